@@ -76,7 +76,7 @@ class Services:
 
     @property
     def updates(self) -> int:
-        """Number of updates sent by ``shmio.v1`` since the start; feeds count their own messages."""
+        """Number of updates sent by ``shmio.v1`` since the start; feeds count theirs."""
         return self._shmio_v1.updates
 
     @property

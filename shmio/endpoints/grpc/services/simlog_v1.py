@@ -284,7 +284,7 @@ class SimlogV1:
         return found
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
-        """Write a stream's values in order; answer when the stream and all its values have ended."""
+        """Write a stream's values in order; answer when it and all its values have ended."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
     async def _time_topic(self, path: str, context: Context) -> TimeTopic | None:

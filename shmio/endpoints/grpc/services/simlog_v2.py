@@ -363,7 +363,7 @@ class SimlogV2:
         return wire.InjectResponse(shadowPathIn=path_in, shadowPathOut=path_out)
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
-        """Write a stream's values in order; answer when the stream and all its values have ended."""
+        """Write a stream's values in order; answer when it and all its values have ended."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
     async def write(self, request: wire.PubRequest, context: Context) -> Empty:

@@ -39,7 +39,7 @@ _TYPES: Final = {"bool": wire.BOOL, "double": wire.NUMBER, "int": wire.NUMBER, "
 
 
 class EncodedMessage:
-    """A SimlogMessage without its path: the header's time stamp, and the fields after the header."""
+    """A SimlogMessage without its path: the header's time stamp, and the later fields."""
 
     __slots__ = ("_last", "rest", "stamp")
 

@@ -1,6 +1,7 @@
-"""Our own service, ``shmio.v1``: registers typed, packed by type, and with their quality.
+"""The service ``shmio.v1``: typed registers, packed by type, with their quality.
 
-``columns`` turns images of a block into packed arrays, ``selection`` is what some patterns name on one block, made once
-for all who name it. ``stream`` follows a block for a subscriber: the ring in shared memory is its queue, so a slow
-client costs the endpoint no memory and is told exactly what it missed. ``service`` has the calls.
+``columns`` packs a block's image into arrays; ``selection`` resolves patterns to a table of
+registers, once for all clients with the same patterns. ``follow`` follows a block for one
+subscriber. Its queue is the ring in shared memory, so a slow client costs the endpoint no
+memory and learns exactly how many frames it missed. ``service`` has the calls.
 """

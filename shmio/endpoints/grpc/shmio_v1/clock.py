@@ -19,26 +19,29 @@ from shmio.segment.clock import ClockState
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_ANSWERS: Final = 1024
-"""Of so many that wait to be read the next step waits, too."""
+"""When this many answers wait for the client, the next step waits too."""
 
 STEPS: Final = wire.StepsResponse.DESCRIPTOR.fields_by_name["steps"].number
 
 
 class StepsCall:
-    """One call of Steps."""
+    """One call of Steps: makes steps and collects their answers."""
 
     def __init__(self, stepper: Stepper, peer: str) -> None:
-        """``peer``: whose it is."""
+        """``peer``: the client, as gRPC names it."""
         self._stepper = stepper
         self._peer = peer
         self._answers: list[bytes] = []
-        self._wake = asyncio.Event()  # there is an answer, or there will be no more
+        self._wake = asyncio.Event()  # there is an answer, or there will be none
         self._room = asyncio.Event()
 
     async def messages(self, requests: AsyncIterator[wire.StepsRequest]) -> AsyncIterator[bytes]:
-        """Serialised StepsResponses: what is done while one is sent shares the next. Time goes on meanwhile.
+        """Yield serialised StepsResponses; steps made while one is sent share the next.
 
-        TimeError: a step has failed, after the answers to those before it; ValueRangeError.
+        Raises:
+            TimeError: A step failed. It is raised after the answers to the earlier steps.
+            ValueRangeError: A step is out of range.
+
         """
         working = asyncio.get_running_loop().create_task(self._work(requests))
         working.add_done_callback(lambda _: self._wake.set())
@@ -72,7 +75,7 @@ MAX_WATCHERS = 256
 
 
 class TimeCalls:
-    """A part of the service."""
+    """The calls about time."""
 
     def __init__(self, segment: Segment, stepper: Stepper) -> None:
         self._segment = segment
@@ -81,7 +84,7 @@ class TimeCalls:
         stepper.timeline.watch(self._tell)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Its calls, by name."""
+        """Return the handlers of these calls, by name."""
         unary, clock = grpc.unary_unary_rpc_method_handler, wire.Clock.SerializeToString
         return {
             "Step": unary(self.step, wire.StepRequest.FromString, clock),
@@ -94,9 +97,11 @@ class TimeCalls:
         }
 
     async def step(self, request: wire.StepRequest, context: Context) -> wire.Clock:
-        """Move time by one step; answered when every stream has what has changed in it.
+        """Make one step; answer when every stream has its changes.
 
-        INVALID_ARGUMENT: no step goes so far; FAILED_PRECONDITION: it failed, or time is not ours to move.
+        Statuses:
+            INVALID_ARGUMENT: The step is out of range.
+            FAILED_PRECONDITION: The step failed, or another program controls time.
         """
         try:
             step = await self._stepper.step(request.dt_ns or None, context.peer())
@@ -107,7 +112,7 @@ class TimeCalls:
         return found
 
     async def steps(self, requests: AsyncIterator[wire.StepsRequest], context: Context) -> AsyncIterator[bytes]:
-        """The same, without a call for each; the first that fails ends it. Errors as of :meth:`step`."""
+        """Make steps until one fails; statuses as for :meth:`step`."""
         try:
             async for message in StepsCall(self._stepper, context.peer()).messages(requests):
                 yield message
@@ -115,28 +120,31 @@ class TimeCalls:
             await refuse(context, error)
 
     async def set_step_size(self, request: wire.SetStepSizeRequest, context: Context) -> wire.Clock:
-        """How far a step goes that does not say it; errors as of :meth:`step`."""
+        """Set the size of steps that have none of their own; statuses as for :meth:`step`."""
         return await self._do(self._stepper.set_step_size(request.dt_ns), context)
 
     async def play(self, request: wire.PlayRequest, context: Context) -> wire.Clock:
-        """Step by itself from now on; errors as of :meth:`step`."""
+        """Play from now on; statuses as for :meth:`step`."""
         rate = request.rate or 1.0
         if not 1e-3 <= rate <= 1e3 or math.isnan(rate):
             await refuse(context, ValueRangeError(f"rate: {rate} is not from 0.001 to 1000"))
         return await self._do(self._stepper.play(request.dt_ns or None, rate), context)
 
     async def pause(self, _: wire.PauseRequest, context: Context) -> wire.Clock:
-        """Step no more by itself; FAILED_PRECONDITION: time is not ours to move."""
+        """Stop playing. Status FAILED_PRECONDITION: another program controls time."""
         return await self._do(self._stepper.pause(), context)
 
     async def release(self, _: wire.ReleaseRequest, context: Context) -> wire.Clock:
-        """Have time be real again; FAILED_PRECONDITION: it is not ours to release, or was never real."""
+        """Return to real time.
+
+        Status FAILED_PRECONDITION: another program controls time, or the instance has no real time.
+        """
         return await self._do(self._stepper.release(), context)
 
     async def watch(self, _: wire.WatchClockRequest, context: Context) -> AsyncIterator[wire.Clock]:
-        """How time stands: at once, then after each step and change; who does not keep up sees the newest.
+        """Stream the state of time: now, and after each step or change; conflated for slow clients.
 
-        RESOURCE_EXHAUSTED: too many streams.
+        Status RESOURCE_EXHAUSTED: too many streams.
         """
         if len(self._watchers) >= MAX_WATCHERS:
             await refuse(context, EndpointError(f"{MAX_WATCHERS} calls of WatchClock are open, the most there may be"))
@@ -163,7 +171,7 @@ class TimeCalls:
 
 
 def clock(state: ClockState) -> wire.Clock:
-    """What the clock page says."""
+    """Convert the state of the clock page to a message."""
     return wire.Clock(
         virtual=state.virtual,
         step=state.done,

@@ -1,4 +1,4 @@
-"""From images of a block to packed arrays by type, with numpy; and which elements differ between two images."""
+"""Packs a block's image into one array per type, with numpy, and compares two images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 
 class Column(IntEnum):
-    """As ``Column`` of the wire. The columns' fields in ``Values`` have the same numbers."""
+    """The type columns, numbered as ``Column`` and as the fields of ``Values`` on the wire."""
 
     BOOL = 1
     INT32 = 2
@@ -50,17 +50,17 @@ KINDS: Final[Mapping[Column, np.dtype[Any]]] = {
     Column.FLOAT: np.dtype("<f4"),
     Column.DOUBLE: np.dtype("<f8"),
 }
-"""How the elements of a column lie in its packed field."""
+"""Element type of each column's packed field."""
 _BITS: Final = {column: np.dtype(f"<u{kind.itemsize}") for column, kind in KINDS.items()}
 
 
 def column_of(element: ElementType) -> Column:
-    """Where values of a type go."""
+    """Return the column of a type."""
     return _BY_BASE.get(element.base) or _COLUMNS.get(scalar_codec(element).plain, Column.TEXT)
 
 
 class DecodedImage(NamedTuple):
-    """All elements of an image. ``invalid``: places of the registers of which some bytes are no value."""
+    """All elements of an image. ``invalid``: indices of registers whose bytes hold no value."""
 
     arrays: Mapping[Column, Array]
     texts: tuple[str, ...]
@@ -69,7 +69,10 @@ class DecodedImage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _NumberGroup:
-    """Elements of one type: ``bytes`` says, by element, where its bytes are, the least significant first."""
+    """Numeric elements of one type.
+
+    ``bytes``: offsets of each element's bytes, the least significant first; shape (elements, size).
+    """
 
     slots: slice
     bytes: Array
@@ -78,7 +81,7 @@ class _NumberGroup:
 
 @dataclass(frozen=True, slots=True)
 class _SingleElement:
-    """An element that is not just a number; ``register``: its place."""
+    """An element that is decoded by itself. ``register``: index of its register."""
 
     column: Column
     slot: int
@@ -89,7 +92,10 @@ class _SingleElement:
 
 
 class _SingleValues(NamedTuple):
-    """Elements that are not just numbers. ``invalid``: those that are no value, of the registers at ``places``."""
+    """Values of the elements that are decoded one by one.
+
+    ``invalid``: indices of the elements without a value; ``places``: those of their registers.
+    """
 
     numbers: Mapping[Column, Mapping[int, Any]]
     texts: tuple[str, ...]
@@ -98,7 +104,7 @@ class _SingleValues(NamedTuple):
 
 
 class Columns:
-    """How registers lie in columns; built once. Decoding remembers what does not change, and is for one thread."""
+    """How registers map to columns. Decoding caches unchanged values, so it is for one thread."""
 
     def __init__(self, registers: Sequence[Register], order: ByteOrder) -> None:
         self.places: list[tuple[Column, int]] = [(Column.TEXT, 0)] * len(registers)
@@ -129,7 +135,7 @@ class Columns:
         starts = np.repeat([other.offset for other in self._others], sizes).astype(np.intp)
         before = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes) if sizes else np.zeros(0, np.intp)
         self._watched = starts + np.arange(len(starts)) - before
-        self._owners = np.repeat(np.arange(len(sizes)), sizes)  # whose each of the watched bytes is
+        self._owners = np.repeat(np.arange(len(sizes)), sizes)  # the element of each watched byte
         self._seen: tuple[Array, _SingleValues] | None = None
 
     def _others_of(
@@ -143,7 +149,7 @@ class Columns:
                 yield _SingleElement(column, first + flat, place, decode, at, register.element.size)
 
     def place(self, column: Column, slot: int) -> int | None:
-        """Place of the register that has a slot; None: there is no such slot."""
+        """Return the index of the register that has a slot; None: there is no such slot."""
         if not 0 <= slot < self.sizes[column]:
             return None
         firsts, places = self._starts[column]
@@ -151,7 +157,7 @@ class Columns:
 
     @cached_property
     def _starts(self) -> Mapping[Column, tuple[list[int], list[int]]]:
-        """First slots of the registers of each column, ascending, and their places."""
+        """For each column, its registers' first slots in ascending order, and their indices."""
         found: dict[Column, tuple[list[int], list[int]]] = {column: ([], []) for column in Column}
         for place, (column, slot) in sorted(enumerate(self.places), key=lambda pair: pair[1][1]):
             found[column][0].append(slot)
@@ -159,7 +165,7 @@ class Columns:
         return found
 
     def touched(self, mask: bytes) -> dict[Column, Array]:
-        """Slots of the elements that any of the bits set in a mask of the block belongs to."""
+        """Return the slots of the elements that have a bit set in a mask of the block."""
         arrays = self.decode_numbers(mask)
         found = {column: array.view(_BITS[column]) != 0 for column, array in arrays.items()}
         if self.sizes[Column.TEXT]:
@@ -169,7 +175,7 @@ class Columns:
         return {column: np.flatnonzero(hit) for column, hit in found.items() if hit.any()}
 
     def decode_numbers(self, image: bytes) -> dict[Column, Array]:
-        """The columns of numbers and bits; elements that are not just that are 0."""
+        """Decode the columns of numbers and bits; elements with a decoder of their own are 0."""
         data = np.frombuffer(image, np.uint8)
         arrays = {column: np.zeros(self.sizes[column], kind) for column, kind in KINDS.items() if self.sizes[column]}
         if Column.BOOL in arrays:
@@ -180,7 +186,13 @@ class Columns:
         return arrays
 
     def encode(self, column: Column, slots: Array, values: Array, image: bytearray) -> Array:
-        """Put values at slots, which there are, into an image; which ``slots`` are no plain numbers, or do not fit."""
+        """Encode values at valid slots into an image.
+
+        Returns:
+            Indices into ``slots`` of the values that were not encoded: they do not fit, or need
+            an encoder of their own.
+
+        """
         data, left = np.frombuffer(image, np.uint8), np.full(len(slots), column is not Column.BOOL)
         if column is Column.BOOL:
             slots, last = np.unique(slots[::-1], return_index=True)
@@ -197,7 +209,7 @@ class Columns:
         return np.flatnonzero(left)
 
     def decode(self, image: bytes) -> DecodedImage:
-        """All elements of an image of the block."""
+        """Decode all elements of an image."""
         arrays = self.decode_numbers(image)
         if not self._others:
             return DecodedImage(arrays, (), ())
@@ -208,7 +220,7 @@ class Columns:
         return DecodedImage(arrays, rest.texts, rest.places)
 
     def _rest(self, image: bytes, data: Array) -> _SingleValues:
-        """What is decoded one by one; not again while its bytes stay the same."""
+        """Decode the elements that need a decoder of their own, if their bytes have changed."""
         watched = data[self._watched]
         if self._seen is None:
             changed, before = (
@@ -236,9 +248,9 @@ class Columns:
 
 
 def pack(new: DecodedImage, old: DecodedImage | None = None, deadband: float = 0.0) -> bytes:
-    """A serialised ``Values`` of what differs, by its bits; of all without an ``old``; empty: nothing does.
+    """Serialise as ``Values`` the elements whose bits differ from ``old``, or all without it.
 
-    ``deadband``: numbers that differ by no more are left out.
+    Numbers that differ by no more than ``deadband`` are left out. Empty: nothing differs.
     """
     parts = []
     for column, values in new.arrays.items():
@@ -262,7 +274,7 @@ def pack(new: DecodedImage, old: DecodedImage | None = None, deadband: float = 0
 
 
 def pack_slots(values: DecodedImage, chosen: Mapping[Column, Array]) -> bytes:
-    """A serialised ``Values`` of these slots."""
+    """Serialise these slots as ``Values``."""
     parts = []
     for column, slots in chosen.items():
         where = field(1, slots.astype("<u4").tobytes())
@@ -274,7 +286,7 @@ def pack_slots(values: DecodedImage, chosen: Mapping[Column, Array]) -> bytes:
 
 
 def merge(new: DecodedImage, old: DecodedImage, deadband: float) -> DecodedImage:
-    """What somebody has after :func:`pack`: of a number that was left out, the old one."""
+    """Return what a receiver has after :func:`pack`: numbers left out keep their old value."""
     arrays = {}
     for column, values in new.arrays.items():
         slots = _differing(column, old.arrays[column], values, deadband)
@@ -284,12 +296,12 @@ def merge(new: DecodedImage, old: DecodedImage, deadband: float) -> DecodedImage
 
 
 def _differing(column: Column, old: Array, new: Array, deadband: float) -> Array:
-    """Slots that differ: compared by bits, for a NaN that stays has not changed, and 0.0 that becomes -0.0 has."""
+    """Return the slots that differ by bits: NaN equals NaN, and 0.0 differs from -0.0."""
     differs = old.view(_BITS[column]) != new.view(_BITS[column])
     if deadband and column is not Column.BOOL:
         with np.errstate(invalid="ignore", over="ignore"):
             distance = np.abs(new.astype(np.float64) - old.astype(np.float64))
-        differs &= ~(distance <= deadband)  # a NaN is never within it
+        differs &= ~(distance <= deadband)  # NaN is never within the dead-band
     return np.flatnonzero(differs)
 
 
@@ -306,7 +318,7 @@ def _numbers(registers: Sequence[Register], code: str, order: ByteOrder, slots: 
 
 
 def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:
-    """Byte and shift of each bit."""
+    """Return each bit's byte offset and its shift."""
     places = [(register.offset + byte, bit) for register in registers for byte, bit in bit_positions(register)]
     where, shifts = zip(*places, strict=True)
     return np.array(where, np.intp), np.array(shifts, np.uint8)

@@ -1,4 +1,4 @@
-"""The calls of shmio.v1 that have a source do something: Write, Inject, Declare, and those about injections."""
+"""The calls of shmio.v1 that send commands: Write, Inject, Declare, ListInjections, Lift."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from shmio.segment.standing_injections import StandingInjection
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_INJECTIONS: Final = 256
-"""Calls of Inject and Declare that may be open at once."""
+"""Bound of the open Inject and Declare calls."""
 MAX_TIMEOUT_MS: Final = 86_400_000
 
 
 class CommandCalls:
-    """A part of the service."""
+    """The calls that send commands to sources, and those about injections."""
 
     def __init__(self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, wake_ups: WakeUps) -> None:
         self._topics = topics
@@ -42,7 +42,7 @@ class CommandCalls:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Its calls, by name."""
+        """Return the handlers of these calls, by name."""
         unary = grpc.unary_unary_rpc_method_handler
         return {
             "Write": unary(self.write, wire.WriteRequest.FromString, wire.WriteResponse.SerializeToString),
@@ -58,10 +58,14 @@ class CommandCalls:
         }
 
     async def write(self, request: wire.WriteRequest, context: Context) -> wire.WriteResponse:
-        """Write registers of one source, all or nothing; what became of each, by the source.
+        """Write registers of one source, all or none; return the outcome of each.
 
-        NOT_FOUND: no such register; INVALID_ARGUMENT: no value of its type, several sources, too many;
-        FAILED_PRECONDITION: not writable, or the source takes nothing. Nothing has been sent then.
+        After an error status nothing was sent.
+
+        Statuses:
+            NOT_FOUND: No such register.
+            INVALID_ARGUMENT: A value does not fit, several sources, or too many values.
+            FAILED_PRECONDITION: A register is not writable, or the source does not answer.
         """
         try:
             if request.timeout_ms > MAX_TIMEOUT_MS:
@@ -75,11 +79,16 @@ class CommandCalls:
             await refuse(context, error)
 
     async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
-        """Lay an injection as long as the stream is open, or for good; originals down, other values up.
+        """Lay an injection while the stream is open, or for good.
 
-        NOT_FOUND: no such register; INVALID_ARGUMENT: no injection, or values that are none of it; FAILED_PRECONDITION:
-        the source refuses it, and says why; RESOURCE_EXHAUSTED: too many streams; ABORTED: somebody else has lifted
-        it, or what is written is not read.
+        Originals are streamed to the client, which streams other values back.
+
+        Statuses:
+            NOT_FOUND: No such register.
+            INVALID_ARGUMENT: The injection is not valid, or does not cover a given value.
+            FAILED_PRECONDITION: The source refuses the injection; the message says why.
+            RESOURCE_EXHAUSTED: Too many streams.
+            ABORTED: Another client lifted it, or this client does not read the originals.
         """
         opening: asyncio.Task[bytes] | None = None
         taking: asyncio.Task[None] | None = None
@@ -92,7 +101,7 @@ class CommandCalls:
             async for message in injection.messages():
                 yield message
             taking.cancel()
-            await asyncio.shield(self._spawn(self._close(injection, opening)))  # who sees the end sees it lifted
+            await asyncio.shield(self._spawn(self._close(injection, opening)))  # it is lifted before the stream ends
             opening = None
         except ShmioError as error:
             await refuse(context, error)
@@ -107,7 +116,7 @@ class CommandCalls:
             await context.abort(grpc.StatusCode.ABORTED, f"{injection.source}: {injection.over}")
 
     async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> InjectCall:
-        """What the first message asks for. PathError, ValueRangeError, EndpointError."""
+        """Read the first message. Raises PathError, ValueRangeError or EndpointError."""
         self._check_room()
         async for request in requests:
             if request.WhichOneof("what") == "lay":
@@ -118,7 +127,7 @@ class CommandCalls:
         raise ValueRangeError("the first message of Inject lays an injection, all others give values")
 
     def _check_room(self) -> None:
-        """EndpointError."""
+        """Raise EndpointError if too many calls are open."""
         if len(self._open) >= MAX_INJECTIONS:
             raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the most there may be")
 
@@ -131,10 +140,15 @@ class CommandCalls:
             self._open.discard(one)
 
     async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
-        """Lay injections that their sources run, all or none, as long as the stream is open, or for good; their record.
+        """Lay declared injections, all or none, while the stream is open or for good.
 
-        INVALID_ARGUMENT: what is wrong with which key; FAILED_PRECONDITION: a source refuses it, and says why;
-        RESOURCE_EXHAUSTED: too many streams; ABORTED: the record is not read, or would have a gap.
+        The stream is the record of their events.
+
+        Statuses:
+            INVALID_ARGUMENT: A declaration is not valid; the message names the key.
+            FAILED_PRECONDITION: A source refuses an injection; the message says why.
+            RESOURCE_EXHAUSTED: Too many streams.
+            ABORTED: The client does not read the record, or it would have a gap.
         """
         opening: asyncio.Task[bytes] | None = None
         try:
@@ -157,7 +171,7 @@ class CommandCalls:
     async def list_injections(
         self, request: wire.ListInjectionsRequest, context: Context
     ) -> wire.ListInjectionsResponse:
-        """What stands at present. NOT_FOUND: no such source."""
+        """List the injections that stand. Status NOT_FOUND: no such source."""
         found = wire.ListInjectionsResponse()
         try:
             for block in self.blocks(request.sources):
@@ -167,7 +181,12 @@ class CommandCalls:
         return found
 
     async def lift(self, request: wire.LiftRequest, context: Context) -> wire.LiftResponse:
-        """Lift one. NOT_FOUND: there is no such injection; FAILED_PRECONDITION: the source does not answer."""
+        """Lift one injection.
+
+        Statuses:
+            NOT_FOUND: No such injection.
+            FAILED_PRECONDITION: The source does not answer.
+        """
         try:
             (block,) = self.blocks([request.source])
             standing = [one for one in block.standing.read() if one.id == request.number and not one.lifted]
@@ -181,7 +200,10 @@ class CommandCalls:
             await refuse(context, error)
 
     async def lift_all(self, request: wire.LiftAllRequest, context: Context) -> wire.LiftResponse:
-        """Lift all, at once; of one that still stands it is said why. NOT_FOUND: no such source."""
+        """Lift all injections at once; the answer says why one still stands.
+
+        Status NOT_FOUND: no such source.
+        """
         try:
             blocks = self.blocks(request.sources)
         except ShmioError as error:
@@ -195,7 +217,7 @@ class CommandCalls:
         return wire.Lifted(source=block.source, number=one.id, name=one.name, failure=failure)
 
     def blocks(self, sources: Collection[str]) -> list[Block]:
-        """The blocks of these sources, or of all; PathError."""
+        """Return the blocks of these sources, or of all. PathError: no such source."""
         for source in sources:
             if source not in self._feeds:
                 raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")

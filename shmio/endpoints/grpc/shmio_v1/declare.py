@@ -1,4 +1,4 @@
-"""Declare: injections that their sources run by themselves, and the record of what is done with them."""
+"""The call Declare: injections that their sources run, and the record of their events."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from shmio.segment import Block, Event, EventKind
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_MATCHES: Final = 10_000_000
-"""Targets times registers that they are held against, in one call: some seconds."""
+"""Bound of one call's comparisons of targets with registers; they take some seconds."""
 SEED_BITS: Final = 53
-"""Of a seed that is drawn: any JSON reader keeps it."""
+"""Bits of a random seed; few enough for any JSON reader."""
 
 _DECLARED, _HAPPENINGS = (
     wire.DeclareResponse.DESCRIPTOR.fields_by_name[name].number for name in ("declared", "happenings")
@@ -43,11 +43,14 @@ _KINDS: Final = {
 
 
 class DeclareCall:
-    """One call of Declare."""
+    """One call of Declare, with its injections."""
 
     def __init__(self, feeds: Mapping[str, Feed], request: wire.DeclareRequest, turn: asyncio.Lock) -> None:
-        """``turn``: calls are looked at one after another. ConfigError, ValueRangeError: what is declared cannot be."""
-        if len(request.declarations) > MAX_DECLARATIONS:  # before looking at any: nobody is served meanwhile
+        """Check the declarations. ``turn``: a lock, so that calls are checked one after another.
+
+        ConfigError, ValueRangeError: a declaration is not valid.
+        """
+        if len(request.declarations) > MAX_DECLARATIONS:  # first: reading them blocks the event loop
             raise ValueRangeError(
                 f"{len(request.declarations)} injections are declared, {MAX_DECLARATIONS} are the most"
             )
@@ -68,15 +71,19 @@ class DeclareCall:
         self._abandoned = False
         self._lifting: asyncio.Task[None] | None = None
         self.over = ""
-        """Why it has to end, though something of it stands."""
+        """Why the call has to end before its injections; empty: it does not."""
 
     async def open(self) -> bytes:
-        """Lay all or none; the first message.
+        """Lay all injections or none; return the first message.
 
-        ConfigError, ValueRangeError; CommandError: a source refuses, or does not answer.
+        Raises:
+            ConfigError: A declaration does not fit the sources.
+            ValueRangeError: There are too many targets to compare.
+            CommandError: A source refuses an injection, or does not answer.
+
         """
         feeds = dict(self._feeds)
-        async with self._turn:  # and not on the loop: the registers of a large layout take seconds
+        async with self._turn:  # in a thread: a large layout takes seconds
             programs = await asyncio.to_thread(
                 _check,
                 self._declarations,
@@ -105,11 +112,11 @@ class DeclareCall:
         return field(_DECLARED, declared.SerializeToString()) + self._waiting.all()
 
     def abandon(self) -> None:
-        """Lay no more, and lift what is laid, unless all of it is: the client is gone."""
+        """Stop laying injections, because the client is gone; lift them unless all are laid."""
         self._abandoned = True
 
     async def close(self) -> None:
-        """Lift them, unless they are to be kept. It goes on until their sources have: nobody else would."""
+        """Lift the injections, unless they are to be kept; retry until the sources have done so."""
         if self._lifting is not None:
             await self._lifting
         elif not self._keep:
@@ -123,7 +130,7 @@ class DeclareCall:
         )
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Serialised DeclareResponses, until nothing of it stands."""
+        """Yield serialised DeclareResponses while an injection stands."""
         while True:
             self._wake.clear()  # before looking
             if self._waiting:
@@ -134,7 +141,7 @@ class DeclareCall:
                 await self._wake.wait()
 
     def tell(self, happening: wire.Happening) -> None:
-        """Something was done with one of them."""
+        """Send an event of one of the injections."""
         if self.over:
             return
         if reason := self._waiting.add(field(_HAPPENINGS, happening.SerializeToString())):
@@ -142,7 +149,10 @@ class DeclareCall:
         self._wake.set()
 
     def end(self, reason: str) -> None:
-        """What comes next is not all there was. A client that does not read would hold up the stream's end."""
+        """End the call because its record has a gap, lifting at once what is not to be kept.
+
+        A client that does not read would delay the stream's end.
+        """
         self.over = self.over or reason
         if self._laid and not self._keep and self._lifting is None:
             self._lifting = asyncio.get_running_loop().create_task(self._lift())
@@ -152,7 +162,10 @@ class DeclareCall:
 def _check(
     declarations: Sequence[Declaration], blocks: Mapping[str, Block], wanted: Callable[[], bool]
 ) -> list[Program]:
-    """What they mean; ConfigError; ValueRangeError: too much to look for."""
+    """Check declarations and return their programs.
+
+    ConfigError: one does not fit the sources. ValueRangeError: too many comparisons.
+    """
     matches = 0
     for declaration in declarations:
         for target in [declaration.target] if isinstance(declaration.target, str) else declaration.target:
@@ -170,18 +183,18 @@ def _check(
 
 
 class DeclaredInjection(InjectionFollower):
-    """One injection of a campaign."""
+    """One injection of a Declare call."""
 
     def __init__(self, campaign: DeclareCall, source: str, commands: CommandClient) -> None:
         self.source = source
         self.commands = commands
         self.number = 0
         self.gone = False
-        """Whether it stands no more."""
+        """Whether the injection is over."""
         self._campaign = campaign
 
     def happened(self, event: Event) -> None:
-        """It was laid, has become active, is no longer, or was lifted."""
+        """Record that the injection was laid, activated, deactivated or lifted."""
         kind = EventKind(event.kind)
         turned = kind in (EventKind.ACTIVATED, EventKind.DEACTIVATED)
         self.gone = kind is EventKind.LIFTED
@@ -200,7 +213,7 @@ class DeclaredInjection(InjectionFollower):
         )
 
     def lifted(self, reason: str) -> None:
-        """It was lifted, or its source is gone."""
+        """Record the injection's end, if no event did."""
         if not self.gone:
             self.gone = True
             now_ns = self.commands.block.clock.read().present_ns
@@ -210,5 +223,5 @@ class DeclaredInjection(InjectionFollower):
             )
 
     def fail(self, reason: str) -> None:
-        """The record would have a gap."""
+        """End the call, because its record would have a gap."""
         self._campaign.end(reason)

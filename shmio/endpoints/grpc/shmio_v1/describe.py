@@ -1,4 +1,4 @@
-"""GetLayouts and GetStatus: what there is, and how it fares."""
+"""Messages that describe layouts, injections and the instance's status."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from shmio.segment.standing_injections import DeclaredState, StandingInjection
 from shmio.wire import shmio_v1_pb2 as wire
 
 PART_REGISTERS = 4096
-"""Most registers in one message."""
+"""Bound of the registers in one message."""
 _REMEDY = "shmio-supervisor up takes them over, shmio-supervisor down stops them"
 
 
 def layout_parts(block: Block) -> Iterator[wire.LayoutPart]:
-    """A block's layout, in as many messages as it takes."""
+    """Yield a block's layout in as many messages as necessary."""
     layout, attributes = block.layout, block.attributes
     for first in range(0, max(1, len(layout.registers)), PART_REGISTERS):
         part = wire.LayoutPart(
@@ -48,7 +48,7 @@ def layout_parts(block: Block) -> Iterator[wire.LayoutPart]:
 
 
 def injection(block: Block, one: StandingInjection) -> wire.Injection:
-    """An injection that stands on a block."""
+    """Describe an injection that stands on a block."""
     return wire.Injection(
         source=block.source,
         number=one.id,
@@ -64,7 +64,7 @@ def injection(block: Block, one: StandingInjection) -> wire.Injection:
 
 
 def _running(running: DeclaredState) -> wire.Running:
-    """How a declared one is."""
+    """Describe the state of a declared injection."""
     declaration = running.declaration
     return wire.Running(
         declaration=declaration_to_wire(msgspec.to_builtins(declaration), declaration.name),
@@ -77,7 +77,7 @@ def _running(running: DeclaredState) -> wire.Running:
 
 
 def status(segment: Segment) -> wire.Status:
-    """The instance as the process table and the blocks show it."""
+    """Describe the instance's status."""
     now = status_of(segment, _REMEDY, asking="grpc")
     found = wire.Status(
         instance=now.instance or "",

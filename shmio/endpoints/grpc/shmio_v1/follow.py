@@ -1,4 +1,4 @@
-"""Follows one block for one subscriber. The ring in shared memory is the queue: nothing waits in this process."""
+"""Follows one block for one subscriber; the ring in shared memory is the queue."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from shmio.endpoints.grpc.streams.encoding import field, number
 from shmio.errors import SegmentError
 from shmio.segment import Block, Frame, Quality
 
-_QUALITY_BAD = number(QUALITY, 0)  # said last it holds, also where the frame was good when it was published
+_QUALITY_BAD = number(QUALITY, 0)  # as the last field it wins over the frame's own quality
 
 
 class BlockFollower(Protocol):
-    """A subscriber's place in a block."""
+    """A subscriber's position in a block's frames."""
 
     view: View
     due_s: float
-    """Event loop's time before which :meth:`next` gives nothing; infinity: only a frame makes it."""
+    """Event loop's time of the next possible update; infinity: it takes a new frame."""
 
     @property
     def begun(self) -> bool:
         """Whether the present values have been given."""
 
     def next(self, now_s: float) -> bytes | None:
-        """The next serialised ``Update``, if there is one."""
+        """Return the next serialised ``Update``, or None."""
 
 
 class EveryFrame:
-    """All frames from the present one on; what was overwritten before the client took it is counted."""
+    """Follows every frame from the present one on, and counts those that were overwritten."""
 
     due_s = math.inf
 
@@ -47,7 +47,7 @@ class EveryFrame:
         return self._shown is not None
 
     def next(self, now_s: float) -> bytes | None:  # noqa: ARG002  as fast as the client takes them
-        """The next frame, or what has become of the last one."""
+        """Return the next frame's update, or one that says that the last frame is stale."""
         frame = self._cursor.poll()
         if frame is None:
             return self._age.look()
@@ -60,7 +60,7 @@ class EveryFrame:
 
 
 class LatestFrame:
-    """The newest frame whenever there is one that shows something else; not more often than wanted."""
+    """Follows the newest frame that differs, at most once per interval."""
 
     def __init__(self, view: View, interval_s: float, deadband: float) -> None:
         self.view = view
@@ -78,7 +78,7 @@ class LatestFrame:
         return self._shown is not None
 
     def next(self, now_s: float) -> bytes | None:
-        """What differs in the newest frame from what was sent last; or what has become of that."""
+        """Return the newest frame's changes, or an update that reports the last one as stale."""
         shown = self._shown
         if shown is not None and self.view.block.ring.head() == shown.number:
             return self._age.look()
@@ -88,7 +88,7 @@ class LatestFrame:
         self.due_s = math.inf
         try:
             frame = self.view.block.latest()
-        except SegmentError:  # overwritten while it was read, again and again; there will be another
+        except SegmentError:  # overwritten during each read; there will be another
             return None
         if frame is None:
             return None
@@ -112,23 +112,23 @@ class LatestFrame:
 
 
 class _AgeWatch:
-    """Says once that what was shown last has become too old."""
+    """Reports once that the last frame has become stale."""
 
     def __init__(self, view: View) -> None:
         self.told = False
-        """Whether the last update has said so."""
+        """Whether the last update reported it."""
         self._view = view
         self._frame: Frame | None = None
 
     def of(self, frame: Frame, *, newest: bool) -> bytes:
-        """What to add to a frame's update if it is too old already; nothing of one that others follow."""
+        """Return the addition to a frame's update if it is stale; empty if newer frames follow."""
         self._frame = frame
         added = aged(self._view.block, frame) if newest else b""
         self.told = bool(added)
         return added
 
     def look(self) -> bytes | None:
-        """An update, if the frame has become too old since."""
+        """Return an update if the last frame has become stale since, or None."""
         frame = self._frame
         if frame is None or self.told or not (added := aged(self._view.block, frame)):
             return None
@@ -137,7 +137,7 @@ class _AgeWatch:
 
 
 def aged(block: Block, frame: Frame) -> bytes:
-    """What to add to the update of a frame that was good, or uncertain, and is too old by now; else nothing."""
+    """Return the addition to an update if its frame was not bad but is stale now; else empty."""
     if frame.quality is Quality.BAD:
         return b""
     quality, reason = block.assess(frame)

@@ -1,4 +1,4 @@
-"""Inject: a stream that lays an injection, is shown what it stands over, and gives other values instead."""
+"""The call Inject: lays an injection, streams its originals, and takes other values."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _PIECES: Final = wire.Update.DESCRIPTOR.fields_by_name["pieces"].number
 
 
 class InjectTarget(NamedTuple):
-    """A place, the topics that patterns name in it, and ranges."""
+    """What an injection is over: a source and direction, topics, and byte ranges."""
 
     place: SourceDirection
     topics: tuple[Topic, ...]
@@ -42,7 +42,7 @@ class InjectTarget(NamedTuple):
 
 
 def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
-    """What it is to stand over. PathError, ValueRangeError."""
+    """Read what an injection is to be over. Raises PathError or ValueRangeError."""
     if not (lay.patterns or lay.ranges):
         raise ValueRangeError("no pattern is given, and no range: an injection stands over something")
     for name, given in (("patterns", len(lay.patterns)), ("ranges", len(lay.ranges))):
@@ -67,10 +67,10 @@ def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
 
 
 class ByteRanges:
-    """The bytes and bits that an injection is over besides registers."""
+    """The bytes and bits that an injection is over, besides registers."""
 
     def __init__(self, ranges: Iterable[wire.Range], size: int) -> None:
-        """``size``: of the block. ValueRangeError: beyond it, or no range."""
+        """``size``: the block's, in bytes. ValueRangeError: a range is empty or outside it."""
         self._spans: list[tuple[slice, int]] = []
         self._bits = np.zeros(size, np.uint8)
         for one in ranges:
@@ -87,25 +87,28 @@ class ByteRanges:
 
     @property
     def bits(self) -> bytes:
-        """An image of the block in which they are set."""
+        """A mask of the block with these bits set."""
         return self._bits.tobytes()
 
     @property
     def table(self) -> bytes:
-        """What a serialised ``Table`` has of them."""
+        """The ranges as fields of a serialised ``Table``."""
         return b"".join(
             field(_RANGES, wire.Range(offset=span.start, size=span.stop - span.start, mask=mask).SerializeToString())
             for span, mask in self._spans
         )
 
     def differing(self, image: bytes, before: bytes | None) -> bytes:
-        """What an ``Update`` has of them: of each from the first byte that differs to the last; else all of them."""
+        """Return fields of an ``Update``: each range from its first to its last changed byte.
+
+        Without ``before`` all bytes count as changed.
+        """
         new = np.frombuffer(image, np.uint8)
         changed = np.full(len(image), 0xFF, np.uint8) if before is None else new ^ np.frombuffer(before, np.uint8)
         return b"".join(self._pieces(new, changed))
 
     def touched(self, image: bytes, mask: bytes) -> bytes:
-        """The same of what a mask of the block has bits of."""
+        """Return such fields for the bits that are set in a mask of the block."""
         return b"".join(self._pieces(np.frombuffer(image, np.uint8), np.frombuffer(mask, np.uint8)))
 
     def _pieces(self, image: Array, changed: Array) -> Iterator[bytes]:
@@ -118,9 +121,9 @@ class ByteRanges:
 
 
 def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
-    """What raw bytes that a client gives write; ``bits``: what its injection is over.
+    """Convert a client's raw bytes to writes. ``bits``: mask of what its injection is over.
 
-    ValueRangeError: it is not over all of them, or they are too many.
+    ValueRangeError: the injection is not over all of the bytes, or there are too many pieces.
     """
     if len(pieces) > MAX_VALUES:
         raise ValueRangeError(f"{len(pieces)} pieces, {MAX_VALUES} are the most: join neighbours, or give less at once")
@@ -141,31 +144,31 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
 
 
 MAX_OPEN: Final = 32
-"""Values of one stream that are under way; what comes beyond waits."""
+"""Bound of one stream's values in flight; further values wait."""
 MAX_LIFETIME_MS: Final = 86_400_000
 
 _ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].number for name in ("originals", "answers"))
 
 
 class InjectCall(InjectionFollower):
-    """One call of Inject."""
+    """One call of Inject, with its injection."""
 
     def __init__(self, topics: Topics, selections: Selections, wake_ups: WakeUps, lay: wire.Lay) -> None:
-        """PathError, ValueRangeError: as of the request."""
+        """Check the request. Raises PathError or ValueRangeError."""
         _check(lay)
         self._topics = topics
         self._selections = selections
         self._wake_ups = wake_ups
         self._lay = lay
         self.over = ""
-        """Why it has to end, if it was somebody else who lifted it, or nobody reads what it stands over."""
+        """Why the call has to end: another client lifted it, or this client does not read."""
         self._lifted = self._ended = False
         self._lifting: asyncio.Task[None] | None = None
         self._target = target_of(topics, lay)
         self._wake = asyncio.Event()
         self._waiting = SendQueue()  # serialised fields of an InjectResponse
         self.failure: ShmioError | None = None
-        """What is wrong with what the client sends."""
+        """The error in what the client sends, if there is one."""
         self._giving: set[asyncio.Task[None]] = set()
         self._room = asyncio.Semaphore(MAX_OPEN)
         self._shown: Frame | None = None
@@ -175,7 +178,7 @@ class InjectCall(InjectionFollower):
 
     @property
     def source(self) -> str:
-        """Whose registers it stands over."""
+        """Name of the source that the injection is over."""
         return self._target.place.source
 
     @property
@@ -183,7 +186,15 @@ class InjectCall(InjectionFollower):
         return self._target.place.inward
 
     async def open(self) -> bytes:
-        """Lay it; the first message. PathError, ValueRangeError, CommandError, EndpointError."""
+        """Lay the injection; return the first message.
+
+        Raises:
+            PathError: No such register.
+            ValueRangeError: Too many registers, or an invalid range.
+            CommandError: The source refuses the injection, or does not answer.
+            EndpointError: Too many registers of all clients together.
+
+        """
         self._view = view = await self._selections.registers({self._target.place: self._target.topics})
         size = view.block.layout.size
         self._ranges = ByteRanges(self._target.ranges, size)
@@ -213,11 +224,11 @@ class InjectCall(InjectionFollower):
 
     @property
     def _originals(self) -> bool:
-        """Whether it looks at frames."""
+        """Whether the originals come from frames."""
         return not (self._inward or self._lay.quiet)
 
     async def close(self) -> None:
-        """Lift it, unless it is to be kept. It goes on until the source has: nobody else would."""
+        """Lift the injection, unless it is to be kept; retry until the source has done so."""
         for task in self._giving:
             task.cancel()
         if self._timer is not None:
@@ -242,7 +253,7 @@ class InjectCall(InjectionFollower):
         self._wake.set()
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Serialised InjectResponses, until it is over or its time is."""
+        """Yield serialised InjectResponses until the injection or its lifetime ends."""
         while True:
             self._wake.clear()  # before looking
             if self._waiting:
@@ -254,10 +265,14 @@ class InjectCall(InjectionFollower):
             else:
                 await self._wake.wait()
 
-    # ---- up: what the client gives -----------------------------------------------------------------------------
+    # ---- given values --------------------------------------------------------------------------
 
     async def take(self, requests: AsyncIterator[wire.InjectRequest]) -> None:
-        """Take the client's values in order. ValueRangeError, PathError: a message that cannot be answered is wrong."""
+        """Send the client's values in order.
+
+        Errors are answered if a message has a sequence number; else they end the stream. Raises
+        ValueRangeError for a message that is not about values.
+        """
         async for request in requests:
             if request.WhichOneof("what") != "shadow":
                 raise ValueRangeError("an injection is laid by the first message, all others give values")
@@ -274,14 +289,14 @@ class InjectCall(InjectionFollower):
         self.taken(task)
 
     def taken(self, task: asyncio.Task[None]) -> None:
-        """A task that takes values has ended: with an error, so has the stream."""
+        """End the stream if a task that takes values has failed."""
         if not task.cancelled() and isinstance(error := task.exception(), ShmioError):
             self.failure = error
             self._end()
 
     async def _give(self, shadow: wire.Shadow) -> None:
         try:
-            async with self._in_order:  # a large message takes turns, in which those behind it must not pass
+            async with self._in_order:  # a large message is read in time slices; later ones must not overtake it
                 values, raw = await self._values(shadow)
             ends: Sequence[End] = await command_client.give(self._commands, self._base.number, values, raw)
         except ShmioError as error:
@@ -308,10 +323,10 @@ class InjectCall(InjectionFollower):
             raise ValueRangeError("no value is given")
         return values, raw
 
-    # ---- down: what it stands over -----------------------------------------------------------------------------
+    # ---- originals -----------------------------------------------------------------------------
 
     def _original(self) -> bytes | None:
-        """Over ``/out``: what differs in the newest image beneath it from the one shown before."""
+        """Return an update with the changes of the image beneath the injection, or None."""
         if not self._originals:
             return None
         block, shown = self._view.block, self._shown
@@ -333,7 +348,7 @@ class InjectCall(InjectionFollower):
         return head(self._view.number, frame, whole=before is None) + body if body or quality else None
 
     def divert(self, diverted: CommandWrites) -> None:
-        """A command's values went to it: over ``/in`` what was written, over ``/out`` what others further in give."""
+        """Take diverted values: over ``/in`` writes, over ``/out`` values of inner injections."""
         self._base.divert(diverted.writes)
         if not self._inward:
             self.restack()
@@ -352,32 +367,32 @@ class InjectCall(InjectionFollower):
         self._wake.set()
 
     def _give_up(self, reason: str) -> None:
-        """Have it lifted at once: a client that does not read holds up the stream's end."""
+        """Lift the injection at once, as a client that does not read delays the stream's end."""
         self.over = self.over or reason
         if self._base.number and not (self._lay.keep or self._lifted):
             self._lifting = self._lifting or self._lift()
         self._wake.set()
 
     def restack(self) -> None:
-        """An injection was laid or lifted, on the same source."""
+        """React to another injection on the source that was laid or lifted."""
         if not self._inward:
             self._base.restack()
             self._wake.set()
 
     def lifted(self, reason: str) -> None:
-        """It was lifted, and not by this stream."""
+        """React to the injection's end, which this stream did not ask for."""
         self._lifted = True
         self.over = f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it"
         self._wake.set()
 
     def fail(self, reason: str) -> None:
-        """What comes next is not all there was: over ``/out`` frames have it."""
+        """React to missed events: writes are missing; originals over ``/out`` come from frames."""
         if self._inward and not self._lay.quiet:
             self._give_up(reason)
 
 
 def _check(lay: wire.Lay) -> None:
-    """ValueRangeError: options that are none, or do not go together."""
+    """Raise ValueRangeError if options are not valid or do not go together."""
     if len(lay.name.encode()) > MAX_NAME_BYTES:
         raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes")
     if lay.lifetime_ms > MAX_LIFETIME_MS:

@@ -1,4 +1,4 @@
-"""The call of shmio.v1 that moves replays: Replay."""
+"""The call of shmio.v1 that controls replays: Replay."""
 
 from __future__ import annotations
 
@@ -21,22 +21,25 @@ MAX_SOURCES: Final = 256
 
 
 class ReplayCalls:
-    """A part of the service."""
+    """The call that controls replays."""
 
     def __init__(self, segment: Segment) -> None:
         self._replays = Replays(segment)
         self._turn = asyncio.Lock()
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Its calls, by name."""
+        """Return the handler of the call, by name."""
         request, response = wire.ReplayRequest.FromString, wire.ReplayResponse.SerializeToString
         return {"Replay": grpc.unary_unary_rpc_method_handler(self.replay, request, response)}
 
     async def replay(self, request: wire.ReplayRequest, context: Context) -> wire.ReplayResponse:
-        """Move the replays; one call after the other. A search ends with its call.
+        """Control the replays or return their status. Calls take turns; a search ends with its call.
 
-        INVALID_ARGUMENT: a speed or a time; NOT_FOUND: a source or a register; FAILED_PRECONDITION: nothing is played,
-        what is looked for is not there, or a source does not answer.
+        Statuses:
+            INVALID_ARGUMENT: The speed or a time is not valid.
+            NOT_FOUND: No such source or register.
+            FAILED_PRECONDITION: Nothing is replayed, the search finds nothing, or a source does
+                not answer.
         """
         try:
             wanted = _wanted(request)
@@ -54,11 +57,11 @@ class ReplayCalls:
             try:
                 return await asyncio.to_thread(self._replays.change, wanted, over.is_set)
             finally:
-                over.set()  # its thread goes on when the call is cancelled
+                over.set()  # ends the thread when the call is cancelled
 
 
 def _wanted(request: wire.ReplayRequest) -> ReplayRequest:
-    """ValueRangeError: more than anybody means."""
+    """Convert a request. ValueRangeError: too many sources, or too long a text."""
     texts = (request.seek, request.until, request.change, request.event, *request.sources)
     if len(request.sources) > MAX_SOURCES or any(len(text) > MAX_TEXT for text in texts):
         raise ValueRangeError(f"at most {MAX_SOURCES} sources, and {MAX_TEXT} characters of each text, can be given")

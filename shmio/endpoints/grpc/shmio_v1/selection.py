@@ -1,4 +1,4 @@
-"""What the patterns of a call name: a view of each block, made once for all clients who name the same."""
+"""Resolves the patterns of a call to views of blocks, which clients with equal patterns share."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from shmio.segment import Block
 MAX_PATTERNS: Final = 256
 MAX_REGISTERS: Final = 16_384
 MAX_ELEMENTS: Final = 262_144
-"""Of one call."""
+"""Bound of one call's elements."""
 MAX_MATCHES: Final = 1_000_000
-"""Patterns with a star times registers that they are held against, in one call: some seconds."""
+"""Bound of one call's comparisons of star patterns with registers; they take some seconds."""
 MAX_ALL_ELEMENTS: Final = 1 << 22
-"""Of what all clients have open; equal patterns count once."""
+"""Bound of the elements of all clients together; equal patterns count once."""
 KEPT: Final = 16
-"""Views that are kept though nobody has them, for who reads the same again and again."""
+"""Number of unused views that are cached for clients that read repeatedly."""
 
 
 class SourceDirection(NamedTuple):
-    """A source, and which way: ``inward``, what is written to it."""
+    """A source's values, or with ``inward`` the writes to it."""
 
     source: str
     inward: bool = False
@@ -43,7 +43,7 @@ _Key = tuple[int, bool, tuple[str, ...]]
 
 
 class Selections:
-    """Those that clients have at present."""
+    """The views of all clients, with a cache."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -53,7 +53,17 @@ class Selections:
         self._turn = asyncio.Lock()
 
     def resolve(self, patterns: Sequence[str], *, inward: bool = False) -> TopicsBySource:
-        """What a call's patterns say; ``inward``: whether ``/in`` may be among them. PathError, ValueRangeError."""
+        """Parse a call's patterns and group them by source and direction.
+
+        Args:
+            patterns: Paths, structures, globs or source names.
+            inward: Whether ``/in`` is allowed.
+
+        Raises:
+            PathError: No such source, or ``/in`` is not allowed.
+            ValueRangeError: There is no pattern, or there are too many.
+
+        """
         if not patterns:
             raise ValueRangeError("no pattern is given: a path, structure, glob, or a source's name for all it has")
         if len(patterns) > MAX_PATTERNS:
@@ -67,13 +77,21 @@ class Selections:
         return {place: tuple(topics) for place, topics in wanted.items()}
 
     def commands(self, source: str) -> CommandClient:
-        """The way into a source as of now; PathError: a reload has removed it."""
+        """Return a source's command client. PathError: a reload has removed the source."""
         return self._topics.feed(source).commands
 
     async def select(self, wanted: TopicsBySource, *, frames: bool = False) -> list[View]:
-        """One for each place, in this order; ``frames``: raw ones.
+        """Return one view for each source and direction, in order.
 
-        PathError: no such register; ValueRangeError: too much for one call; EndpointError: for all clients together.
+        Args:
+            wanted: The topics, by source and direction.
+            frames: Return views of raw frames.
+
+        Raises:
+            PathError: No such register.
+            ValueRangeError: Too much for one call.
+            EndpointError: Too much for all clients together.
+
         """
         views = []
         budget = _Budget()
@@ -83,7 +101,7 @@ class Selections:
         return views
 
     async def registers(self, wanted: TopicsBySource) -> Selection:
-        """That of the one place there is; of no registers, if no topic is named."""
+        """Return the view of a single source; it has no registers if no topic is given."""
         ((place, topics),) = wanted.items()
         if not topics:
             block = self._topics.feed(place.source).block
@@ -94,11 +112,11 @@ class Selections:
         return view
 
     async def _view(self, place: SourceDirection, topics: Sequence[Topic], budget: _Budget) -> View:
-        """``topics``: none for raw frames."""
+        """Return a cached or new view. ``topics``: empty for raw frames."""
         block = self._topics.feed(place.source).block
         key = block.section, place.inward, tuple(topic.path for topic in topics)
         if (view := self._known.get(key)) is None:
-            async with self._turn:  # one at a time, and not on the loop: a large layout and its patterns take seconds
+            async with self._turn:  # one at a time, in a thread: a large layout takes seconds
                 view = self._known.get(key)
                 if view is None:
                     view = self._known[key] = await self._make(block, topics, budget, inward=place.inward)
@@ -128,7 +146,7 @@ class Selections:
 
 
 class _Budget:
-    """What is left of a call's limits."""
+    """The rest of a call's limits."""
 
     def __init__(self) -> None:
         self.registers, self.elements, self.matches = MAX_REGISTERS, MAX_ELEMENTS, MAX_MATCHES
@@ -140,7 +158,7 @@ class _Budget:
             self.elements -= view.elements
 
     def check(self, registers: int, elements: int) -> None:
-        """ValueRangeError: too many."""
+        """Raise ValueRangeError if there are too many registers or elements."""
         if registers > self.registers or elements > self.elements:
             raise ValueRangeError(
                 f"the patterns name more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the most of one "
@@ -148,7 +166,7 @@ class _Budget:
             )
 
     def match(self, registers: int) -> None:
-        """ValueRangeError: too many patterns with a star for so large a block."""
+        """Count a star pattern. ValueRangeError: too many for the size of the blocks."""
         self.matches -= registers
         if self.matches < 0:
             raise ValueRangeError(

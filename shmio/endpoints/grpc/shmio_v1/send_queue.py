@@ -1,4 +1,4 @@
-"""Messages that wait to be read by one client, of which none may be left out."""
+"""A queue of messages for one client, none of which may be dropped."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_WAITING: Final = 4096
 
 
 class SendQueue:
-    """Up to a number of them, and of bytes."""
+    """A queue with bounds on the number and the size of its messages."""
 
     def __init__(self) -> None:
         self._messages: deque[bytes] = deque()
@@ -21,7 +21,7 @@ class SendQueue:
         return bool(self._messages)
 
     def add(self, message: bytes) -> str:
-        """Add one; why not, or empty."""
+        """Add a message; return why it does not fit, or an empty text."""
         if self._load.full(message, MAX_WAITING):
             return f"{self._load.count} messages wait to be read: the client is too slow for what is told"
         self._load.add(message)
@@ -29,11 +29,11 @@ class SendQueue:
         return ""
 
     def pop(self) -> bytes:
-        """The oldest."""
+        """Remove and return the oldest message."""
         message = self._messages.popleft()
         self._load.remove(message)
         return message
 
     def all(self) -> bytes:
-        """All that wait, one behind the other."""
+        """Remove all messages and return them concatenated."""
         return b"".join([self.pop() for _ in range(len(self._messages))])

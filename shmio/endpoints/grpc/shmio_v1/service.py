@@ -32,11 +32,11 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 MAX_STREAMS: Final = 256
-"""Subscribe calls that may be open at once."""
+"""Bound of the open Subscribe calls."""
 
 
 class ShmioV1:
-    """Serves the registers of all sources typed and packed."""
+    """Serves the registers of all sources, typed and packed."""
 
     name = SERVICE
 
@@ -49,7 +49,7 @@ class ShmioV1:
         stepper: Stepper,
         open_streams: OpenStreams,
     ) -> None:
-        """``audience``: what its streams are a part of."""
+        """``open_streams`` counts these streams together with those of other services."""
         self._feeds = feeds
         self._segment = segment
         self._selections = Selections(topics)
@@ -66,16 +66,16 @@ class ShmioV1:
 
     @property
     def streams(self) -> int:
-        """Subscribe calls that are open."""
+        """Number of open Subscribe calls."""
         return len(self._open)
 
     @property
     def updates(self) -> int:
-        """Updates sent on them since the start."""
+        """Number of updates sent by Subscribe calls since the start."""
         return self._ended_updates + sum(subscription.updates for subscription in self._open)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """The service's calls, for a server. Values are serialised where they are made, and once."""
+        """Return the handlers of the service's calls. Values are serialised where they are made."""
         unary, streaming = grpc.unary_unary_rpc_method_handler, grpc.unary_stream_rpc_method_handler
         calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
             "GetLayouts": streaming(
@@ -90,7 +90,7 @@ class ShmioV1:
         return calls
 
     async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
-        """The layouts of these sources, or of all. NOT_FOUND: no such source."""
+        """Stream the layouts of these sources, or of all. Status NOT_FOUND: no such source."""
         try:
             blocks = self._command_calls.blocks(request.sources)
         except ShmioError as error:
@@ -100,13 +100,16 @@ class ShmioV1:
                 yield part
 
     async def get_status(self, _: wire.GetStatusRequest, __: Context) -> wire.Status:
-        """As ``shmio-supervisor status --json`` has it."""
+        """Return what ``shmio-supervisor status --json`` prints."""
         return describe.status(self._segment)
 
     async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
-        """The present values, those of one source from one frame.
+        """Return the present values; those of one source are from one frame.
 
-        NOT_FOUND: no such register, INVALID_ARGUMENT: too many, RESOURCE_EXHAUSTED: too many of all clients together.
+        Statuses:
+            NOT_FOUND: No such register.
+            INVALID_ARGUMENT: Too many registers.
+            RESOURCE_EXHAUSTED: Too many registers of all clients together.
         """
         try:
             views = await self._selections.select(self._selections.resolve(request.patterns))
@@ -117,10 +120,13 @@ class ShmioV1:
             await refuse(context, error)
 
     async def subscribe(self, request: wire.SubscribeRequest, context: Context) -> AsyncIterator[bytes]:
-        """The present values, then what changes, or every frame.
+        """Stream the present values, then their changes or every frame.
 
-        NOT_FOUND: no such register, INVALID_ARGUMENT: too many, or options that are none; RESOURCE_EXHAUSTED: too many
-        streams, or registers of all clients together.
+        Statuses:
+            NOT_FOUND: No such register.
+            INVALID_ARGUMENT: Too many registers, or options that are not valid.
+            RESOURCE_EXHAUSTED: Too many streams, too many registers of all clients together, or
+                the client is too slow for steps or writes.
         """
         try:
             if len(self._open) >= MAX_STREAMS:
@@ -144,7 +150,7 @@ class ShmioV1:
             subscription.close()
 
     async def deliver(self, step: Step) -> None:
-        """Have all streams send what has changed in a step, and then say so; wait until they have."""
+        """Have all streams send a step's changes and its marker, and wait until they have."""
         marks = {subscription.mark(step): subscription for subscription in self._open}
         if marks:
             _, late = await asyncio.wait(marks, timeout=PATIENCE_S)
@@ -152,19 +158,19 @@ class ShmioV1:
                 marks[mark].give_up()
 
     def release(self) -> None:
-        """Time is real again: send whatever there is."""
+        """Have all streams send values as they come, because time is real again."""
         for subscription in self._open:
             subscription.wake()
 
     def move(self, sources: Collection[str]) -> None:
-        """Have the streams of these sources go over to the blocks that there are by now."""
+        """Switch the streams of these sources to their present blocks, after a reload."""
         self._simulate_calls.move()
         for subscription in self._open:
             subscription.move(sources)
 
 
 def _reading(view: View, *, originals: bool) -> bytes:
-    """A serialised ``Update`` of the newest frame."""
+    """Return a serialised ``Update`` of the newest frame."""
     frame = view.block.latest()
     if frame is None:
         return wire.Update(table=view.number, reason="no data yet", whole=True).SerializeToString()

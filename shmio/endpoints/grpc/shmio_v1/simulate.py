@@ -1,4 +1,4 @@
-"""Simulate: a stream on which a program elsewhere computes a source, step by step."""
+"""The call Simulate: a remote program (a model) computes a source, step by step."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 
 class OutputEncoder:
-    """Those of one table. What was found out about a slot or a path is kept."""
+    """Encodes a model's outputs into an image of the block; caches lookups of slots and paths."""
 
     def __init__(self, selection: Selection) -> None:
         self._selection = selection
@@ -42,7 +42,7 @@ class OutputEncoder:
         self._paths: dict[str, Register] = {}
 
     async def packed(self, values: wire.Values, image: bytearray) -> None:
-        """Values by slots, in turns. ValueRangeError: not of this table, or of a register's type."""
+        """Encode values by slot, in time slices. ValueRangeError: a slot or value does not fit."""
         for column, name in FIELDS.items():
             if not values.HasField(name):
                 continue
@@ -52,7 +52,7 @@ class OutputEncoder:
             slots = np.fromiter(part.slots or range(most), np.int64)
             if len(slots) != len(part.values):
                 raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
-            if len(slots) > max(1, most):  # else one message could hold up everybody
+            if len(slots) > max(1, most):  # else one message could delay all clients
                 raise ValueRangeError(f"{name}: {len(slots)} values, the table has {most}: give each once")
             if len(wrong := np.flatnonzero(slots >= most)):
                 raise ValueRangeError(f"{name}: the table has no slot {slots[wrong[0]]}")
@@ -63,7 +63,13 @@ class OutputEncoder:
                 self._put(*self._at(column, int(slots[at])), part.values[at], image)
 
     async def assigned(self, assignments: Any, image: bytearray) -> None:
-        """Values by paths, in turns. PathError: no such register in the table; ValueRangeError."""
+        """Encode values by path, in time slices.
+
+        Raises:
+            PathError: The table has no such register.
+            ValueRangeError: A value does not fit, or there are too many.
+
+        """
         if len(assignments) > (most := self._selection.elements):
             raise ValueRangeError(f"assignments: {len(assignments)} values, the table has {most}: give each once")
         if len(assignments) > MAX_VALUES:  # each is put in by itself
@@ -119,7 +125,7 @@ _VALUES, _INVALID = (wire.Do.DESCRIPTOR.fields_by_name[name].number for name in 
 
 
 class SimulateCalls:
-    """A part of the service: the models that are connected, one for a source at most."""
+    """The call that connects models, at most one per source."""
 
     def __init__(self, feeds: Mapping[str, Feed], segment: Segment) -> None:
         self._feeds = feeds
@@ -163,7 +169,7 @@ class SimulateCalls:
             await refuse(context, simulation.failure)
 
     async def _joining(self, requests: AsyncIterator[wire.SimulateRequest], peer: str) -> SimulateCall:
-        """What the first message asks for. PathError, CommandError, ConflictError, ValueRangeError."""
+        """Read the first message; raises PathError, CommandError, ConflictError, ValueRangeError."""
         async for request in requests:
             if request.WhichOneof("what") == "join":
                 block, name = self._block(request.join.source), request.join.name or peer
@@ -191,20 +197,20 @@ class SimulateCalls:
         return block
 
     def _release(self, simulation: SimulateCall, _: object = None) -> None:
-        """Have its source free for another one, if it is not yet."""
+        """Disconnect a model, so that another one can join its source."""
         if self._open.get(simulation.block.section) is simulation:
             del self._open[simulation.block.section]
             simulation.leave()
             self._ring(simulation.block)
 
     def _ring(self, block: Block) -> None:
-        """Have the source look who is connected."""
+        """Wake the source, so that it notices who is connected."""
         for slot in self._segment.processes:
             if slot.name == block.source:
                 self._segment.clock.slot_bell(slot.index).ring()
 
     def move(self) -> None:
-        """A reload has ended some blocks."""
+        """End the calls whose blocks a reload has ended."""
         for simulation in self._open.values():
             if simulation.block.retired:
                 source = simulation.block.source
@@ -212,23 +218,23 @@ class SimulateCalls:
 
 
 class SimulateCall:
-    """One call of Simulate."""
+    """One call of Simulate: a model that computes a source."""
 
     def __init__(self, block: Block, segment: Segment, name: str, peer: str) -> None:
         self.block = block
         self.name = name
         self.peer = peer
         self.failure: ShmioError | None = None
-        """Why it is over, if its client is to be told."""
+        """The error that ended the call; None: there is none to report."""
         self._segment = segment
         self._joined = False
         self._over = False
         self._wake = asyncio.Event()
         self._bell: WakeUp | None = None  # rings when the source has asked for a step
         self._handed = 0
-        self._asked: ModelRequest | None = None  # what the model has in hand
+        self._asked: ModelRequest | None = None  # the step that the model computes now
         self._given: DecodedImage | None = None
-        self._image: bytearray | None = None  # with the outputs as the model has set them
+        self._image: bytearray | None = None  # with the model's latest outputs
         self._refused = ""
 
     @property
@@ -263,7 +269,7 @@ class SimulateCall:
         return field(_JOINED, joined.SerializeToString() + parts)
 
     def leave(self) -> None:
-        """Give the link back."""
+        """Leave the source's model channel."""
         self._over = True
         if self._joined:
             self._link.leave()
@@ -271,15 +277,15 @@ class SimulateCall:
             self._bell.stop()
 
     def end(self, failure: ShmioError | None = None) -> None:
-        """Have the stream end."""
+        """End the stream, with an error if one is given."""
         self.failure = self.failure or failure
         self._over = True
         self._wake.set()
 
-    # ---- down: what is to be done ------------------------------------------------------------------------------
+    # ---- requests to the model -----------------------------------------------------------------
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Serialised SimulateResponses, until it is over."""
+        """Yield serialised SimulateResponses until the call is over."""
         while not self._over:
             self._wake.clear()  # before looking
             if self._asked is None and (ask := self._newest()) is not None:
@@ -289,7 +295,7 @@ class SimulateCall:
                 await self._wake.wait()
 
     def _newest(self) -> ModelRequest | None:
-        """The step that the source waits for, unless it has been handed out."""
+        """Return the step that the source waits for, or None if the model has it already."""
         link = self._link
         if link.asked.head() == self._handed or (ask := link.newest()) is None:
             return None
@@ -297,7 +303,7 @@ class SimulateCall:
         return ask if ask.until_ns > time.monotonic_ns() else None
 
     def _work(self, ask: ModelRequest) -> bytes:
-        """A serialised ``Do``: all inputs at first, then those that differ from what the model has."""
+        """Return a serialised ``Do``: all inputs the first time, later those that have changed."""
         before, now = self._given, self._inputs.columns.decode(ask.commanded)
         self._given = now
         work = wire.Do(
@@ -309,10 +315,10 @@ class SimulateCall:
             work += field(_INVALID, field(1, np.array(now.invalid, "<u4").tobytes()))
         return work
 
-    # ---- up: what has become of it -----------------------------------------------------------------------------
+    # ---- answers of the model ------------------------------------------------------------------
 
     async def take(self, requests: AsyncIterator[wire.SimulateRequest]) -> None:
-        """Take the model's answers, until it half-closes. ValueRangeError: one to what was not asked."""
+        """Process the model's answers until it half-closes. ValueRangeError: one is unexpected."""
         async for request in requests:
             if request.WhichOneof("what") != "done":
                 raise ValueRangeError("a model joins once, by the first message; all others answer steps")
@@ -320,7 +326,7 @@ class SimulateCall:
         self.end()
 
     def taken(self, task: asyncio.Task[None]) -> None:
-        """The task of :meth:`take` has ended."""
+        """End the call when the task of :meth:`take` has ended."""
         if not task.cancelled():
             error = task.exception()
             self.end(error if isinstance(error, ShmioError) else None)
@@ -352,7 +358,13 @@ class SimulateCall:
 
 
 def _tables(block: Block) -> tuple[Selection, Selection]:
-    """Inputs and outputs. ValueRangeError: they are too many; ConfigError."""
+    """Return the tables of inputs and outputs.
+
+    Raises:
+        ValueRangeError: They are too large.
+        ConfigError: The declared outputs do not fit the layout.
+
+    """
     ends = model_ports(block.layout, block.attributes.outputs, block.attributes.inouts)
     tables = Selection(1, block, ends.inputs), Selection(2, block, ends.outputs)
     for table in tables:

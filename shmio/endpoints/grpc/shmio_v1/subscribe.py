@@ -1,4 +1,4 @@
-"""Subscribe: one stream over any number of blocks."""
+"""The call Subscribe: one stream over any number of blocks."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from shmio.local.time_control import Step
 from shmio.wire import shmio_v1_pb2 as wire
 
 BATCH_BYTES: Final = 1 << 18
-"""What has come of all blocks goes out in one message up to this size."""
+"""Size up to which the updates of all blocks are sent in one message."""
 BATCH_UPDATES: Final = 256
-"""And up to so many of frames, however small, which takes milliseconds: then others have their turn."""
+"""Bound of one message's frame updates, which take milliseconds: then other tasks run."""
 MAX_RATE_HZ: Final = 1e6
 
 TABLES, UPDATES, ENDED, STEP = (
@@ -32,7 +32,7 @@ TABLES, UPDATES, ENDED, STEP = (
 
 
 def check(request: wire.SubscribeRequest) -> None:
-    """ValueRangeError: options that are none, or do not go together."""
+    """Raise ValueRangeError if options are not valid or do not go together."""
     if request.mode not in wire.Mode.values() or request.format not in wire.Format.values():
         raise ValueRangeError(f"mode {request.mode}, format {request.format}: this version has 0 and 1 of each")
     for name, value, most in (
@@ -55,11 +55,11 @@ class SubscribeCall:
     def __init__(
         self, selections: Selections, wake_ups: WakeUps, virtual_time: VirtualTime, request: wire.SubscribeRequest
     ) -> None:
-        """``hold``: virtual time. PathError, ValueRangeError: as of the request."""
+        """Check the request. Raises PathError or ValueRangeError."""
         check(request)
         self.updates = 0
         self.late = False
-        """Whether a step has waited too long for it; see :meth:`give_up`."""
+        """Whether a step has waited too long for the client; see :meth:`give_up`."""
         self._virtual_time = virtual_time
         self._opened = False
         self._step_marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
@@ -71,44 +71,50 @@ class SubscribeCall:
             raise ValueRangeError("what is written has no raw frames: leave out /in, or ask for the format VALUES")
         self._followers: dict[SourceDirection, BlockFollower] = {}
         self._inward: dict[SourceDirection, WriteFollower] = {}
-        self._rings: dict[SourceDirection, Callback] = {}  # what their bells call
+        self._rings: dict[SourceDirection, Callback] = {}  # the callbacks of their wake-ups
         self._moved: dict[SourceDirection, None] = {}
         self._turn = 0
         self._wake = asyncio.Event()
         self._clock = asyncio.get_running_loop().time
 
     async def open(self) -> bytes:
-        """Join all blocks; the tables. PathError, ValueRangeError, EndpointError."""
+        """Start following all blocks; return the tables.
+
+        Raises PathError, ValueRangeError and EndpointError as :meth:`Selections.select`.
+        """
         views = await self._selections.select(self._wanted, frames=self._request.format == wire.FORMAT_FRAMES)
         self._opened = True
         return b"".join(map(self._join, self._wanted, views))
 
     def close(self) -> None:
-        """Leave them."""
+        """Stop following the blocks."""
         while self._step_marks:
             _set(self._step_marks.popleft()[1])
         for place in self._wanted:
             self._leave(place)
 
     def give_up(self) -> None:
-        """Nothing waits for it any more, and it ends as soon as its client reads again; what it holds goes at once."""
+        """End a call that is too slow for steps: release all now, end when the client reads."""
         self.late = True
         self.close()
         self._wake.set()
 
     def wake(self) -> None:
-        """Look for what may be sent by now."""
+        """Wake the stream to look for updates."""
         self._wake.set()
 
     def move(self, sources: Collection[str]) -> None:
-        """A reload has changed these sources."""
+        """Switch these sources to their present blocks, after a reload."""
         self._moved |= dict.fromkeys(place for place in self._wanted if place.source in sources)
         self._wake.set()
 
     def mark(self, step: Step) -> asyncio.Future[None]:
-        """Say that a step is over, when all that has changed in it is sent; what is done then, or when this ends.
+        """Have a step's marker sent after its changes.
 
-        Before the tables are there, which takes seconds for a large layout, it is done at once.
+        Returns:
+            A future that is done when the marker was sent or the call has ended. Before
+            :meth:`open` has returned, which takes seconds for a large layout, it is done at once.
+
         """
         sent = asyncio.get_running_loop().create_future()
         if self.late or not self._opened:
@@ -119,9 +125,9 @@ class SubscribeCall:
         return sent
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Serialised SubscribeResponses, without end.
+        """Yield serialised SubscribeResponses without end.
 
-        EndpointError: a step, or what was written, has waited too long to be read.
+        EndpointError: the client is too slow for steps or writes.
         """
         while not self.late:
             for inward in self._inward.values():
@@ -146,9 +152,9 @@ class SubscribeCall:
         raise EndpointError("a step has waited too long to be read: this client is too slow for how time is stepped")
 
     def _batch(self) -> tuple[bytes, bool]:
-        """What there is at present, up to a bound, first what was written, then of each block in turn.
+        """Return the present updates up to a bound, and whether these are all.
 
-        And whether it is all there is.
+        Writes come first, then the updates of the blocks in turn.
         """
         parts: list[bytes] = []
         size, now_s = 0, self._clock()
@@ -159,7 +165,7 @@ class SubscribeCall:
                 parts.append(field(UPDATES, written))
         waiting = deque(follower for follower in self._followers.values() if self._open(follower))
         waiting.rotate(self._turn)
-        self._turn += 1  # else one with long updates would hide the others
+        self._turn += 1  # else a block with long updates would starve the others
         most = len(parts) + BATCH_UPDATES
         while waiting and size < BATCH_BYTES and len(parts) < most:
             update = waiting[0].next(now_s)
@@ -173,12 +179,15 @@ class SubscribeCall:
         return b"".join(parts), not (waiting or any(inward.waits for inward in self._inward.values()))
 
     def _open(self, follower: BlockFollower) -> bool:
-        """Whether a block may be shown now: on the instance's clock, in virtual time, only when a step is over."""
+        """Return whether a block's updates may be sent now.
+
+        In virtual time those of a block on the instance's clock wait for the end of a step.
+        """
         held = self._virtual_time.on and follower.view.block.attributes.stepped
         return not held or bool(self._step_marks) or not follower.begun
 
     def _ring(self, follower: BlockFollower) -> None:
-        """Its block has something new."""
+        """Wake the stream, because the follower's block has something new."""
         if self._open(follower):
             self._wake.set()
 
@@ -194,7 +203,7 @@ class SubscribeCall:
             handle.cancel()
 
     async def _go_over(self, place: SourceDirection) -> bytes:
-        """Follow the block that a source has by now, or say that it has none; all of the old one was sent."""
+        """Follow a source's present block, or report that it has none, after all of the old one."""
         self._leave(place)
         try:
             (view,) = await self._selections.select(

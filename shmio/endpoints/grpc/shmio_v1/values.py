@@ -1,4 +1,4 @@
-"""Values that clients send: one by one by path, or packed by a table's slots."""
+"""Reads values that clients send, by path or packed by a table's slots; encodes outcomes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.segment import EventKind
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_VALUES: Final = 4096
-"""Of one command."""
+"""Bound of one command's values."""
 
 FIELDS: Final = {column: wire.Values.DESCRIPTOR.fields_by_number[column].name for column in Column}
 _OUTCOMES: Final = {
@@ -33,12 +33,19 @@ _OUTCOMES: Final = {
 
 
 def outcome(kind: EventKind, reason: str) -> wire.Outcome:
-    """What became of a value, for the client."""
+    """Convert an outcome to a message."""
     return wire.Outcome(kind=_OUTCOMES.get(kind, wire.Outcome.KIND_UNKNOWN), reason=reason)
 
 
 async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
-    """The source, and values by path, found in turns. PathError, ValueRangeError; CommandError: ``/out``."""
+    """Read values by path, in time slices; return their source, and the values.
+
+    Raises:
+        PathError: No such register.
+        ValueRangeError: A value does not fit, several sources, too many values, or none.
+        CommandError: A path ends in ``/out``.
+
+    """
     if len(assignments) > MAX_VALUES:  # before looking at any
         raise ValueRangeError(
             f"{len(assignments)} values, {MAX_VALUES} are the most: write whole arrays, or less at once"
@@ -62,14 +69,14 @@ async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, obj
 
 
 def plain(value: wire.Value, register: Register) -> object:
-    """A value as Python has it; ValueRangeError: there is none, or no text of its type."""
+    """Convert a value to Python. ValueRangeError: it is missing, or a text does not fit."""
     if value.WhichOneof("kind") == "text" and (register.dims or wire_type(register) != "string"):
         return from_text(value.text, register)
     return value_from_wire(value, register.path)
 
 
 def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
-    """Values by path, of registers or of arrays' elements. ValueRangeError: not of this table."""
+    """Read values by slot as values by path. ValueRangeError: they do not fit the table."""
     found: dict[str, object] = {}
     for column, name in FIELDS.items():
         if not values.HasField(name):
@@ -86,7 +93,7 @@ def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
 
 
 def _path(selection: Selection, column: Column, slot: int) -> str:
-    """The path of the register or element at a slot; ValueRangeError."""
+    """Return the path of the register or element at a slot. ValueRangeError: no such slot."""
     place = selection.columns.place(column, slot)
     if place is None:
         raise ValueRangeError(f"{column.name.lower()}s: the table has no slot {slot}")
@@ -98,7 +105,7 @@ def _path(selection: Selection, column: Column, slot: int) -> str:
 
 
 def index_of(register: Register, flat: int) -> Iterator[int]:
-    """The declared indices of an array's element."""
+    """Return the declared indices of an array element."""
     indices = []
     for low, high in reversed(register.dims):
         flat, rest = divmod(flat, high - low + 1)

@@ -1,4 +1,4 @@
-"""What patterns name on one block as one table, and the block's frames as messages of it."""
+"""Views of a block: a table of registers, or raw frames, with the updates made of frames."""
 
 from __future__ import annotations
 
@@ -30,17 +30,20 @@ Places = np.ndarray[Any, np.dtype[Any]]
 
 
 class UpdateMessage(NamedTuple):
-    """A serialised ``Update`` in two parts. ``body``: what has changed; empty, if nothing has."""
+    """A serialised ``Update`` in two parts. ``body``: the changes; empty if there are none."""
 
     head: bytes
     body: bytes
 
 
 class Selection:
-    """Registers of one block as one table, and what becomes of its frames. For the event loop's thread, once made."""
+    """A table of registers of one block; it makes updates of frames, once for all subscribers.
+
+    After creation it is for the event loop's thread.
+    """
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], *, inward: bool = False) -> None:
-        """``inward``: it is about what is written to them."""
+        """``inward``: the table is for writes to the registers."""
         self.number = number
         self.inward = inward
         self.block = block
@@ -53,7 +56,7 @@ class Selection:
 
     @cached_property
     def writes(self) -> WriteUpdates:
-        """What becomes of what is written to them."""
+        """Makes the updates about writes to the registers."""
         return WriteUpdates(self.number, self.block, self.registers, self.columns)
 
     @cached_property
@@ -73,7 +76,7 @@ class Selection:
         return table.SerializeToString()
 
     def decode(self, frame: Frame) -> DecodedImage:
-        """All elements of a frame as consumers see it."""
+        """Decode a frame as consumers see it, with injections; cached."""
         found = self._decoded.get(frame.number)
         if found is None:
             found = self._decoded[frame.number] = self.columns.decode(frame.image)
@@ -81,9 +84,9 @@ class Selection:
         return found
 
     def update(self, frame: Frame, before: Frame | None = None) -> UpdateMessage:
-        """An ``Update``: what differs from the frame before; all of it, if there is none.
+        """Return an ``Update`` with the changes since ``before``, or with everything; cached.
 
-        Its quality is that which the frame was published with.
+        Its quality is the one that the frame was published with.
         """
         if before is not None and not before.source_ns:
             before = None
@@ -98,7 +101,10 @@ class Selection:
     def update_beyond(
         self, frame: Frame, before: Frame, sent: DecodedImage, deadband: float
     ) -> tuple[UpdateMessage, DecodedImage]:
-        """The same with a dead-band, for who was sent that much; and what it has then."""
+        """Return an ``Update`` with a dead-band, and what the receiver has after it.
+
+        ``sent``: what the receiver has now.
+        """
         new = self.decode(frame)
         return self._update(frame, before, new, sent, deadband), merge(new, sent, deadband)
 
@@ -117,14 +123,14 @@ class Selection:
         return UpdateMessage(head(self.number, frame, whole=before is None), b"".join(parts))
 
     def originals(self, frame: Frame) -> bytes:
-        """The serialised ``Values`` that the source delivered."""
+        """Return the serialised ``Values`` as the source delivered them."""
         return pack(self.columns.decode(frame.raw))
 
     def injected(self, frame: Frame) -> Places:
-        """Places of the registers that are under an injection over ``/out``, by what stood when it was asked first."""
+        """Return the indices of registers under an injection over ``/out``; cached by event."""
         if frame.effective is None:
             return _NO_PLACES
-        found = self._injected_places.get(frame.event)  # nothing is laid or lifted without an event
+        found = self._injected_places.get(frame.event)  # injections change only with an event
         if found is None:
             found = self._injected_places[frame.event] = self._under_injections()
             _trim(self._injected_places)
@@ -143,7 +149,7 @@ class Selection:
 
     @cached_property
     def _extents(self) -> tuple[Places, ...]:
-        """First byte, the one after the last, and of a single bit its mask, by register."""
+        """For each register, its first byte, the byte after its last, and a single bit's mask."""
         starts = [register.offset for register in self.registers]
         stops = [register.offset + register.size for register in self.registers]
         masks = [0 if register.bit is None or register.dims else 1 << register.bit for register in self.registers]
@@ -151,7 +157,7 @@ class Selection:
 
 
 class RawFrames:
-    """A block of which somebody wants raw frames; as a :class:`Selection` of no registers."""
+    """A view of a block's raw frames, with the methods of a :class:`Selection`."""
 
     def __init__(self, number: int, block: Block) -> None:
         self.number = number
@@ -172,7 +178,7 @@ class RawFrames:
         ).SerializeToString()
 
     def update(self, frame: Frame, before: Frame | None = None) -> UpdateMessage:  # noqa: ARG002  a frame is always whole
-        """An ``Update`` with both images, if they are two."""
+        """Return an ``Update`` with the image, and with the original one under an injection."""
         found = self._updates.get(frame.number)
         if found is None:
             body = field(IMAGE, frame.image) if frame.source_ns else b""
@@ -187,7 +193,7 @@ View = Selection | RawFrames
 
 
 def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
-    """A serialised ``Update`` without values."""
+    """Return a frame's serialised ``Update`` without values."""
     return wire.Update(
         table=table,
         frame=frame.number,
@@ -203,7 +209,7 @@ def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
 
 
 def describe(register: Register, found: wire.Register, column: Column | None = None, slot: int = 0) -> None:
-    """Fill in a register's description."""
+    """Fill in a message with a register's description."""
     found.path, found.type = register.path, register.type
     found.offset, found.size, found.count = register.offset, register.size, register.count
     found.column = int(column or column_of(register.element))  # type: ignore[assignment]

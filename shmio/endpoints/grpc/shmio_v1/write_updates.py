@@ -1,4 +1,4 @@
-"""What is written to registers, for those who subscribe to their ``/in``."""
+"""Updates about writes, for subscribers to ``/in``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NOBODY: Final = (0, 0, 0)
 
 
 def head_of(table: int, event: Event) -> bytes:
-    """A serialised ``Update`` without values, about what an event tells of."""
+    """Return a serialised ``Update`` for an event, without values."""
     return wire.Update(
         table=table,
         frame=event.frame,
@@ -37,10 +37,10 @@ def head_of(table: int, event: Event) -> bytes:
 
 
 class WriteUpdates:
-    """What is written to a table's registers, each part of a command once for all who listen. For the loop's thread."""
+    """Encodes writes to a table's registers, once for all subscribers. For the loop's thread."""
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], columns: Columns) -> None:
-        """``number``: the table's."""
+        """``number`` is that of the table."""
         self._number = number
         self._block = block
         self._columns = columns
@@ -51,10 +51,10 @@ class WriteUpdates:
         self._update = b""
 
     def of(self, event: Event) -> bytes:
-        """The serialised ``Update`` of what a source has accepted by an event; empty: nothing of the table.
+        """Return the serialised ``Update`` of an accepted write; empty: it is not in the table.
 
-        Of an element that is written in part, the rest is as in the frame before the command. An element whose other
-        part is in the command's next event comes with that.
+        If an element is written in part, the rest is taken from the frame before the command. An
+        element that the command's next event completes is left to that event.
         """
         if event.number != self._event:
             self._event, self._update = event.number, self._make(event)
@@ -82,12 +82,12 @@ class WriteUpdates:
 
 
 class WriteFollower:
-    """A subscriber's place in what is written: a queue, for none of it may be left out."""
+    """Follows the writes to a table for one subscriber, in a queue from which none is dropped."""
 
     def __init__(self, writes: WriteUpdates, commands: CommandClient, ring: Callable[[], None]) -> None:
-        """``ring``: called when there is something."""
+        """``ring`` is called when there is an update."""
         self.failure = ""
-        """Why what comes next is not all there was; empty: it is."""
+        """Why writes are missing; empty: none are."""
         self._writes = writes
         self._commands = commands
         self._ring = ring
@@ -95,27 +95,27 @@ class WriteFollower:
         commands.followers.listen(self)
 
     def leave(self) -> None:
-        """Listen no more."""
+        """Stop following writes."""
         self._commands.followers.leave(self)
 
     @property
     def waits(self) -> bool:
-        """Whether there is something."""
+        """Whether an update waits."""
         return bool(self._waiting)
 
     def next(self) -> bytes | None:
-        """The next serialised ``Update``, if there is one."""
+        """Return the next serialised ``Update``, or None."""
         return self._waiting.pop() if self._waiting else None
 
     def accept(self, event: Event) -> None:
-        """The source has accepted this part of a command."""
+        """Queue a part of a command that the source has accepted."""
         if not self.failure and (update := self._writes.of(event)):
             if reason := self._waiting.add(update):
                 self.fail(reason)
             self._ring()
 
     def fail(self, reason: str) -> None:
-        """What comes next is not all there was: what waits is not given either, and nothing more is kept."""
+        """Fail because writes are missing; discard what waits, and stop following."""
         self.failure = self.failure or reason
         self._waiting = SendQueue()
         self.leave()
