@@ -12,8 +12,8 @@ from typing import Final
 
 import msgspec
 
-from shmio.cli.cell import Campaign, Cell, Happened
-from shmio.cli.interrupt import told_to_stop
+from shmio.cli.cell import Campaign, CampaignEvent, Cell
+from shmio.cli.interrupt import stop_on_signals
 from shmio.cli.run import dumps
 from shmio.config import Declaration
 from shmio.config.campaign import read_campaign
@@ -38,7 +38,7 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
         declarations = [_shifted(declaration, now_s) for declaration in declarations]
     else:
         _refuse_past(declarations, now_s)
-    with told_to_stop() as over, cell.declare(declarations, keep=options.keep) as campaign:
+    with stop_on_signals() as over, cell.declare(declarations, keep=options.keep) as campaign:
         if any(declaration.seed is None for declaration in read):
             told = dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again"
             print(told, flush=True)
@@ -83,7 +83,7 @@ def _shifted(declaration: Declaration, now_s: float) -> Declaration:
     return msgspec.structs.replace(declaration, start_s=(declaration.start_s or 0) + now_s, end_s=end_s)
 
 
-def _print(happened: Happened, *, as_json: bool) -> None:
+def _print(happened: CampaignEvent, *, as_json: bool) -> None:
     """A line: the instance's clock, the cycle, what happened to which."""
     time_s, cycle, source, number, what, text = happened
     if as_json:

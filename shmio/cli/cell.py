@@ -28,7 +28,7 @@ class Selected(NamedTuple):
         return f"{self.source}/{self.register.path}"
 
 
-class News(NamedTuple):
+class Change(NamedTuple):
     """A reading that differs from the one before. ``width``: of the longest path that is watched."""
 
     what: Selected
@@ -45,7 +45,7 @@ class Shadow(Protocol):
         """Give values by path; what became of each."""
 
 
-class Happened(NamedTuple):
+class CampaignEvent(NamedTuple):
     """What was done with a declared injection: ``what``, at which time of the instance's clock."""
 
     time_s: float
@@ -63,7 +63,7 @@ class Campaign(Protocol):
     def stands(self) -> bool:
         """Whether any of it does, by what :meth:`news` has told."""
 
-    def news(self) -> list[Happened]:
+    def news(self) -> list[CampaignEvent]:
         """What has happened since it was asked last, or was laid."""
 
 
@@ -80,7 +80,7 @@ class Cell(Protocol):
     def readings(self, patterns: Sequence[str], chosen: Sequence[Selected]) -> list[Reading]:
         """The chosen registers as of now, which are what the patterns name; those of one source from one frame."""
 
-    def news(self, patterns: Sequence[str]) -> Iterator[News]:
+    def news(self, patterns: Sequence[str]) -> Iterator[Change]:
         """The present readings of all that the patterns name, then each that changes. NotRunningError at the end."""
 
     def write(self, values: Mapping[str, object], timeout_s: float | None) -> Sequence[Outcome]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli.interrupt import ended_by_interrupt, undone_by_signals
+from shmio.cli.interrupt import ended_by_interrupt, exit_on_signals
 from shmio.cli.run import add_full, add_json, complete, run
 
 PROGRAM = "shmio-dump"
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = verb.execute(arguments)
         return status
 
-    with undone_by_signals():  # a file that is being made is removed again
+    with exit_on_signals():  # a file that is being made is removed again
         return run(PROGRAM, command, arguments)
 
 

@@ -11,7 +11,7 @@ import msgspec
 
 from shmio.cli.campaign import run_campaign
 from shmio.cli.cell import Cell
-from shmio.cli.interrupt import told_to_stop
+from shmio.cli.interrupt import stop_on_signals
 from shmio.cli.run import dumps, seconds
 from shmio.cli.set import Pairs, read_value
 from shmio.errors import CommandError, PathError, ValueRangeError
@@ -95,7 +95,7 @@ def _read(cell: Cell, path: str, text: str) -> tuple[Topic, Value]:
 
 def _wait(for_s: float | None) -> None:
     """Until Ctrl-C, SIGTERM or the time is over; then all is lifted."""
-    with told_to_stop() as over:
+    with stop_on_signals() as over:
         over.wait(for_s)
 
 

@@ -11,7 +11,7 @@ from types import FrameType
 
 
 @contextmanager
-def told_to_stop() -> Iterator[threading.Event]:
+def stop_on_signals() -> Iterator[threading.Event]:
     """An event that is set by the first of these signals; whoever heeded them before does so again afterwards.
 
     SIGHUP counts unless it is ignored, as by nohup.
@@ -48,7 +48,7 @@ def ended_by_interrupt() -> Iterator[None]:
 
 
 @contextmanager
-def undone_by_signals() -> Iterator[None]:
+def exit_on_signals() -> Iterator[None]:
     """SIGTERM and a closed terminal end what is at work as Ctrl-C does, by an exception: nothing is left half done.
 
     The exit status is 128 + n, as shells have it. What was ignored, as SIGHUP is under nohup, still is.

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Final
 
-from shmio.cli.cell import Happened, News, Selected
+from shmio.cli.cell import CampaignEvent, Change, Selected
 from shmio.cli.readings import choose
 from shmio.config import Declaration
 from shmio.errors import CommandError, NotRunningError, PathError
@@ -54,7 +54,7 @@ class Local:
         frames = {source: block.latest() for source, block in blocks.items()}
         return [reading(blocks[one.source], one.register, frames[one.source]) for one in chosen]
 
-    def news(self, patterns: Sequence[str]) -> Iterator[News]:
+    def news(self, patterns: Sequence[str]) -> Iterator[Change]:
         """What all blocks report; a thread waits on each.
 
         NotRunningError: the instance has stopped, or a reload has removed a source or a register.
@@ -73,7 +73,7 @@ class Local:
                 self._check_running()
                 chosen = self._choose_again(patterns, {one.source for one in chosen})
                 width = self._follow_new(chosen, followed, news)
-            yield from (News(Selected(block.source, register), now, width) for block, register, now in batch)
+            yield from (Change(Selected(block.source, register), now, width) for block, register, now in batch)
 
     def _check_running(self) -> None:
         if not self.attachment.current:
@@ -173,15 +173,15 @@ class LocalCampaign:
         """Whether any of it does."""
         return bool(self._laid)
 
-    def news(self) -> list[Happened]:
+    def news(self) -> list[CampaignEvent]:
         """What has happened since."""
         return [happened for source, cursor in self._cursors.items() for happened in self._of(source, cursor)]
 
-    def _of(self, source: str, cursor: Cursor[Event]) -> Iterator[Happened]:
+    def _of(self, source: str, cursor: Cursor[Event]) -> Iterator[CampaignEvent]:
         while (event := cursor.next(0)) is not None:
             if event.kind in _TOLD and event.injection in self._laid and event.offset == 0:  # of parts the first
                 time_s, what = event.clock_ns / 1e9, str(EventKind(event.kind))
-                yield Happened(time_s, event.cycle, source, event.injection, what, event.text)
+                yield CampaignEvent(time_s, event.cycle, source, event.injection, what, event.text)
                 if event.kind == EventKind.LIFTED:
                     del self._laid[event.injection]
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from shmio.cli.cell import Campaign, Happened, News, Selected, Shadow
+from shmio.cli.cell import Campaign, CampaignEvent, Change, Selected, Shadow
 from shmio.cli.readings import choose
 from shmio.client import BlockLayout, Client, Happening, Outcome, Update, connect
 from shmio.client import Campaign as ClientCampaign
@@ -94,7 +94,7 @@ class Remote:
             readings.append(_reading(update, update.table.places[one.register.path]))
         return readings
 
-    def news(self, patterns: Sequence[str]) -> Iterator[News]:
+    def news(self, patterns: Sequence[str]) -> Iterator[Change]:
         """The present readings of all that the patterns name, then each that changes.
 
         RemoteError: the instance has ended; NotRunningError: a reload has removed a source or a register.
@@ -115,7 +115,7 @@ class Remote:
                 seen = repr(now.value), now.quality, now.reason.partition(":")[0]
                 if shown.get(what.path) != seen:
                     shown[what.path] = seen
-                    yield News(what, now, width)
+                    yield Change(what, now, width)
 
     def write(self, values: Mapping[str, object], timeout_s: float | None) -> list[LocalOutcome]:
         """Write registers of one source as one command."""
@@ -230,7 +230,7 @@ class _RemoteCampaign:
         """Whether any of it does."""
         return bool(self._left)
 
-    def news(self) -> list[Happened]:
+    def news(self) -> list[CampaignEvent]:
         """What has happened since. RemoteError: the instance has ended."""
         found = []
         while not self._told.empty():
@@ -240,7 +240,7 @@ class _RemoteCampaign:
             if one.what == "lifted":
                 self._left.discard(one.number)
             text = one.text or self._names[one.number]
-            found.append(Happened(one.clock_ns / 1e9, one.cycle, one.source, one.number, one.what, text))
+            found.append(CampaignEvent(one.clock_ns / 1e9, one.cycle, one.source, one.number, one.what, text))
         return found
 
 

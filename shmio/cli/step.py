@@ -10,7 +10,7 @@ import msgspec
 
 from shmio.cli.cell import Cell
 from shmio.cli.instance.status import clock_line
-from shmio.cli.interrupt import told_to_stop
+from shmio.cli.interrupt import stop_on_signals
 from shmio.cli.run import at_least, dumps
 from shmio.errors import CommandError, ValueRangeError
 from shmio.local.status import clock_status
@@ -73,7 +73,7 @@ def _ask(cell: Cell) -> None:
 
 
 def _play(cell: Cell, rate: float, dt_s: float | None) -> None:
-    with told_to_stop() as over:
+    with stop_on_signals() as over:
         cell.play(rate, dt_s)
         while not over.wait(LOOK_S) and cell.clock.playing:
             pass  # until it is told to stop, or a step fails

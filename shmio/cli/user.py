@@ -16,7 +16,7 @@ from shmio.cli.interrupt import ended_by_interrupt
 from shmio.cli.local import Local
 from shmio.cli.run import add_json, complete, run
 from shmio.cli.target import target
-from shmio.layout.spelling import may_be_foreign, topic_path
+from shmio.layout.spelling import may_be_tia_spelling, topic_path
 from shmio.local.attach import Attachment
 
 PROGRAM = "shmio"
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
     """The arguments, with paths that are written as in TIA Portal in our own spelling."""
     patterns, pairs = getattr(arguments, "patterns", None) or (), getattr(arguments, "pairs", None) or ()
-    if not any(map(may_be_foreign, [*patterns, *(path for path, _ in pairs)])):
+    if not any(map(may_be_tia_spelling, [*patterns, *(path for path, _ in pairs)])):
         return arguments
     layouts = {source: cell.layout(source) for source in cell.sources}
     default = next(iter(layouts)) if len(layouts) == 1 else None

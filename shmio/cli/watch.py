@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 
-from shmio.cli.cell import Cell, News
+from shmio.cli.cell import Cell, Change
 from shmio.cli.readings import as_json, as_line, choose
 from shmio.cli.run import add_full, at_least, dumps, room, seconds
 from shmio.errors import NotRunningError, PathError
@@ -72,7 +72,7 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
     return 0
 
 
-def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[list[News]]:
+def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[list[Change]]:
     """All that the patterns name, at once and then every so many seconds.
 
     PathError: they name nothing; NotRunningError: the instance has stopped, or a reload has taken them away.
@@ -82,7 +82,7 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[lis
     while True:
         width = max(len(one.path) for one in chosen)
         readings = cell.readings(patterns, chosen)
-        yield [News(one, now, width) for one, now in zip(chosen, readings, strict=True)]
+        yield [Change(one, now, width) for one, now in zip(chosen, readings, strict=True)]
         due_s = max(due_s + every_s, time.monotonic())
         time.sleep(max(due_s - time.monotonic(), 0))
         try:
@@ -91,11 +91,11 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[lis
             raise NotRunningError(f"{error}: a reload has taken it away") from None
 
 
-def _object(news: News) -> str:
+def _object(news: Change) -> str:
     return dumps({"path": news.what.path, **as_json(news.now, news.what.register)})
 
 
-def _line(news: News, limit: int | None) -> str:
+def _line(news: Change, limit: int | None) -> str:
     what, now, width = news
     return f"{_clock(now)}  {as_line(what.path, now, what.register, width, limit)}"
 

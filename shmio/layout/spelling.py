@@ -22,7 +22,7 @@ _TOKEN = re.compile(
 _INDEX = re.compile(r"-?[0-9]+(?:\.\.-?[0-9]+)?|\*")
 
 
-def may_be_foreign(text: str) -> bool:
+def may_be_tia_spelling(text: str) -> bool:
     """Return whether text has a character that is typical of TIA Portal's spelling."""
     return _SIGNS.search(text) is not None
 
@@ -32,7 +32,7 @@ def block_path(text: str, layout: Layout) -> str:
 
     Text that names nothing in the block is returned unchanged.
     """
-    if not may_be_foreign(text) or _names(layout, text):
+    if not may_be_tia_spelling(text) or _names(layout, text):
         return text
     path = _translated(text)
     first, _, rest = path.partition("/")
@@ -46,7 +46,7 @@ def topic_path(text: str, layouts: Mapping[str, Layout], default: str | None) ->
     The data block's own name, with which TIA Portal's paths begin, stands for its source.
     Text that names nothing is returned unchanged.
     """
-    if not may_be_foreign(text) or _is_topic(text, layouts, default):
+    if not may_be_tia_spelling(text) or _is_topic(text, layouts, default):
         return text
     path = _translated(text)
     first, _, rest = path.partition("/")

@@ -1,1 +1,1 @@
-"""From a checked configuration to the processes to start: layouts, sources, injections, ports."""
+"""Plan an instance: from a checked configuration to the processes to start."""

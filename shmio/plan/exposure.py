@@ -1,4 +1,4 @@
-"""What other users of this host may do to an instance: who reaches a port on loopback need not be its user."""
+"""Find what other users of this host may do to an instance through its loopback ports."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_NAMES: Final = 3
 
 
 def exposure(config: Config) -> str | None:
-    """A line that says which other users may do what without being asked who they are; None: nobody, or nothing."""
+    """Return a line on what other users of this host may do without authentication, or None."""
     ways = [*_grpc(config), *_mqtt(config)]
     users = other_users() if ways else []
     if not users:
@@ -32,7 +32,10 @@ def exposure(config: Config) -> str | None:
 
 
 def other_users() -> list[str]:
-    """Names of those who can log in, but this user and root; a directory service need not tell all that it has."""
+    """Return the names of other users who can log in, without root.
+
+    A directory service need not list all its users.
+    """
     return [user.pw_name for user in pwd.getpwall() if _may_log_in(user) and user.pw_uid not in (0, os.geteuid())]
 
 
@@ -41,7 +44,7 @@ def _may_log_in(user: pwd.struct_passwd) -> bool:
 
 
 def _grpc(config: Config) -> Iterator[str]:
-    """What those may do by gRPC who show neither token nor certificate."""
+    """Yield what clients without token and certificate may do by gRPC."""
     grpc = config.grpc
     if grpc is None:
         return
@@ -56,7 +59,7 @@ def _grpc(config: Config) -> Iterator[str]:
 
 
 def _mqtt(config: Config) -> Iterator[str]:
-    """The same for our own broker; an external one has its own rules."""
+    """Yield what clients without account may do at shmio's own broker."""
     mqtt = config.mqtt
     if mqtt is None or not mqtt.listen:
         return

@@ -1,4 +1,4 @@
-"""What a configuration demands of the host, looked at before anything starts."""
+"""Check what a configuration needs of the host, before anything starts."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from shmio.errors import ConfigError
 
 
 def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> list[str]:
-    """Group, priorities, folders of log files and recordings, TLS files, tokens; warnings. Nothing is made.
+    """Check group, priorities, folders, TLS files and tokens; return warnings. Nothing is created.
 
-    ``catching``: what makes a context that keeps a ConfigError for later.
+    ``catching`` returns a context manager that collects a ConfigError instead of raising it.
     """
     with catching():
         _check_group(config.instance.group)
@@ -51,7 +51,7 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
 
 
 def _check_mqtt(mqtt: Mqtt) -> None:
-    """What its processes will read, and start."""
+    """Check the files that the MQTT processes read, and the broker that they start."""
     external = mqtt.broker == "external"
     if mqtt.tls:
         (client_context if external else server_context)(mqtt.tls)
@@ -84,7 +84,7 @@ def _check_priority(key: str, priority: int | None) -> None:
 
 
 def _check_folder(key: str, folder: Path) -> list[str]:
-    """ConfigError: it cannot be made or written. A warning if its disk is full: the plant is served all the same."""
+    """Raise ConfigError if a folder cannot be written; a full disk is only a warning."""
     found = unwritable(folder)
     if found is None:
         return []

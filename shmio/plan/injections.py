@@ -1,4 +1,4 @@
-"""Declared injections against what they name: registers, types, conditions, and what their source allows."""
+"""Check declared injections against registers, types, conditions and their source's limits."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ from shmio.segment.standing_injections import DeclaredState, StandingInjection, 
 
 
 def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
-    """What each source's process is given of them, by its name, and what they are, a line each.
+    """Return the declared injections encoded for each source's process, and a line about each.
 
-    ConfigError with the full key.
+    Raises:
+        ConfigError: An injection is invalid; the message begins with the full key.
+
     """
     periods_ns = {source.name: source.period_ns for source in config.source}
     found: dict[str, list[Program]] = {}

@@ -1,4 +1,4 @@
-"""The data-block sources that a configuration names: compiled once, one block chosen from each."""
+"""Compile the data-block sources that a configuration names, and choose a block of each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _QUOTED = re.compile(r"'[^']*'")
 
 
 class LayoutFiles:
-    """Reads each set of files once, and compiles each data block of them once."""
+    """A cache that reads each set of files once and compiles each of their data blocks once."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -29,10 +29,15 @@ class LayoutFiles:
         """What is odd about the sections' keys, each beginning with the key."""
 
     def get(self, key: str, section: Source | Emulator, number: int | None) -> Layout:
-        """The data block of a section; if its files hold several, the one of its ``block`` or of this number.
+        """Return the layout of a section's data block.
 
-        What is wrong with other blocks does not count then. ConfigError: no such file or block, or none is chosen;
-        LayoutError.
+        If the files hold several blocks, ``block`` or ``number`` chooses one, and errors in the
+        other blocks are ignored.
+
+        Raises:
+            ConfigError: A file or block is missing, or no block is chosen.
+            LayoutError: The block cannot be compiled.
+
         """
         paths, program = self._program(key, section)
         if section.block is None and len(program.blocks) <= 1:
@@ -40,12 +45,12 @@ class LayoutFiles:
         try:
             block = _choose(key, section, program.blocks, number)
         except ConfigError:
-            program.compile(())  # which says so if the sources are damaged: that comes first
+            program.compile(())  # damaged sources are reported first
             raise
         return self._compile(key, section, paths, program, block.name)[0]
 
     def all(self, key: str, section: Source | Emulator) -> tuple[Layout, ...]:
-        """Every data block of a section's files; ConfigError: no such file; LayoutError."""
+        """Return all layouts of a section's files; ConfigError for a missing file, or LayoutError."""
         return self._compile(key, section, *self._program(key, section), None)
 
     def _program(self, key: str, section: Source | Emulator) -> tuple[tuple[Path, ...], compiler.Program]:
@@ -60,7 +65,7 @@ class LayoutFiles:
     def _compile(
         self, key: str, section: Source | Emulator, paths: object, program: compiler.Program, block: str | None
     ) -> tuple[Layout, ...]:
-        """Compile one block, or all."""
+        """Compile one block, or all blocks."""
         sizes = section.type_bytes
         which = paths, block and block.lower(), tuple(sorted(sizes.items()))
         if which not in self._compiled:
@@ -96,12 +101,18 @@ def _choose(
 
 
 def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
-    """Read files that may use each other's types; ConfigError beginning with ``key``, LayoutError."""
+    """Read files that may use each other's types.
+
+    Raises:
+        ConfigError: A file cannot be read; the message begins with ``key``.
+        LayoutError: A tag table is invalid, or given with other files.
+
+    """
     return compiler.Program([_read(path, key) for path in paths])
 
 
 def _read(path: Path, key: str) -> compiler.Source:
-    """Read a source; a little more than allowed is enough for the compiler to refuse it."""
+    """Read a source, at most slightly more than allowed: the compiler refuses that."""
     try:
         with open(path, "rb", opener=_open_at_once) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -112,12 +123,12 @@ def _read(path: Path, key: str) -> compiler.Source:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Open without waiting for a writer, as a FIFO would have it."""
+    """Open a file without waiting for a writer if it is a FIFO."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
 def summarize(warnings: Iterable[Diagnostic]) -> list[str]:
-    """A line each; those of one file that differ in the quoted name only are one, with all the names."""
+    """Return a line for each warning; merge those of a file that differ only in the quoted name."""
     lines: list[str] = []
     alike: dict[tuple[str, str], int] = {}
     for warning in warnings:

@@ -1,4 +1,4 @@
-"""Models that a configuration names: what they declare, and whether their connections fit."""
+"""Ask simulation models what they declare, and check their connections."""
 
 from __future__ import annotations
 
@@ -21,9 +21,13 @@ PATIENCE_S: Final = 60.0
 
 
 def describe(key: str, options: Simulation.Options, layout: Layout | None) -> tuple[Layout, tuple[str, ...]]:
-    """The layout of a model's block, and the inputs that can be connected; ConfigError, beginning with ``key``.
+    """Return the layout of a model's block, and the inputs that can be connected.
 
-    Imports the model in a process of its own.
+    A separate process imports the model.
+
+    Raises:
+        ConfigError: The model cannot be imported or described; the message begins with ``key``.
+
     """
     request = Request(options, None if layout is None else layout.to_json().decode())
     command = [sys.executable, "-m", "shmio.connectors.models.describe"]
@@ -52,7 +56,7 @@ def check_connections(
     inputs: tuple[str, ...],
     layouts: Mapping[str, Layout],
 ) -> None:
-    """Whether each connection leads from a register of a source to an input that takes its values; ConfigError."""
+    """Raise ConfigError unless each connection goes from a source's register to a fitting input."""
     for path, topic in connections.items():
         try:
             _check_connection(source, path, topic, inputs, layouts)

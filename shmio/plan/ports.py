@@ -1,4 +1,4 @@
-"""Addresses to listen on: whether they are of this host, and who listens there already; before anything starts."""
+"""Check before the start whether listening addresses are local and free."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ _LISTEN: Final = "0A"
 
 
 def check_listening(config: Config) -> None:
-    """ConfigError when the name of a host to listen on is none, or two addresses are one port; 0 is any free one."""
+    """Raise ConfigError if a host name cannot be resolved or two addresses share a port.
+
+    Port 0 is any free port.
+    """
     listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
     if config.grpc:
         listening += [(key, address.listen) for key, address in config.grpc.listening.items()]
@@ -51,15 +54,15 @@ def check_listening(config: Config) -> None:
 
 
 def check_ports(plan: Plan) -> None:
-    """EndpointError when an address of the plan is taken."""
+    """Raise EndpointError if an address of the plan is in use."""
     for problem in taken(plan):
         raise EndpointError(problem)
 
 
 def taken(plan: Plan) -> Iterator[str]:
-    """Each address of the plan that is taken, and by whom, as far as this user may know it.
+    """Yield a message for each address of the plan that is in use, with its user where visible.
 
-    Whatever else may be wrong with an address is for its process to find.
+    Other faults of an address are left for its process to report.
     """
     for job in plan.jobs:
         for text in job.listening:
@@ -72,14 +75,14 @@ def taken(plan: Plan) -> Iterator[str]:
 
 
 def in_use(address: Address) -> bool:
-    """Whether somebody listens there; of a name with several addresses, on all of them. ConfigError."""
+    """Return whether an address is in use; a name counts if all its addresses are. ConfigError."""
     with suppress(OSError):
         return address.port != 0 and all(_taken(family, place) for family, place in _places(address))
     return False
 
 
 def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
-    """(family, socket address) of each address that the host has; ConfigError if it has none."""
+    """Return (family, socket address) for each address of a host name; ConfigError if unknown."""
     try:
         found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:  # UnicodeError: a part of the name is empty, or too long
@@ -91,7 +94,7 @@ def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
 
 
 def _hosts(address: Address) -> set[str]:
-    """All that a host's name stands for, as /proc/net/tcp writes it."""
+    """Return all addresses of a host name in the form of /proc/net/tcp."""
     return {
         _words(socket.inet_pton(family, str(place[0]).partition("%")[0])).removeprefix(_MAPPED)
         for family, place in _places(address)
@@ -99,7 +102,7 @@ def _hosts(address: Address) -> set[str]:
 
 
 def _share(hosts: set[str], others: set[str]) -> bool:
-    """Whether who listens on these keeps who listens on those from the same port: [::] takes IPv4, too."""
+    """Return whether listeners on two sets of hosts exclude each other; [::] takes IPv4, too."""
     if hosts & others or _ANY in hosts | others:
         return True
     ours, theirs = ({host for host in all_ if len(host) == len(_ANY_IPV4)} for all_ in (hosts, others))
@@ -117,7 +120,7 @@ def _taken(family: int, place: tuple[Any, ...]) -> bool:
 
 
 def _holder(address: Address) -> str:
-    """Who listens there, and what to do about it."""
+    """Return which process listens at an address, and what to do about it."""
     links = {f"socket:[{inode}]" for inode in _listening(address)}
     for instance in instances():
         with suppress(ShmioError):
@@ -134,7 +137,7 @@ def _holder(address: Address) -> str:
 
 
 def _listening(address: Address) -> Iterator[str]:
-    """The inodes of the sockets that listen there."""
+    """Yield the inodes of the sockets that listen at an address."""
     wanted = _hosts(address)
     for table in ("tcp", "tcp6"):
         with suppress(OSError):
@@ -151,7 +154,7 @@ def _words(packed: bytes) -> str:
 
 
 def _with_children(pid: int) -> Iterator[int]:
-    """It, and the programs that it runs: a broker's process has mosquitto."""
+    """Yield a process and its children: the broker's process runs mosquitto."""
     yield pid
     with suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():
@@ -169,7 +172,7 @@ def _command(pid: int) -> str:
 
 
 def _open_files(pid: int) -> Iterator[str]:
-    """What a process's descriptors lead to, as far as this user may know it."""
+    """Yield the targets of a process's descriptors, as far as this user may read them."""
     with suppress(OSError):
         for entry in Path(f"/proc/{pid}/fd").iterdir():
             with suppress(OSError):

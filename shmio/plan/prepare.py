@@ -1,4 +1,4 @@
-"""From the configuration file to a plan: layouts compiled, connectors and emulators asked whether they agree."""
+"""Prepare a plan from a configuration file: compile layouts, check connectors and emulators."""
 
 from __future__ import annotations
 
@@ -34,29 +34,37 @@ from shmio.recorder.selection import Selection
 
 EMULATOR_KINDS = ("s7",)
 NONFINITE = ("REAL", "LREAL")
-"""The types whose values may be NaN or infinite."""
+"""Types whose values can be NaN or infinite."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A configuration that can be started."""
+    """A checked configuration, ready to start."""
 
     config: Config
     plan: Plan
     layouts: dict[str, Layout]
-    """Of each source, by its name."""
+    """The layout of each source, by source name."""
     emulated: dict[str, tuple[Layout, ...]]
-    """All blocks of each emulator, by its name."""
+    """All blocks of each emulator, by emulator name."""
     injections: tuple[str, ...]
-    """What is declared, in words."""
+    """A line about each declared injection."""
     notes: tuple[str, ...] = ()
-    """What to know of it that is no fault."""
+    """Remarks that are not faults."""
 
 
 def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = None) -> Prepared:
-    """Read and check everything that can be checked without starting anything; ConfigError, LayoutError.
+    """Read a configuration and check everything that can be checked without starting anything.
 
-    ``keys``: of ``[replay]``, in place of those of the file.
+    Args:
+        file: The configuration file.
+        mode: ``live``, ``log`` or ``replay``.
+        keys: Keys of ``[replay]`` that override those of the file.
+
+    Raises:
+        ConfigError: The configuration has faults.
+        LayoutError: A layout cannot be compiled.
+
     """
     config, faults, broken = examine(file)
     origin, notices = None, list[str]()
@@ -71,7 +79,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             with faults.catching():
                 config, origin, notices = replayed(config, keys or {}, recordings)
             faults.raise_any()
-            faults = Faults(file, msgspec.to_builtins(config))  # its sources are not those of the file
+            faults = Faults(file, msgspec.to_builtins(config))  # with the recording's sources
         files = LayoutFiles(config)
         notices += check_host(config, faults.catching)
         if not faults:
@@ -122,12 +130,12 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         remote=sources.remote,
         origin=origin,
     )
-    open_to = None if mode == "log" else exposure(config)  # a log serves nobody
+    open_to = None if mode == "log" else exposure(config)  # mode log has no endpoints
     return Prepared(config, plan, layouts, emulated, described, (open_to,) if open_to else ())
 
 
 def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
-    """The configuration, with what is written as in TIA Portal in our own spelling."""
+    """Return the configuration with TIA Portal's spelling of paths translated to shmio's."""
     default = next(iter(layouts)) if len(layouts) == 1 else None
 
     def topics(patterns: str | list[str]) -> str | list[str]:
@@ -155,7 +163,7 @@ def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
 
 
 def peer(source: Source) -> str:
-    """The device of a checked source, as host:port where it has such; empty if not."""
+    """Return the device of a checked source as host:port, or what it has of these."""
     host, port = source.options.get("host"), source.options.get("port")
     return str(Address(host, port)) if host and port else str(host or "")
 
@@ -178,7 +186,7 @@ def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
 
 
 def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:
-    """The blocks it serves: the one its program runs on, or all of its files if that runs on none."""
+    """Return the blocks that an emulator serves: its program's block, or all if it has none."""
     from shmio.emulators.programs import IDLE, program  # noqa: PLC0415
 
     key = f"emulator[{index}]"
@@ -202,7 +210,7 @@ def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple
 
 
 def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
-    """Each block must have a number; the compiler gives none twice."""
+    """Raise ConfigError if a block has no number; the compiler ensures that numbers are unique."""
     for layout in layouts:
         if layout.number is None:
             alone = f'; block = "{layout.name}" beside it, to serve that block alone' if len(layouts) > 1 else ""
@@ -211,7 +219,7 @@ def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
 
 
 def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
-    """What is allowed and yet hardly meant."""
+    """Return warnings about settings that are valid but probably unintended."""
     odd = []
     for index, source in enumerate(config.source):
         key, layout = f"source[{index}]", layouts[source.name]
@@ -235,7 +243,12 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
 
 
 def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
-    """Patterns of ``[mqtt]`` that name nothing, and a broker open to all. ConfigError: a pattern that is none."""
+    """Yield warnings about unused ``[mqtt]`` patterns and an open broker.
+
+    Raises:
+        ConfigError: A pattern is invalid.
+
+    """
     mqtt = config.mqtt
     if mqtt and mqtt.listen:
         yield from _odd_accounts(mqtt, Address.parse(mqtt.listen))
@@ -257,13 +270,13 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
 
 
 def _check_part(path: str, layouts: dict[str, Layout]) -> None:
-    """PathError: no such bit, slice or other part."""
+    """Raise PathError if there is no such bit, slice or other part."""
     topic = parse_topic(path, layouts, None)
     look_up(layouts[topic.source], topic)
 
 
 def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
-    """Who may do more, or less, at our own broker than may be meant."""
+    """Yield warnings about accounts of shmio's own broker with unexpected permissions."""
     free = any(account.name is None and "write" in account.roles for account in mqtt.account)
     shown = mqtt.tls is not None and mqtt.tls.ca is not None
     if free and (mqtt.password_file or not (address.loopback or shown)):
@@ -278,14 +291,14 @@ def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
 
 
 def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
-    """Patterns of ``recorder.registers`` that name nothing."""
+    """Yield warnings about patterns of ``recorder.registers`` that name nothing."""
     if config.recorder is not None:
         for text in Selection(registers=config.recorder.registers).nothing(layouts):
             yield f"recorder.registers: {text}"
 
 
 def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:
-    """Each pattern with its key, and whether it is of frames."""
+    """Yield each pattern of ``[mqtt]`` with its key, and whether it selects frames."""
     if config.mqtt is None:
         return
     for index, rule in enumerate(config.mqtt.topic):
@@ -302,7 +315,7 @@ def _near(pattern: str, layout: Layout) -> str:
 
 
 def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
-    """Sources of which an emulator of the same file is the device, and does not serve their block."""
+    """Yield warnings about sources whose emulator in this file does not serve their block."""
     for index, source in enumerate(config.source):
         wanted = source.options.get("dbNumber") or layouts[source.name].number
         for emulator in config.emulator:
@@ -315,7 +328,7 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
 
 
 def _not_emulated(config: Config) -> Iterator[str]:
-    """Sources that read a controller of this host where no emulator of this file listens, though it has some."""
+    """Yield warnings about sources that read this host where none of the file's emulators listens."""
     listening = {emulator.name: str(Address.parse(emulator.listen)) for emulator in config.emulator}
     for index, source in enumerate(config.source):
         device = peer(source)
@@ -327,14 +340,17 @@ def _not_emulated(config: Config) -> Iterator[str]:
 
 
 def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
-    """Initial values that mean nothing to an emulator."""
+    """Yield warnings about initial values that an emulator cannot read."""
     for name, layouts in emulated.items():
         for text in (text for layout in layouts for text in initial_value_warnings(layout)):
             yield f"emulator {name!r}: {text}"
 
 
 def _covers(pattern: str, layout: Layout, types: Sequence[str] = ()) -> bool:
-    """Whether a pattern names a register, what is above one, or a part; of one of these types, if any; PathError."""
+    """Return whether a pattern names a register of these types, something above it, or a part.
+
+    Without ``types`` all types count. PathError: the pattern is invalid.
+    """
     if names_part(pattern):
         return any(not types or register.type in types for register in chosen(layout, pattern))
     glob = Glob(pattern)

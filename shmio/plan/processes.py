@@ -1,4 +1,4 @@
-"""From a checked configuration to what is started: blocks, processes, their descriptions. No I/O."""
+"""Plan the blocks and processes of a checked configuration. No I/O."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ from shmio.layout.model import Layout
 from shmio.segment import Attributes, BlockSpec, Origin, ProcessSpec, segment_size
 
 RANKS: Final[Mapping[str, int]] = {"emulator": 0, "recorder": 0, "source": 1, "grpc": 2, "mqtt": 2}
-"""Order of start by kind: what plays a device, what reads devices, what serves the readings.
+"""Order of start by kind: emulators, then sources, then endpoints.
 
-The recorder is there before the sources and after them: their last frames and events are recorded, too.
+The recorder starts before the sources and stops after them, to record their last frames and events.
 """
 
 BROKER: Final = "broker"
-"""The process of our own MQTT broker, of kind mqtt: there before the bridge, and after it, which takes leave of it."""
+"""The process of shmio's own MQTT broker, of kind mqtt.
+
+It starts before the bridge and stops after it, so that the bridge can disconnect properly.
+"""
 
 
 def rank(name: str, kind: str) -> int:
-    """Place of a process in the order of start; what this version does not know is stopped last."""
+    """Return a process's place in the order of start; a kind unknown to this version stops last."""
     return 0 if (name, kind) == (BROKER, "mqtt") else RANKS.get(kind, 0)
 
 
@@ -36,21 +39,21 @@ MODULES: Final[Mapping[str, str]] = {
     "mqtt": "shmio.endpoints.mqtt",
     "recorder": "shmio.recorder",
 }
-"""The module that is a process of each kind."""
+"""The module that each kind of process runs."""
 
 RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
-"""Keys of a section that its process takes anew while it runs, by its kind."""
+"""Keys of a section that its process reloads while it runs, by kind."""
 
 MAX_PROCESSES = 200
 MODES = ("live", "log", "replay")
-"""What it can be started as; log: what serves others is left out; replay: a recording has the sources' places."""
+"""Modes of an instance; log: without endpoints; replay: a recording replaces the sources."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A process to run: ``config`` is its section as resolved, what the process gets.
+    """A process to run; ``config`` is its resolved section, which the process receives.
 
-    ``rules`` is the part of the section that it takes anew while it runs, when it is told to; None: there is none.
+    ``rules`` is the part of the section that the running process can reload, None if there is none.
     """
 
     name: str
@@ -61,22 +64,22 @@ class Job:
 
     @property
     def rank(self) -> int:
-        """Place in the order of start."""
+        """The process's place in the order of start."""
         return rank(self.name, self.kind)
 
     @property
     def listening(self) -> list[str]:
-        """The addresses on which it listens, as the configuration has them."""
+        """The process's listening addresses, as configured."""
         listen = self.config.get("listen") or ()
         texts = [listen] if isinstance(listen, str) else [*listen]
         return [*texts, *(address["listen"] for address in self.config.get("address", ()))]
 
     def describe(self, instance: str, epoch: int) -> bytes:
-        """The JSON object that the process reads from its standard input."""
+        """Return the JSON object that the process reads from its standard input."""
         return self._json(instance, epoch, self.config | (self.rules or {}))
 
     def identify(self, instance: str, epoch: int) -> bytes:
-        """What of it makes another process necessary when it changes."""
+        """Return the part of the description whose change requires a new process."""
         return self._json(instance, epoch, self.config)
 
     def _json(self, instance: str, epoch: int, config: dict[str, Any]) -> bytes:
@@ -89,13 +92,13 @@ class Job:
                 "log_file": str(self.log_file),
                 "config": config,
             },
-            order="deterministic",  # it is compared with what an earlier supervisor gave
+            order="deterministic",  # compared with the description of an earlier supervisor
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """An instance as it will be."""
+    """The plan of an instance: its blocks, processes and settings."""
 
     instance: str
     mode: str
@@ -105,11 +108,11 @@ class Plan:
     blocks: tuple[BlockSpec, ...]
     jobs: tuple[Job, ...]
     warnings: tuple[str, ...] = ()
-    """What is odd about its configuration, a line each."""
+    """Warnings about the configuration, a line each."""
     stepped: bool = False
-    """Whether time stands from the start until somebody steps."""
+    """Whether the instance's clock is stopped from the start, until it is stepped."""
     origin: Origin | None = None
-    """The time of the recording that is played; None: it has its own."""
+    """The clock's origin in a replayed recording; None for an instance with its own time."""
 
     @property
     def processes(self) -> list[ProcessSpec]:
@@ -136,12 +139,25 @@ def make_plan(
     remote: Mapping[str, tuple[Sequence[str], Sequence[str]]] | None = None,
     origin: Origin | None = None,
 ) -> Plan:
-    """Plan an instance. ``layouts``: of each source, by its name; ``emulated``: all blocks of each emulator.
+    """Plan an instance.
 
-    ``computed``: the sources that live on the instance's clock; ``replayed``: those of them that play a recording.
-    ``remote``: patterns of outputs and in-outs of those that a program elsewhere computes, by the source's name.
-    ``declared``: what the sources' processes get of the declared injections, by the source's name.
-    ConfigError: too many processes.
+    Args:
+        config: The checked configuration.
+        layouts: The layout of each source, by source name.
+        emulated: All blocks of each emulator, by emulator name.
+        config_file: Path of the configuration file.
+        mode: ``live``, ``log`` or ``replay``.
+        declared: The encoded injections for each source's process, by source name.
+        warnings: Warnings about the configuration.
+        computed: Sources that follow the instance's clock.
+        replayed: The computed sources that play a recording.
+        remote: Patterns of the outputs and in-outs of sources that a remote program computes, by
+            source name.
+        origin: The clock's origin in a replayed recording.
+
+    Raises:
+        ConfigError: The instance has too many processes.
+
     """
     ring_bytes = round(config.instance.ring_mb * 1e6)
     blocks = tuple(
@@ -196,7 +212,7 @@ def make_plan(
 
 
 def process_names(config: Config) -> list[str]:
-    """Of all processes that an instance of this configuration may have, whatever its mode."""
+    """Return the names of all processes that an instance may have, in any mode."""
     names = [emulator.name for emulator in config.emulator] + [source.name for source in config.source]
     names += ["grpc"] if config.grpc else []
     names += [name for name, _, _ in _mqtt(config.mqtt)] if config.mqtt else []
@@ -204,7 +220,10 @@ def process_names(config: Config) -> list[str]:
 
 
 def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
-    """The bridge, and the broker if it is ours: each gets the keys that it needs, so that it alone is replaced."""
+    """Return the sections of the bridge, and of the broker if it is shmio's own.
+
+    Each gets only the keys that it needs, so a change replaces only the process concerned.
+    """
     section = msgspec.to_builtins(mqtt)
     listen, accounts = section.pop("listen"), section.pop("account")
     if mqtt.broker == "external":

@@ -1,4 +1,4 @@
-"""The recordings that a configuration plays: each is opened, and measured, once for all of its sources."""
+"""Open each recording that a configuration plays once for all of its sources."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ if TYPE_CHECKING:
 
 
 class Recordings:
-    """The one that was asked for last stays open. A context manager."""
+    """A context manager that keeps the recording requested last open."""
 
     def __init__(self) -> None:
         self._files: Sequence[str] = ()
         self._recording: Recording | None = None
 
     def get(self, files: Sequence[str]) -> Recording:
-        """The recording of these files, until another is asked for. RecordingError: there is none."""
+        """Return the recording of these files, valid until another is requested; RecordingError."""
         from shmio.connectors.replay.recording import Recording  # noqa: PLC0415  most configurations play none
 
         if self._recording is None or files != self._files:
@@ -26,7 +26,7 @@ class Recordings:
         return self._recording
 
     def close(self) -> None:
-        """Close the one that is open."""
+        """Close the open recording, if any."""
         if self._recording is not None:
             self._recording.close()
             self._recording = None

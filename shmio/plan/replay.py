@@ -1,4 +1,4 @@
-"""``--mode replay``: the sources of a recording in the place of those of the configuration."""
+"""``--mode replay``: replace a configuration's sources by those of a recording."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from shmio.plan.recordings import Recordings
 from shmio.segment import Origin
 
 LEAD_NS: Final = 2_000_000_000
-"""So long before the recording begins, if it can, the clock does: until then its processes start."""
+"""Lead of the clock's start over the recording's, if possible, for the processes to start."""
 _OPTIONS: Final = ("from", "start", "end", "speed", "injections")
 _FLAGS: Final = ("loop", "paused", "record")
 
 
 class Replayed(NamedTuple):
-    """A configuration for a replay."""
+    """A configuration changed for a replay."""
 
     config: Config
     origin: Origin
     notices: list[str]
-    """What of the configuration is left out, or has been added."""
+    """Lines about what was removed from or added to the configuration."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``up`` that go before the keys of ``[replay]``."""
+    """Add the options of ``up`` that override the keys of ``[replay]``."""
     group = parser.add_argument_group("with --mode replay, in place of the keys of [replay]")
     group.add_argument("--from", nargs="+", metavar="FILE", help="the recording: one .mem, or several of one run")
     group.add_argument("--start", metavar="TIME", help="seconds from its begin, or a date and time")
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def given(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What the command line says, as keys of ``[replay]``. ConfigError: it is not for another mode."""
+    """Return the command line's replay options as keys of ``[replay]``; ConfigError in other modes."""
     found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}
     if found and arguments.mode != "replay":
         raise ConfigError(f"--{next(iter(found))} goes with --mode replay only")
@@ -55,7 +55,7 @@ def given(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def options(keys: Mapping[str, Any]) -> list[str]:
-    """The same as options again, for the command line of a detached supervisor."""
+    """Return keys of ``[replay]`` as options for a detached supervisor's command line."""
     words: list[str] = []
     for name, value in keys.items():
         if name == "file":
@@ -66,7 +66,7 @@ def options(keys: Mapping[str, Any]) -> list[str]:
 
 
 def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) -> Replayed:
-    """The configuration with the recording's sources alone. ConfigError, beginning with the key."""
+    """Return the configuration with only the recording's sources; ConfigError begins with the key."""
     section = _section(config, keys)
     files = [str(config.path(file)) for file in _listed(section.file)]
     if not files:
@@ -135,7 +135,7 @@ def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]
 
 
 def _mqtt(config: Config, names: list[str]) -> Mqtt | None:
-    """Without rules for frames of sources that are left out."""
+    """Return ``[mqtt]`` without rules for frames of omitted sources."""
     if config.mqtt is None:
         return None
     rules = []
@@ -148,7 +148,7 @@ def _mqtt(config: Config, names: list[str]) -> Mqtt | None:
 
 
 def _gone(config: Config, rule: MqttTopic, names: list[str]) -> list[str]:
-    """The sources of the configuration whose frames a rule means, and that the recording has not."""
+    """Return the configured sources that a rule for frames names and the recording lacks."""
     own = {source.name for source in config.source} - set(names)
     return [pattern for pattern in rule.patterns if rule.payload == "frames" and pattern in own]
 
@@ -167,7 +167,7 @@ def _source(name: str, own: Source | None, section: Replay, files: list[str]) ->
 
 
 def _check_names(names: list[str], file: str) -> None:
-    """A file may say anything."""
+    """Raise ConfigError if a source's name in a recording is invalid or reserved."""
     for name in names:
         try:
             msgspec.convert({"name": name, "connector": "replay"}, Source)

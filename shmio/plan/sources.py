@@ -1,6 +1,6 @@
-"""The sources of a configuration: their connectors asked whether all goes together, their layouts found.
+"""Check a configuration's sources with their connectors, and find their layouts.
 
-Connectors are imported here, and only when they are asked: status and its like do without them.
+Connectors are imported on use, because commands such as status do not need them.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ NEEDED: Final = "this key is needed"
 
 
 class Sources(NamedTuple):
-    """What was found out about the sources, by their names."""
+    """Facts about the checked sources, by source name."""
 
     layouts: dict[str, Layout]
     computed: list[str]
-    """Those that live on the instance's clock."""
+    """Sources that follow the instance's clock."""
     replayed: list[str]
-    """Those that play a recording."""
+    """Sources that play a recording."""
     remote: dict[str, tuple[list[str], list[str]]]
-    """Patterns of what a program elsewhere computes, of sources that have such: outputs, in-outs."""
+    """Patterns of the outputs and in-outs that a remote program computes, by source name."""
 
 
 def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
-    """Ask the connectors of all sources whether they can be as configured, and note what is wrong.
+    """Check all sources with their connectors, and add faults.
 
-    Their ``options`` are complete and of their types from here on.
+    Afterwards the sources' ``options`` are complete and have their types.
     """
     found = Sources({}, [], [], {})
     inputs: dict[int, tuple[str, ...]] = {}
@@ -102,7 +102,7 @@ def _check_source(
 
 
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
-    """Note what is wrong with the connector's own keys of a source, by its place in the file."""
+    """Add the faults of a source's connector keys; ``index`` is the source's place in the file."""
     from shmio.connectors import registry  # noqa: PLC0415
 
     key = f"source[{index}]"
@@ -122,7 +122,7 @@ def note_options(index: int, connector: str, options: dict[str, Any], texts: dic
 
 
 def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
-    """The connector's own keys, checked; None if there are faults, which are noted."""
+    """Return the connector's checked options, or add faults and return None."""
     from shmio.connectors import registry  # noqa: PLC0415
 
     before = faults.count
@@ -139,7 +139,7 @@ def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
 
 
 def _filled(kind: type[msgspec.Struct], source: Source) -> msgspec.Struct | None:
-    """The options with something in place of texts that are missing; None if more than that is wrong."""
+    """Return the options with placeholders for missing texts, or None if they have other faults."""
     fields = msgspec.structs.fields(kind)
     known = {field.encode_name for field in fields}
     given = {key: value for key, value in (source.texts | source.options).items() if key in known}
@@ -151,7 +151,7 @@ def _filled(kind: type[msgspec.Struct], source: Source) -> msgspec.Struct | None
 
 
 def _recorded(key: str, source: Source, config: Config, recordings: Recordings) -> Layout:
-    """The layout of a replay: that of the recording, which has its period and its age, too."""
+    """Return a replayed source's layout; the recording also gives its period and stale age."""
     from shmio.connectors.replay.source import Replay, chosen, files  # noqa: PLC0415
 
     for name in ("layout", "block", "type_bytes", "properties"):
@@ -172,7 +172,7 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
-    """The layout and the inputs of a simulation: those of its files, if it has any, else what its model declares."""
+    """Return a simulation's layout and inputs; the layout is its files', or its model declares it."""
     from shmio.connectors.models.simulation import Simulation  # noqa: PLC0415
     from shmio.plan.models import describe  # noqa: PLC0415
 

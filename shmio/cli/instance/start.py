@@ -15,7 +15,7 @@ import msgspec
 
 from shmio import logs
 from shmio.cli.instance import logdir
-from shmio.cli.instance.up import Configured, Failed, Started, Told, headline
+from shmio.cli.instance.up import Configured, Failed, Started, StartMessage, headline
 from shmio.cli.run import say
 from shmio.errors import AlreadyRunningError, EndpointError, ShmioError
 from shmio.logs import printable
@@ -52,7 +52,7 @@ def detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int
     """Run it, and tell who waits for it how the start went, through this descriptor."""
     told = False
 
-    def tell(message: Told) -> None:
+    def tell(message: StartMessage) -> None:
         nonlocal told
         if told:
             return

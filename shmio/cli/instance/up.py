@@ -50,7 +50,7 @@ class Failed(msgspec.Struct, tag=True):
     error: str
 
 
-Told = Configured | Started | Failed
+StartMessage = Configured | Started | Failed
 """What a detached supervisor tells about its start: a JSON object a line, of printable text."""
 
 
@@ -107,7 +107,7 @@ def _await(fd: int) -> tuple[str, Started]:
     """Its log file, and what it tells when it runs; ControlError with what it says otherwise."""
     log_file = ""
     for line in _lines(fd):
-        told = msgspec.json.decode(line, type=Told)
+        told = msgspec.json.decode(line, type=StartMessage)
         if isinstance(told, Started):
             return log_file, told
         if isinstance(told, Failed):

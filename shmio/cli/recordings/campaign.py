@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from shmio.cli.recordings.complaints import Complaints
+from shmio.cli.recordings.damage_report import DamageReport
 from shmio.cli.recordings.rewriting import new_file
 from shmio.cli.run import say
 from shmio.config.declaration import check_declarations
@@ -20,8 +20,8 @@ from shmio.recording.campaign import derive
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write the injections of some files of one run; what cannot be declared is told."""
-    complaints = Complaints()
-    with complaints.open(arguments.files) as dump:
+    report = DamageReport()
+    with report.open(arguments.files) as dump:
         found = derive(dump)
     for text in found.left_out:
         print(printable(f"not as it was: {text}"), file=sys.stderr)
@@ -36,7 +36,7 @@ def execute(arguments: argparse.Namespace) -> int:
     with new_file(arguments.output) as stream:
         stream.write("\n".join(tables).encode())
     say(f"{arguments.output}: {len(tables)} injections; shmio inject --file {arguments.output} lays them")
-    return int(complaints.any)
+    return int(report.any)
 
 
 def _table(keys: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from shmio.cli.recordings.complaints import Complaints
+from shmio.cli.recordings.damage_report import DamageReport
 from shmio.cli.recordings.each import not_closed
 from shmio.cli.recordings.printers import Csv, JsonLines, Printer, Table, View
 from shmio.cli.recordings.progress import Progress
@@ -32,7 +32,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
     1 if something was damaged: all the rest is printed, and where something is lost is told.
     """
-    complaints = Complaints()
+    report = DamageReport()
     with (
         Reader(arguments.file) as reader,
         Progress(f"reading {arguments.file}", silent=sys.stdout.isatty()) as progress,
@@ -41,7 +41,7 @@ def execute(arguments: argparse.Namespace) -> int:
         from_ns, to_ns = time_range(arguments, found.begin_ns)
         channels = [track.channel for track in found.tracks.values()]
         try:
-            views = _views(reader, channels, arguments.patterns, complaints)
+            views = _views(reader, channels, arguments.patterns, report)
         except PathError:
             _one_file(arguments.patterns)
             raise
@@ -58,7 +58,7 @@ def execute(arguments: argparse.Namespace) -> int:
         begin_ns = max(from_ns, found.begin_ns)
         progress.total = max(1, min(to_ns, found.end_ns) - begin_ns)
         for message in reader.messages(
-            lambda channel: channel.number in wanted, from_ns, to_ns, partial(complaints.damage, arguments.file)
+            lambda channel: channel.number in wanted, from_ns, to_ns, partial(report.damage, arguments.file)
         ):
             progress.at(message.log_ns - begin_ns)
             for line in _lines(message, views, sources, printer, explainers):
@@ -69,7 +69,7 @@ def execute(arguments: argparse.Namespace) -> int:
             print(printable(f"{reader.file}: {_nothing(found)}"), file=sys.stderr)
         if not reader.records.closed:
             print(printable(f"{reader.file}: {not_closed(reader.records.damage)}"), file=sys.stderr)
-    return int(complaints.any)
+    return int(report.any)
 
 
 def _printer(arguments: argparse.Namespace, views: Sequence[View]) -> Printer:
@@ -86,7 +86,7 @@ def _nothing(found: Survey) -> str:
 
 
 def _views(
-    reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], complaints: Complaints
+    reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], report: DamageReport
 ) -> dict[int, View]:
     """By their frames' channels the blocks of which something is to be shown. PathError: a pattern names nothing.
 
@@ -98,7 +98,7 @@ def _views(
             try:
                 blocks[channel.number] = channel, reader.layout(channel)
             except RecordingError as error:
-                complaints.say(str(error))
+                report.say(str(error))
     if not patterns:
         return {number: View(*block, block[1].registers) for number, block in blocks.items()}
     sources = list(dict.fromkeys(channel.source for channel, _ in blocks.values()))

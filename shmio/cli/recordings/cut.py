@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from shmio.cli.recordings.complaints import Complaints
+from shmio.cli.recordings.damage_report import DamageReport
 from shmio.cli.recordings.rewriting import rewrite, verified
 from shmio.cli.recordings.times import span, time_range
 from shmio.cli.run import dumps, say
@@ -60,8 +60,8 @@ def _part(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, R
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write what lies between two times, of some sources or registers, to a new file."""
-    complaints = Complaints()
-    with complaints.open(arguments.files) as dump:
+    report = DamageReport()
+    with report.open(arguments.files) as dump:
         from_ns, to_ns = time_range(arguments, dump.begin_ns)
         parts = Parts(dump, arguments.only) if arguments.only else None
         work = rewrite(
@@ -69,12 +69,12 @@ def execute(arguments: argparse.Namespace) -> int:
         )
     verified_lines = verified(arguments.output)
     if arguments.json:
-        print(dumps({"file": str(arguments.output), **work.counts, "damage": complaints.texts}, indent=2))
-        return int(complaints.any)
+        print(dumps({"file": str(arguments.output), **work.counts, "damage": report.texts}, indent=2))
+        return int(report.any)
     for line in verified_lines:
         say(line)
     say(f"  {work.counts['frames']} frames and {work.counts['events']} events")
-    return int(complaints.any)
+    return int(report.any)
 
 
 def _entries(

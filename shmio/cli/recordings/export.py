@@ -13,7 +13,7 @@ from typing import IO, Any, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from shmio.cli.recordings.complaints import Complaints
+from shmio.cli.recordings.damage_report import DamageReport
 from shmio.cli.recordings.event_table import export_events
 from shmio.cli.recordings.progress import Progress
 from shmio.cli.recordings.rewriting import new_file
@@ -150,12 +150,12 @@ OTHERS: Final = frozenset(
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write tables, a file for each block, or one MCAP file for viewers."""
-    complaints = Complaints()
+    report = DamageReport()
     named, form = _form(arguments.output, arguments.format)
     if arguments.events and (not named or form not in TABLES):
         raise RecordingError(f"{arguments.output}: --events makes one table: have its name end in .csv or .parquet")
     with (
-        complaints.open(arguments.files) as dump,
+        report.open(arguments.files) as dump,
         Progress(f"exporting to {arguments.output}") as progress,
     ):
         from_ns, to_ns = time_range(arguments, dump.begin_ns)
@@ -167,12 +167,12 @@ def execute(arguments: argparse.Namespace) -> int:
             progress.total = dump.end_ns - dump.begin_ns
             with new_file(arguments.output) as stream:
                 count = export_events(dump, sources, stream, form, from_ns, to_ns, progress)
-            return _told(arguments, complaints, [(arguments.output, count)], "rows")
+            return _print_result(arguments, report, [(arguments.output, count)], "rows")
         if form == "mcap":
             progress.total = dump.end_ns - dump.begin_ns
             with new_file(arguments.output) as stream:
                 counts = export_mcap(dump, chosen, stream, from_ns, to_ns, raw=arguments.raw, progress=progress)
-            return _told(arguments, complaints, [(arguments.output, counts)], "messages")
+            return _print_result(arguments, report, [(arguments.output, counts)], "messages")
         progress.total = len(sources) * (dump.end_ns - dump.begin_ns)
         with ExitStack() as stack:
             if named:
@@ -187,18 +187,20 @@ def execute(arguments: argparse.Namespace) -> int:
             raise RecordingError(
                 f"no frames of {dump.files[0]} are in that time; it goes {span(dump.begin_ns, dump.end_ns)}"
             )
-    return _told(arguments, complaints, tables.files, "rows")
+    return _print_result(arguments, report, tables.files, "rows")
 
 
-def _told(arguments: argparse.Namespace, complaints: Complaints, files: Sequence[tuple[Path, int]], what: str) -> int:
+def _print_result(
+    arguments: argparse.Namespace, report: DamageReport, files: Sequence[tuple[Path, int]], what: str
+) -> int:
     """Print what was made, as lines or an object; 1 if something was damaged."""
     if arguments.json:
         made = [{"file": str(path), what: count} for path, count in files]
-        print(dumps({"files": made, "damage": complaints.texts}, indent=2))
+        print(dumps({"files": made, "damage": report.texts}, indent=2))
     else:
         for path, count in files:
             say(f"{path}: {count} {what}")
-    return int(complaints.any)
+    return int(report.any)
 
 
 def _form(output: Path, asked: str | None) -> tuple[bool, str]:

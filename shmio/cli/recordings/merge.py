@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 
-from shmio.cli.recordings.complaints import Complaints
+from shmio.cli.recordings.damage_report import DamageReport
 from shmio.cli.recordings.rewriting import rewrite, verified
 from shmio.cli.run import say
 
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write what is in any of the files, once and in the order of time, to a new one."""
-    complaints = Complaints()
-    with complaints.open(arguments.files) as dump:
+    report = DamageReport()
+    with report.open(arguments.files) as dump:
         work = rewrite(dump, arguments.output, "shmio-dump merge", dump.items())
     for line in verified(arguments.output):
         say(line)
     say(f"  {work.counts['frames']} frames and {work.counts['events']} events of {len(arguments.files)} files")
-    return int(complaints.any)
+    return int(report.any)

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from shmio.cli.interrupt import told_to_stop
+from shmio.cli.interrupt import stop_on_signals
 from shmio.cli.run import say, say_json
 from shmio.cli.target import target
 from shmio.config import Recorder as Settings
@@ -33,13 +33,13 @@ LOOK_S = 0.5
 def execute(arguments: argparse.Namespace) -> int:
     """Record until Ctrl-C, the time is over, or the instance ends."""
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
-    with target(arguments).open() as segment, told_to_stop() as stopping:
+    with target(arguments).open() as segment, stop_on_signals() as stopping:
         sources = arguments.sources
         selection = Selection(sources, arguments.registers or ())
         for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
             raise PathError(missing)
         tap = InstanceFollower(segment, StartPositions(first=False), selection)
-        news = _News(as_json=arguments.json)
+        news = Reporter(as_json=arguments.json)
         work = _work(arguments, tap, _attachments(segment, news))
         chosen = list(sources or segment.blocks)
         place = work.file or f"{arguments.directory} whenever {arguments.when}"
@@ -77,7 +77,7 @@ def _record(
     work: RotatingRecorder | TriggeredRecorder,
     stopping: threading.Event,
     duration_s: float | None,
-    news: _News,
+    news: Reporter,
 ) -> bool:
     """Whether it went on as long as was asked."""
     until_s = None if duration_s is None else time.monotonic() + duration_s
@@ -102,7 +102,7 @@ def _record(
             return until_s is None
 
 
-def _attachments(segment: Segment, news: _News) -> AttachedFiles:
+def _attachments(segment: Segment, news: Reporter) -> AttachedFiles:
     """The files of the configuration, if the supervisor says where that is."""
     try:
         return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
@@ -113,7 +113,7 @@ def _attachments(segment: Segment, news: _News) -> AttachedFiles:
 
 
 def _sum_up(
-    work: RotatingRecorder | TriggeredRecorder, file: Path | None, directory: Path, news: _News, *, whole: bool
+    work: RotatingRecorder | TriggeredRecorder, file: Path | None, directory: Path, news: Reporter, *, whole: bool
 ) -> None:
     counters = work.counters
     counts = {"frames": counters.frames, "events": counters.events, "missed": counters.missed}
@@ -126,7 +126,7 @@ def _name(file: Path | None) -> str | None:
     return None if file is None else str(file)
 
 
-class _News:
+class Reporter:
     """Tells what goes on: on standard error in lines, or on standard output as an object a line."""
 
     def __init__(self, *, as_json: bool) -> None:

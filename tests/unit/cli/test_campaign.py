@@ -11,7 +11,7 @@ from typing import cast
 import pytest
 
 from shmio.cli.campaign import run_campaign
-from shmio.cli.cell import Cell, Happened
+from shmio.cli.cell import CampaignEvent, Cell
 from shmio.cli.user import main
 from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
@@ -61,7 +61,7 @@ class Still:
     clock = ClockState(ClockMode.VIRTUAL, time_ns=3_000_000_000)
     stands = False
 
-    def news(self) -> list[Happened]:
+    def news(self) -> list[CampaignEvent]:
         return []
 
     @contextmanager

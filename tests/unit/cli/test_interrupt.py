@@ -6,12 +6,12 @@ import signal
 
 import pytest
 
-from shmio.cli.interrupt import told_to_stop
+from shmio.cli.interrupt import stop_on_signals
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_them(sign: signal.Signals) -> None:
-    with told_to_stop() as stopping:
+    with stop_on_signals() as stopping:
         signal.raise_signal(sign)
         assert stopping.wait(20)
 
@@ -19,7 +19,7 @@ def test_a_signal_ends_them(sign: signal.Signals) -> None:
 def test_under_nohup_a_closed_terminal_does_not() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with told_to_stop():
+        with stop_on_signals():
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:

@@ -12,7 +12,7 @@ from shmio.recording.dump import Dump, open_dump
 from shmio.recording.format.damage import Damage
 
 
-class Complaints:
+class DamageReport:
     """Tells on standard error."""
 
     def __init__(self) -> None:
