@@ -1,4 +1,4 @@
-"""``shmio inject --file``: lay a campaign, tell what happens in it, and lift it at the end."""
+"""``shmio inject --file``: run a campaign, print its events, and remove it at the end."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from shmio.errors import CommandError
 from shmio.logs import printable
 
 TURN_S: Final = 0.2
-"""How often it is told what has happened: the bells of several sources cannot be waited for at once."""
+"""Interval between looks for events: one thread cannot wait for several sources at once."""
 SEED_BITS: Final = 32
 
 
 def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
-    """Until all of it is over, the time is up, or Ctrl-C; with ``keep`` until it is laid.
+    """Run a campaign until all of it is over, the time is up, or Ctrl-C.
 
-    ConfigError, CommandError: nothing was laid.
+    With ``keep``, return as soon as it has started. ConfigError, CommandError: nothing was started.
     """
     seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
     read = read_campaign(options.file)
@@ -51,7 +51,7 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespace) -> None:
-    """Tell what happens, until nothing of it stands any more."""
+    """Print events until no injection remains, the time is up, or a signal comes."""
     deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
     while True:
         ended = over.is_set() or options.keep or (deadline_s is not None and time.monotonic() > deadline_s)
@@ -63,7 +63,7 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
 
 
 def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
-    """CommandError: the time of one is over, so that it would do nothing."""
+    """Raise CommandError if the time of an injection has passed, so that it would do nothing."""
     for one in declarations:
         if one.end_s is not None and one.end_s <= now_s:
             raise CommandError(
@@ -73,18 +73,18 @@ def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
 
 
 def _with_seed(declaration: Declaration, seed: int) -> Declaration:
-    """One that has no seed of its own gets one that the user is told, or has told."""
+    """Return a declaration with the given seed, unless it has its own."""
     return msgspec.structs.replace(declaration, seed=seed) if declaration.seed is None else declaration
 
 
 def _shifted(declaration: Declaration, now_s: float) -> Declaration:
-    """With times that count from now."""
+    """Return a declaration with times that count from now."""
     end_s = None if declaration.end_s is None else declaration.end_s + now_s
     return msgspec.structs.replace(declaration, start_s=(declaration.start_s or 0) + now_s, end_s=end_s)
 
 
 def _print(happened: CampaignEvent, *, as_json: bool) -> None:
-    """A line: the instance's clock, the cycle, what happened to which."""
+    """Print an event as a line: time, cycle, injection, what happened."""
     time_s, cycle, source, number, what, text = happened
     if as_json:
         told = {"time_s": time_s, "cycle": cycle, "source": source, "id": number, "what": what, "text": text}

@@ -1,4 +1,4 @@
-"""What the user's verbs act on: an instance of this host (local.py), or one that is reached by gRPC (remote.py)."""
+"""The interface that the verbs of ``shmio`` use: an instance on this host, or one behind gRPC."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shmio.segment.standing_injections import StandingInjection
 
 
 class Selected(NamedTuple):
-    """A register, or an array's element, of a source."""
+    """A register or array element of a source."""
 
     source: str
     register: Register
@@ -29,7 +29,7 @@ class Selected(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A reading that differs from the one before. ``width``: of the longest path that is watched."""
+    """A changed reading; ``width`` is the length of the longest watched path, in characters."""
 
     what: Selected
     now: Reading
@@ -37,16 +37,16 @@ class Change(NamedTuple):
 
 
 class Shadow(Protocol):
-    """An injection that was laid."""
+    """An active injection."""
 
     number: int
 
     def set(self, values: Mapping[str, object]) -> Sequence[Outcome]:
-        """Give values by path; what became of each."""
+        """Set values by path, and return the outcome of each."""
 
 
 class CampaignEvent(NamedTuple):
-    """What was done with a declared injection: ``what``, at which time of the instance's clock."""
+    """An event of a declared injection; ``time_s`` is of the instance's clock."""
 
     time_s: float
     cycle: int
@@ -57,68 +57,74 @@ class CampaignEvent(NamedTuple):
 
 
 class Campaign(Protocol):
-    """Declared injections that were laid."""
+    """The declared injections of one campaign."""
 
     @property
     def stands(self) -> bool:
-        """Whether any of it does, by what :meth:`news` has told."""
+        """Whether any injection remains, according to the events that :meth:`news` has returned."""
 
     def news(self) -> list[CampaignEvent]:
-        """What has happened since it was asked last, or was laid."""
+        """Return the events since the last call, or since the start."""
 
 
 class Cell(Protocol):
-    """An instance. Errors are those of :mod:`shmio.errors`."""
+    """An instance; its methods raise the errors of :mod:`shmio.errors`."""
 
     @property
     def sources(self) -> list[str]:
         """Names of the sources."""
 
     def layout(self, source: str) -> Layout:
-        """The layout of a source; PathError."""
+        """Return the layout of a source; PathError if there is no such source."""
 
     def readings(self, patterns: Sequence[str], chosen: Sequence[Selected]) -> list[Reading]:
-        """The chosen registers as of now, which are what the patterns name; those of one source from one frame."""
+        """Return the present readings of ``chosen``, the registers that the patterns name.
+
+        Readings of one source come from one frame.
+        """
 
     def news(self, patterns: Sequence[str]) -> Iterator[Change]:
-        """The present readings of all that the patterns name, then each that changes. NotRunningError at the end."""
+        """Yield the present readings of all that the patterns name, then each change.
+
+        NotRunningError or RemoteError ends the iteration when the instance ends.
+        """
 
     def write(self, values: Mapping[str, object], timeout_s: float | None) -> Sequence[Outcome]:
         """Write registers of one source as one command."""
 
     def inject(self, *paths: str, priority: int, keep: bool, name: str) -> AbstractContextManager[Shadow]:
-        """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
+        """Start an injection for the duration of a ``with`` block, or permanently with ``keep``."""
 
     def declare(self, declarations: Sequence[Declaration], *, keep: bool) -> AbstractContextManager[Campaign]:
-        """Lay declared injections, all or none, for the time of a ``with`` block unless they are to be kept."""
+        """Start all declared injections or none, for a ``with`` block or permanently."""
 
     def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
-        """What stands at present, by source; the innermost first."""
+        """Return the present injections by source, innermost first."""
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection."""
+        """Remove an injection."""
 
     def lift_all(self) -> list[tuple[str, StandingInjection]]:
-        """Lift all."""
+        """Remove all injections, and return them with their sources."""
 
     @property
     def clock(self) -> ClockState:
-        """How time stands."""
+        """The state of the instance's clock."""
 
     def real_sources(self) -> list[str]:
-        """Names of the sources that steps do not move: those with a device."""
+        """Return the names of the sources with a device, which steps do not affect."""
 
     def step(self, dt_s: float | None, count: int) -> None:
-        """Move time by so many steps."""
+        """Advance the clock by ``count`` steps of ``dt_s`` each."""
 
     def play(self, rate: float, dt_s: float | None) -> None:
-        """Have time step by itself."""
+        """Let the clock advance by itself at ``rate`` times real time."""
 
     def pause(self) -> None:
-        """Have it step no more by itself."""
+        """Stop the clock."""
 
     def release(self) -> None:
-        """Have it be real again."""
+        """Return the clock to real time."""
 
     def replay(self, wanted: ReplayRequest) -> list[Playing]:
-        """Move what plays recordings, if anything is wanted; how they play then."""
+        """Control the replayed sources if anything is requested, and return their states."""

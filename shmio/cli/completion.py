@@ -1,6 +1,7 @@
-"""Completion of command lines, by argcomplete: the shell runs the command, which answers what may come next.
+"""Command-line completion by argcomplete: the shell runs the command, which prints the choices.
 
-Options, verbs and choices argcomplete takes from the parsers. What else there is, this finds by an argument's ``dest``.
+argcomplete takes options, verbs and choices from the parsers. This module completes other arguments
+by their ``dest``.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ Completer = Callable[..., Iterable[str]]
 
 
 def script(shell: str) -> str:
-    """What a shell is to read, once each time that it starts. MissingLibraryError."""
+    """Return the code that a shell reads at its start; MissingLibraryError."""
     text: str = _argcomplete().shellcode(PROGRAMS, shell=shell)
     return text
 
 
 def answer(parser: argparse.ArgumentParser) -> None:
-    """Tell the shell what may come next, and exit. MissingLibraryError."""
+    """Print the possible completions for the shell, and exit; MissingLibraryError."""
     completers = _argcomplete().completers
     files = completers.FilesCompleter
 
@@ -63,7 +64,7 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
                 yield from _actions(verb)
 
 
-# -- what there is -------------------------------------------------------------------------------------------
+# -- completers ----------------------------------------------------------------------------------------------
 
 
 def _nothing(**_: object) -> list[str]:
@@ -77,7 +78,7 @@ def _instances(**_: object) -> list[str]:
 
 
 def _processes(parsed_args: argparse.Namespace, **_: object) -> list[str]:
-    """Names for ``restart`` and ``logs``."""
+    """Return the process names for ``restart`` and ``logs``."""
     from shmio.cli.target import target  # noqa: PLC0415
 
     try:
@@ -93,7 +94,7 @@ def _sources(parsed_args: argparse.Namespace, **_: object) -> list[str]:
 
 
 def _registers(prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
-    """Paths that begin so, to the next slash: as files of folders are completed."""
+    """Return the paths that begin with the prefix, up to the next slash, as for files."""
     found = _paths(parsed_args)
     paths = [f"{source}/{path}" for source, ones in found.items() for path in ones]
     if len(found) == 1 and not any(path.startswith(prefix) for path in paths):
@@ -103,7 +104,7 @@ def _registers(prefix: str, parsed_args: argparse.Namespace, **_: object) -> lis
 
 
 def _paths(options: argparse.Namespace) -> dict[str, list[str]]:
-    """Registers by their sources: of the recordings that the line names, else of the instance on this host."""
+    """Return paths by source: of the recordings on the line, else of the instance on this host."""
     files = getattr(options, "files", None) or [getattr(options, "file", None)]
     try:
         return _recorded(files) if hasattr(options, "output") or files[0] else _running(options)

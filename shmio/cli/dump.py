@@ -1,4 +1,7 @@
-"""``shmio-dump``: record a running instance, look into recordings. A module of ``shmio.cli.recordings`` each."""
+"""``shmio-dump``: record a running instance, and examine recordings.
+
+Each verb is a module of ``shmio.cli.recordings``.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +19,11 @@ from shmio.cli.run import add_full, add_json, complete, run
 PROGRAM = "shmio-dump"
 SOME_FILES = "print JSON: one object, or a list for several files"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
-"""What ``diff`` may pass over: shmio.recording.compare, which is not imported for other verbs."""
+"""What ``diff`` can ignore, as in shmio.recording.compare, which only that verb imports."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of the console script; the exit status."""
+    """Run ``shmio-dump`` and return its exit status."""
     parser = _parser()
     complete(parser)
     arguments, rest = parser.parse_known_args(argv)

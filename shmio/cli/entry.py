@@ -1,6 +1,7 @@
-"""The console scripts. They import next to nothing: Ctrl-C while a command is still loading ends it at once.
+"""The console scripts, with few imports, so that Ctrl-C ends a command at once while it loads.
 
-Not by an exception: one within the import of a library leaves half of it, and C code that goes on with that crashes.
+It does not raise an exception then: one during an import leaves a half-loaded library, and C code
+that uses it crashes.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from types import TracebackType
 
 
 def _hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """What the script shows of an error that ends it: nothing of Ctrl-C, by which it ends as shells expect."""
+    """Print the traceback of an uncaught error, except for Ctrl-C."""
     if not issubclass(kind, KeyboardInterrupt):
         sys.__excepthook__(kind, error, trace)
 
@@ -45,7 +46,7 @@ def shmio_supervisor() -> int:
 
 
 def _run(module: str) -> int:
-    """The exit status of this module's ``main``: 130 if it was interrupted before that heeds Ctrl-C."""
+    """Run a module's ``main`` and return its exit status; 130 if Ctrl-C came early."""
     try:
         main = importlib.import_module(module).main
         if _HEEDED:
@@ -61,7 +62,7 @@ def _run(module: str) -> int:
 
 
 def _leave(status: int) -> None:
-    """End without the interpreter's own end, in which threads of gRPC that still run may crash, or wait for ever."""
+    """Exit without the interpreter's shutdown, in which gRPC's threads may crash or hang."""
     for stream in filter(None, (sys.stdout, sys.stderr)):
         try:
             stream.flush()
@@ -71,6 +72,6 @@ def _leave(status: int) -> None:
 
 
 def _end_quietly() -> None:
-    """Have Ctrl-C end the process at once: nothing is left to be told, and the interpreter would print a traceback."""
+    """Let Ctrl-C end the process at once, without the interpreter's traceback."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

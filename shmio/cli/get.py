@@ -1,4 +1,4 @@
-"""``shmio get``: values as of now."""
+"""``shmio get``: print present values."""
 
 from __future__ import annotations
 

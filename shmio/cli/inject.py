@@ -1,4 +1,4 @@
-"""``shmio inject``: shadows over registers, as long as the command runs."""
+"""``shmio inject``: override registers' values as long as the command runs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Lay, list, or lift. PathError, ValueRangeError, CommandError."""
+    """Start, list or remove injections; PathError, ValueRangeError, CommandError."""
     if options.lift_all or options.lift is not None:
         return _lift(cell, options)
     if options.file is not None:
@@ -75,7 +75,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _seed(text: str) -> int:
-    """An argument's type."""
+    """Convert the argument of ``--seed``."""
     if not text.isascii() or not text.isdecimal() or len(text) > 19 or int(text) >= 2**63:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to {2**63 - 1}")
     return int(text)
@@ -94,7 +94,7 @@ def _read(cell: Cell, path: str, text: str) -> tuple[Topic, Value]:
 
 
 def _wait(for_s: float | None) -> None:
-    """Until Ctrl-C, SIGTERM or the time is over; then all is lifted."""
+    """Wait for Ctrl-C, SIGTERM, SIGHUP or the end of the time."""
     with stop_on_signals() as over:
         over.wait(for_s)
 
@@ -115,7 +115,7 @@ def _lift(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _list(cell: Cell, *, as_json: bool) -> None:
-    """What stands, with the registers that it is over."""
+    """Print the present injections with their registers."""
     found: list[dict[str, Any]] = []
     for source, standing in cell.injections().items():
         layout = cell.layout(source)
@@ -140,7 +140,7 @@ def _list(cell: Cell, *, as_json: bool) -> None:
 
 
 def _targets(one_found: dict[str, Any]) -> list[str]:
-    """What it is over: of a declared one as that says it."""
+    """Return an injection's targets; those of a declared one as declared."""
     running = one_found.get("running")
     if running is None:
         return list(one_found["registers"])
@@ -150,7 +150,7 @@ def _targets(one_found: dict[str, Any]) -> list[str]:
 
 
 def _running(running: dict[str, Any] | None) -> str:
-    """How a declared one is."""
+    """Return the state of a declared injection as text."""
     if running is None:
         return ""
     times = f" since cycle {running['cycle']}, run {running['runs']}" if running["state"] == "active" else ""

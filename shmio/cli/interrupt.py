@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and a closed terminal, for commands that run until they are told to stop, or are cut short."""
+"""Handle Ctrl-C, SIGTERM and a closed terminal in commands that run for a long time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
     stopping = threading.Event()
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        # Not here: the main thread, which is interrupted, may hold the event's lock.
+        # In another thread, because the interrupted main thread may hold the event's lock.
         threading.Thread(target=stopping.set, daemon=True).start()
 
     heeded = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -35,7 +35,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
 @contextmanager
 def ended_by_interrupt() -> Iterator[None]:
-    """Ctrl-C ends the process at once, and quietly: for imports of libraries that an exception within would break."""
+    """Let Ctrl-C end the process at once and quietly, for imports that an exception would break."""
     main = threading.current_thread() is threading.main_thread()
     heeded = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heeded:
@@ -49,14 +49,15 @@ def ended_by_interrupt() -> Iterator[None]:
 
 @contextmanager
 def exit_on_signals() -> Iterator[None]:
-    """SIGTERM and a closed terminal end what is at work as Ctrl-C does, by an exception: nothing is left half done.
+    """Let SIGTERM and SIGHUP raise SystemExit, so that unfinished work is undone.
 
-    The exit status is 128 + n, as shells have it. What was ignored, as SIGHUP is under nohup, still is.
+    The exit status is 128 + n, as in shells. Ignored signals, such as SIGHUP under nohup, stay
+    ignored.
     """
 
     def end(number: int, _frame: FrameType | None) -> None:
         for other in old:
-            signal.signal(other, signal.SIG_IGN)  # a shell that ends tells it once more, and what is undone is undone
+            signal.signal(other, signal.SIG_IGN)  # an ending shell repeats it, and must not disturb the undoing
         sys.exit(128 + number)
 
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}

@@ -81,7 +81,7 @@ def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], 
 
 
 def _read(name: str) -> Source:
-    """Read a source; one byte more than allowed is enough for the compiler to refuse it."""
+    """Read a source, at most slightly more than allowed: the compiler refuses that."""
     with Path(name).open("rb") as file:
         return Source(name, file.read(MAX_SOURCE_BYTES + 4))
 
@@ -92,7 +92,7 @@ def _complain(lines: Iterable[object]) -> None:
 
 
 def _unread(layout: Layout) -> Iterator[str]:
-    """Say which initial values mean nothing here; an emulated PLC would start without them."""
+    """Yield warnings about initial values that cannot be read, and that an emulated PLC lacks."""
     for text in initial_value_warnings(layout):
         yield f"{layout.name}: warning: {text}"
 

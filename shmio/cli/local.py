@@ -1,4 +1,4 @@
-"""An instance of this host, as the user's verbs see it: by its shared memory."""
+"""An instance on this host, accessed through its shared memory."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from shmio.segment.standing_injections import StandingInjection
 
 IDLE_S: Final = 0.5
 WAITING_FRAMES: Final = 64
-"""Changes of so many frames may wait for a slow terminal; a block further behind goes on with its newest frame."""
+"""Frames whose changes may wait for a slow terminal; a block further behind skips to its newest."""
 
 _TOLD: Final = frozenset({EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.LIFTED})
 
@@ -44,18 +44,21 @@ class Local:
         return self.attachment.sources
 
     def layout(self, source: str) -> Layout:
-        """The layout of a source; PathError."""
+        """Return the layout of a source; PathError if there is no such source."""
         return self.attachment.block(source).layout
 
     def readings(self, patterns: Sequence[str], chosen: Sequence[Selected]) -> list[Reading]:  # noqa: ARG002
-        """The chosen registers as of now; those of one source from one frame. NotRunningError: it has stopped."""
+        """Return the present readings of ``chosen``; those of one source come from one frame.
+
+        NotRunningError: the instance has stopped.
+        """
         self._check_running()
         blocks = {source: self.attachment.block(source) for source in {one.source for one in chosen}}
         frames = {source: block.latest() for source, block in blocks.items()}
         return [reading(blocks[one.source], one.register, frames[one.source]) for one in chosen]
 
     def news(self, patterns: Sequence[str]) -> Iterator[Change]:
-        """What all blocks report; a thread waits on each.
+        """Yield the changes of all blocks; a thread waits on each block.
 
         NotRunningError: the instance has stopped, or a reload has removed a source or a register.
         """
@@ -80,7 +83,10 @@ class Local:
             raise NotRunningError(f"instance {self.attachment.instance!r} has stopped")
 
     def _choose_again(self, patterns: Sequence[str], sources: set[str]) -> list[Selected]:
-        """What the patterns name after a reload; ``sources``: of what they named before. NotRunningError."""
+        """Return what the patterns name after a reload; NotRunningError if that is nothing.
+
+        ``sources`` are those of what they named before.
+        """
         try:
             return choose(self, patterns)
         except PathError as error:
@@ -92,7 +98,7 @@ class Local:
             raise NotRunningError(f"{error}: a reload has taken it away") from None
 
     def _follow_new(self, chosen: Sequence[Selected], followed: set[int], news: queue.Queue[_Changes]) -> int:
-        """Have a thread follow each block that none follows yet; the width of the longest path."""
+        """Start a thread for each block that none follows yet; return the longest path's length."""
         registers: dict[int, tuple[Block, list[Register]]] = {}
         for one in chosen:
             block = self.attachment.block(one.source)
@@ -108,60 +114,60 @@ class Local:
         return self.attachment.write(values, timeout_s)
 
     def inject(self, *paths: str, priority: int, keep: bool, name: str) -> Shadow:
-        """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
+        """Start an injection for the duration of a ``with`` block, or permanently with ``keep``."""
         return self.attachment.inject(*paths, priority=priority, keep=keep, name=name)
 
     def declare(self, declarations: Sequence[Declaration], *, keep: bool) -> LocalCampaign:
-        """Lay declared injections, all or none, for the time of a ``with`` block unless they are to be kept."""
+        """Start all declared injections or none, for a ``with`` block or permanently."""
         return LocalCampaign(self.attachment, declarations, keep=keep)
 
     def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
-        """What stands at present, by source; the innermost first."""
+        """Return the present injections by source, innermost first."""
         return self.attachment.injections()
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection."""
+        """Remove an injection."""
         self.attachment.lift(source, number)
 
     def lift_all(self) -> list[tuple[str, StandingInjection]]:
-        """Lift all."""
+        """Remove all injections, and return them with their sources."""
         return self.attachment.lift_all()
 
     @property
     def clock(self) -> ClockState:
-        """How time stands."""
+        """The state of the instance's clock."""
         return self.attachment.clock
 
     def real_sources(self) -> list[str]:
-        """Names of the sources that steps do not move: those with a device."""
+        """Return the names of the sources with a device, which steps do not affect."""
         blocks = map(self.attachment.block, self.attachment.sources)
         return [block.source for block in blocks if not block.attributes.stepped]
 
     def step(self, dt_s: float | None, count: int) -> None:
-        """Move time by so many steps."""
+        """Advance the clock by ``count`` steps of ``dt_s`` each."""
         for _ in range(count):
             self.attachment.step(dt_s)
 
     def play(self, rate: float, dt_s: float | None) -> None:
-        """Have time step by itself."""
+        """Let the clock advance by itself at ``rate`` times real time."""
         self.attachment.play(rate, dt_s)
 
     def pause(self) -> None:
-        """Have it step no more by itself."""
+        """Stop the clock."""
         self.attachment.pause()
 
     def release(self) -> None:
-        """Have it be real again."""
+        """Return the clock to real time."""
         self.attachment.release()
 
     def replay(self, wanted: ReplayRequest) -> list[Playing]:
-        """Move what plays recordings, if anything is wanted; how they play then."""
+        """Control the replayed sources if anything is requested, and return their states."""
         replay = self.attachment.replay
         return replay.status(wanted.sources) if wanted.nothing else replay.change(wanted)
 
 
 class LocalCampaign:
-    """Declared injections as a :class:`shmio.cli.cell.Campaign`; they are laid when it is made."""
+    """A :class:`shmio.cli.cell.Campaign` whose injections start on construction."""
 
     def __init__(self, cell: Attachment, declarations: Sequence[Declaration], *, keep: bool) -> None:
         self._keep = keep
@@ -170,11 +176,11 @@ class LocalCampaign:
 
     @property
     def stands(self) -> bool:
-        """Whether any of it does."""
+        """Whether any injection remains."""
         return bool(self._laid)
 
     def news(self) -> list[CampaignEvent]:
-        """What has happened since."""
+        """Return the events since the last call."""
         return [happened for source, cursor in self._cursors.items() for happened in self._of(source, cursor)]
 
     def _of(self, source: str, cursor: Cursor[Event]) -> Iterator[CampaignEvent]:
@@ -195,7 +201,7 @@ class LocalCampaign:
 
 
 def _follow(block: Block, registers: list[Register], news: queue.Queue[_Changes]) -> None:
-    """Report each register's reading, then every change of value or quality; an empty list when the block ends."""
+    """Queue each register's reading, then every change; an empty list when the block ends."""
     shown: list[tuple[str, Quality, str] | None] = [None] * len(registers)
     cursor = block.cursor()
     frame: Frame | None = block.latest()

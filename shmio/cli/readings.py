@@ -1,4 +1,4 @@
-"""Registers as the user's tool selects and shows them."""
+"""Select registers and format readings for ``shmio``."""
 
 from __future__ import annotations
 
@@ -22,9 +22,13 @@ CUT = "… (all: --full)"
 
 
 def choose(cell: Cell, patterns: Sequence[str]) -> list[Selected]:
-    """Registers that the patterns name, each once, in order: a path, an array's element or slice, a structure, a glob.
+    """Return the registers that the patterns name, each once, in order.
 
-    PathError when one of them names nothing.
+    A pattern is a path, an array element or slice, a structure, or a glob.
+
+    Raises:
+        PathError: A pattern names nothing.
+
     """
     chosen: dict[Selected, None] = {}
     sources = cell.sources
@@ -43,7 +47,7 @@ def choose(cell: Cell, patterns: Sequence[str]) -> list[Selected]:
 
 
 def as_json(reading: Reading, register: Register) -> dict[str, Any]:
-    """A reading as the object that ``get --json`` and ``watch --json`` print."""
+    """Return a reading as the object that ``get --json`` and ``watch --json`` print."""
     return {
         "value": json_value(reading.value, register.element),
         "quality": str(reading.quality),
@@ -55,16 +59,16 @@ def as_json(reading: Reading, register: Register) -> dict[str, Any]:
 
 
 def as_line(path: str, reading: Reading, register: Register, width: int, room: int | None) -> str:
-    """A reading as a line for people; quality is said unless it is good, and that a value is injected."""
+    """Return a reading as a line of text, with its quality unless good, and a note if injected."""
     quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {printable(reading.reason)}"
     injected = f"  ({reading.provenance})" if reading.provenance == str(Provenance.INJECTED) else ""
     return f"{printable(path):<{width}}  {shown(reading.value, register, room)}{injected}{quality}"
 
 
 def shown(value: Value, register: Register, room: int | None) -> str:
-    """A value for people; ``-`` if there is none, ``""`` if it is empty.
+    """Return a value as text; ``-`` if there is none, ``""`` if it is empty.
 
-    With ``room`` for so many characters: no more of it than that, and how to see all.
+    ``room`` is the maximum number of characters; longer text is cut, with a hint on how to see all.
     """
     text = "-" if value is None else printable(literal_text(value, register)) or '""'
     return text if room is None or len(text) <= room else f"{text[: max(room - len(CUT), 0)]}{CUT}"

@@ -1,4 +1,4 @@
-"""``shmio list``: which registers there are."""
+"""``shmio list``: list registers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An instance that is reached by gRPC, as the user's verbs see it."""
+"""An instance that is accessed through gRPC."""
 
 from __future__ import annotations
 
@@ -36,10 +36,14 @@ from shmio.segment.standing_injections import DeclaredState, StandingInjection
 
 @contextmanager
 def connected(options: argparse.Namespace) -> Iterator[Remote]:
-    """The instance that the options name. ConfigError: they name none; OSError: a file cannot be read.
+    """Connect to the instance that the options name.
 
-    ValueRangeError: the token would go to another host in plain text. UnknownClientError: it wants a token; which
-    option gives one.
+    Raises:
+        ConfigError: The options also name a local instance, or the address is invalid.
+        OSError: A file cannot be read.
+        ValueRangeError: The token would go to another host in plain text.
+        UnknownClientError: The instance requires a token; the message has the option for it.
+
     """
     if options.config is not None or options.instance is not None:
         raise ConfigError("--host names the instance already: leave out -c and --instance")
@@ -78,13 +82,13 @@ class Remote:
         return list(self._layouts)
 
     def layout(self, source: str) -> Layout:
-        """The layout of a source; PathError."""
+        """Return the layout of a source; PathError if there is no such source."""
         if source not in self._layouts:
             raise PathError(f"no source {source!r}; there are: {', '.join(self._layouts)}")
         return self._layouts[source]
 
     def readings(self, patterns: Sequence[str], chosen: Sequence[Selected]) -> list[Reading]:
-        """The chosen registers as of now; those of one source from one frame."""
+        """Return the present readings of ``chosen``; those of one source come from one frame."""
         found = self._client.read(*patterns).updates
         readings = []
         for one in chosen:
@@ -95,7 +99,7 @@ class Remote:
         return readings
 
     def news(self, patterns: Sequence[str]) -> Iterator[Change]:
-        """The present readings of all that the patterns name, then each that changes.
+        """Yield the present readings of all that the patterns name, then each change.
 
         RemoteError: the instance has ended; NotRunningError: a reload has removed a source or a register.
         """
@@ -127,17 +131,17 @@ class Remote:
             yield _RemoteShadow(shadow)
 
     def inject(self, *paths: str, priority: int, keep: bool, name: str) -> AbstractContextManager[Shadow]:
-        """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
+        """Start an injection for the duration of a ``with`` block, or permanently with ``keep``."""
         return self._lay(self._client.inject(*paths, priority=priority, keep=keep, name=name, originals=False))
 
     @contextmanager
     def declare(self, declarations: Sequence[Declaration], *, keep: bool) -> Iterator[Campaign]:
-        """Lay declared injections, all or none, for the time of a ``with`` block unless they are to be kept."""
+        """Start all declared injections or none, for a ``with`` block or permanently."""
         with self._client.declare(map(msgspec.to_builtins, declarations), keep=keep) as campaign:
             yield _RemoteCampaign(campaign)
 
     def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
-        """What stands at present, by source; the innermost first."""
+        """Return the present injections by source, innermost first."""
         found: dict[str, tuple[StandingInjection, ...]] = {}
         for one in self._client.injections():
             standing = StandingInjection(
@@ -148,11 +152,11 @@ class Remote:
         return found
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection."""
+        """Remove an injection."""
         self._client.lift(source, number)
 
     def lift_all(self) -> list[tuple[str, StandingInjection]]:
-        """Lift all."""
+        """Remove all injections, and return them with their sources."""
         return [
             (one.source, StandingInjection(one.number, "", 0, False, one.name, 0, 0, ()))
             for one in self._client.lift_all()
@@ -160,7 +164,7 @@ class Remote:
 
     @property
     def clock(self) -> ClockState:
-        """How time stands."""
+        """The state of the instance's clock."""
         now = self._client.clock()
         mode = ClockMode.VIRTUAL if now.virtual else ClockMode.WALL
         return ClockState(
@@ -168,29 +172,29 @@ class Remote:
         )
 
     def real_sources(self) -> list[str]:
-        """Names of the sources that steps do not move; an endpoint of version 0.1 tells of none."""
+        """Return the names of the sources that steps do not affect; version 0.1 reports none."""
         return [one["name"] for one in self._client.status()["processes"] if one.get("real_time")]
 
     def step(self, dt_s: float | None, count: int) -> None:
-        """Move time by so many steps."""
+        """Advance the clock by ``count`` steps of ``dt_s`` each."""
         with self._client.steps(count, dt_s) as steps:
             for _ in steps:
                 pass
 
     def play(self, rate: float, dt_s: float | None) -> None:
-        """Have time step by itself."""
+        """Let the clock advance by itself at ``rate`` times real time."""
         self._client.play(rate, dt_s)
 
     def pause(self) -> None:
-        """Have it step no more by itself."""
+        """Stop the clock."""
         self._client.pause()
 
     def release(self) -> None:
-        """Have it be real again."""
+        """Return the clock to real time."""
         self._client.release()
 
     def replay(self, wanted: ReplayRequest) -> list[Playing]:
-        """Move what plays recordings, if anything is wanted; how they play then."""
+        """Control the replayed sources if anything is requested, and return their states."""
         wish = msgspec.to_builtins(wanted)  # what is wanted alone
         return self._client.replay(**wish)
 
@@ -205,7 +209,7 @@ class _RemoteShadow:
 
 
 class _RemoteCampaign:
-    """Declared injections as a :class:`shmio.cli.cell.Campaign`; a thread reads the record."""
+    """A :class:`shmio.cli.cell.Campaign` over gRPC; a thread reads its events."""
 
     def __init__(self, campaign: ClientCampaign) -> None:
         self._names = {one.number: one.name for one in campaign.declared}
@@ -227,11 +231,11 @@ class _RemoteCampaign:
 
     @property
     def stands(self) -> bool:
-        """Whether any of it does."""
+        """Whether any injection remains."""
         return bool(self._left)
 
     def news(self) -> list[CampaignEvent]:
-        """What has happened since. RemoteError: the instance has ended."""
+        """Return the events since the last call; RemoteError if the instance has ended."""
         found = []
         while not self._told.empty():
             one = self._told.get()
@@ -274,7 +278,7 @@ def _register(found: Any) -> Register:
 
 
 def _reading(update: Update, place: int) -> Reading:
-    """One register of an update."""
+    """Return the reading of one register of an update."""
     table = update.table
     value: Value = None
     if update.source_ns:

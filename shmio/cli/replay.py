@@ -1,4 +1,4 @@
-"""``shmio replay``: moves what plays recordings."""
+"""``shmio replay``: control sources that replay recordings."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Do it, and tell how they play then. CommandError, PathError, ValueRangeError."""
+    """Carry out the action and print the new states; CommandError, PathError, ValueRangeError."""
     found = cell.replay(_wanted(options))
     if options.json:
         print(dumps([msgspec.to_builtins(one) for one in found]))

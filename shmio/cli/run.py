@@ -1,4 +1,4 @@
-"""What every command shares: exit status, output, and errors as one clear line. No traceback reaches a user."""
+"""Shared by all commands: exit status, output, and errors without a traceback."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from shmio.logs import printable
 
 MAX_SECONDS = 86_400
 SHOWN_CHARACTERS = 60
-"""Of a value, on a terminal."""
+"""Maximum characters of a value on a terminal."""
 
 
 class PartlyDoneError(CommandError):
-    """A command failed when some of it was done; ``found``: what its JSON tells of that, beside the error."""
+    """A command failed after a part was done; ``found`` describes that part for its JSON output."""
 
     def __init__(self, message: str, found: Mapping[str, object]) -> None:
         super().__init__(message)
@@ -61,7 +61,7 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """If it is a shell that asks, tell it what may come next on a command line, and exit."""
+    """Answer a shell's request for completion and exit; otherwise do nothing."""
     if "_ARGCOMPLETE" in os.environ:
         from shmio.cli.completion import answer  # noqa: PLC0415  not for those who run a command
 
@@ -69,13 +69,13 @@ def complete(parser: argparse.ArgumentParser) -> None:
 
 
 def say(line: str, stream: TextIO | None = None) -> None:
-    """Print a line at once; a terminal that has gone away must not stop what runs."""
+    """Print a line at once; a closed terminal must not stop the command."""
     with suppress(OSError):
         print(printable(line), file=stream or sys.stdout, flush=True)
 
 
 def say_json(value: Any) -> None:
-    """Print an object as a line at once, as ``say`` a text."""
+    """Print an object as one line of JSON at once; a closed terminal is ignored."""
     with suppress(OSError):
         print(dumps(value), flush=True)
 
@@ -95,7 +95,7 @@ def _give_up_output() -> None:
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """An argument's type: a whole number from ``least`` on."""
+    """Return an argument type: a whole number of at least ``least``."""
 
     def convert(text: str) -> int:
         if not text.isascii() or not text.isdecimal() or len(text) > 7 or int(text) < least:
@@ -106,7 +106,7 @@ def at_least(least: int) -> Callable[[str], int]:
 
 
 def seconds(text: str) -> float:
-    """An argument's type: a time in s."""
+    """Convert an argument that is a time in s."""
     try:
         seconds = float(text)
     except ValueError:
@@ -117,7 +117,7 @@ def seconds(text: str) -> float:
 
 
 def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:
-    """Add ``--json``, to which :func:`run` holds for errors, too."""
+    """Add ``--json``, which :func:`run` also applies to errors."""
     parser.add_argument("--json", action="store_true", help=f"{text}; an error, too")
 
 
@@ -127,11 +127,11 @@ def add_full(parser: argparse.ArgumentParser) -> None:
 
 
 def room(options: argparse.Namespace) -> int | None:
-    """For how many characters of a value there is room; None, for all: who is no terminal gets it whole."""
+    """Return the maximum characters of a value; None, for all, with ``--full`` or no terminal."""
     return None if options.full or not sys.stdout.isatty() else SHOWN_CHARACTERS
 
 
 def dumps(value: Any, indent: int | None = None) -> str:
-    """JSON that standard output can take, whatever its encoding."""
+    """Return JSON that standard output can encode."""
     utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
     return json.dumps(value, indent=indent, ensure_ascii=not utf8)

@@ -1,4 +1,4 @@
-"""``shmio set``: values toward a source, and what became of them."""
+"""``shmio set``: write values to a source, and print the outcomes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from shmio.segment import EventKind
 
 HELP = "Write values of registers, and print what became of each."
 MATCHES = 3
-"""So many of a pattern's registers are named to who meant one of them."""
+"""Number of matching registers that the error about a pattern names."""
 
 _NEGATIVE = re.compile(r"-(?:\.?[0-9]|Infinity\Z)")
 _QUOTED = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
@@ -45,20 +45,20 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def shield(words: Sequence[str]) -> list[str]:
-    """The command line with a space in front of what begins as a negative number, which argparse takes for options.
+    """Put a space before words that begin as negative numbers, so argparse takes no option there.
 
-    It knows ``-1.5`` itself, but not ``-1.5e-3``, ``-16#FF`` or ``-Infinity``.
+    argparse itself knows ``-1.5``, but not ``-1.5e-3``, ``-16#FF`` or ``-Infinity``.
     """
     return [f" {word}" if _NEGATIVE.match(word) else word for word in words]
 
 
 class Pairs(argparse.Action):
-    """PATH VALUE, as often as wanted."""
+    """The arguments PATH VALUE, any number of times."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, _: str | None = None
     ) -> None:
-        """Keep them as pairs; wrong usage when one is single."""
+        """Store the words as pairs; a path without a value is wrong usage."""
         words = [word[_NEGATIVE.match(word[1:]) is not None :] for word in values] if isinstance(values, list) else []
         if len(words) % 2:
             parser.error(f"{words[-1]!r} has no value: give PATH VALUE [PATH VALUE ...]")
@@ -66,7 +66,7 @@ class Pairs(argparse.Action):
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Write all values of each source as one command. CommandError, when not all were written, names the first."""
+    """Write all values of each source as one command; CommandError names the first failure."""
     wanted: dict[str, dict[str, Value]] = {}
     for path, text in options.pairs:
         target = _target(cell, path)
@@ -100,9 +100,9 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def read_value(text: str, register: Register) -> Value:
-    """The value of a text for this register: JSON if it is that, else an S7 literal. ValueRangeError.
+    """Return the value of JSON or an S7 literal for a register; ValueRangeError.
 
-    An array's literal must have all elements: what it leaves out would be written as zero.
+    An array's literal must have all elements: missing ones would be written as zero.
     """
     try:
         value = json.loads(text)
@@ -160,12 +160,12 @@ def _target(cell: Cell, path: str) -> Selected:
 
 
 def _described(outcomes: dict[str, Outcome]) -> dict[str, object]:
-    """Each outcome, for programs."""
+    """Return the outcomes for JSON."""
     return {path: {"outcome": str(end.kind), "reason": end.text} for path, end in outcomes.items()}
 
 
 def _print(outcomes: dict[str, Outcome], complaint: str) -> None:
-    """Each outcome, for people: without the reason that the error line gives."""
+    """Print the outcomes as text, without the reason that the error line gives."""
     width = max((len(printable(path)) for path in outcomes), default=0)
     for path, end in outcomes.items():
         reason = f": {printable(end.text)}" if end.text and end.text != complaint else ""
@@ -173,7 +173,7 @@ def _print(outcomes: dict[str, Outcome], complaint: str) -> None:
 
 
 def _complaint(path: str, outcome: Outcome) -> str:
-    """What to tell, and what to do about it."""
+    """Return the error text for a failed write, with a remedy."""
     if outcome.kind == EventKind.REJECTED:
         return f"{path}: not written, the source took nothing: {outcome.text}; see shmio-supervisor status"
     if outcome.kind == EventKind.REFUSED:

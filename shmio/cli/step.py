@@ -1,4 +1,4 @@
-"""``shmio step``: moves the time of an instance."""
+"""``shmio step``: advance, play or stop the clock of an instance."""
 
 from __future__ import annotations
 
@@ -39,7 +39,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Step, play or pause, and tell the time then. TimeError, ValueRangeError, CommandError."""
+    """Step, play, pause or release the clock, and print it.
+
+    Raises:
+        CommandError: The options contradict each other, or the user declined.
+        TimeError: The clock cannot be moved, or a step failed.
+        ValueRangeError: A step or rate is out of range.
+
+    """
     dt_s = None if options.dt_ms is None else options.dt_ms / 1000
     if dt_s is not None and (options.pause or options.release):
         raise CommandError(f"{'--pause' if options.pause else '--release'} does no step: leave out --dt-ms")
@@ -59,7 +66,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _ask(cell: Cell) -> None:
-    """Ask before the devices' real time and the instance's part. CommandError: the answer is no, or nobody is there."""
+    """Ask before the clock departs from the devices' real time; CommandError unless confirmed."""
     if cell.clock.virtual or not (real := cell.real_sources()):
         return
     who = f"{real[0]} goes" if len(real) == 1 else f"{real[0]} and {len(real) - 1} more go"

@@ -18,7 +18,7 @@ MODES = ("live", "log", "replay")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of the console script; the exit status."""
+    """Run ``shmio-supervisor`` and return its exit status."""
     parser = _parser()
     complete(parser)
     arguments = parser.parse_args(argv)

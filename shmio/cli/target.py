@@ -1,4 +1,4 @@
-"""Which instance a verb acts on."""
+"""Find the instance that a verb acts on."""
 
 from __future__ import annotations
 
@@ -21,23 +21,26 @@ DEFAULT_CONFIG = Path("supervisor.toml")
 
 
 def config_file(arguments: argparse.Namespace) -> Path:
-    """The configuration that a verb reads."""
+    """Return the configuration file that a verb reads."""
     return arguments.config or DEFAULT_CONFIG
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The instance that a verb acts on. ``file``: the configuration that names it; None: it was named by itself."""
+    """The instance that a verb acts on, and the configuration that names it, if any."""
 
     name: str
     file: Path | None = None
 
     def open(self, *, writable: bool = False) -> Segment:
-        """Its segment. WrongInstanceError: it was not started from the file that names it; else as Segment.open."""
+        """Open the instance's segment, with the errors of Segment.open.
+
+        WrongInstanceError: the instance was started from another file.
+        """
         return Segment.open(self.name, writable=writable, config=self.file)
 
     def open_supervised(self) -> Segment:
-        """Its segment, if it has a living supervisor; NotRunningError otherwise."""
+        """Open the instance's segment; NotRunningError if its supervisor is dead."""
         segment = self.open()
         if not segment.supervised:
             segment.close()
@@ -49,9 +52,13 @@ class Target:
 
 
 def target(arguments: argparse.Namespace) -> Target:
-    """The instance: as asked, else of the configuration asked for or here, else the only running one.
+    """Return the instance named by option or configuration, else the only running one.
 
-    ConfigError: not a name, or none in the file; NotRunningError: none runs; ControlError: several do.
+    Raises:
+        ConfigError: The name is invalid or missing in the file.
+        NotRunningError: No instance is running.
+        ControlError: Several instances are running.
+
     """
     if arguments.instance is not None:
         return Target(_checked("--instance", arguments.instance))
@@ -67,9 +74,9 @@ def target(arguments: argparse.Namespace) -> Target:
 
 
 def config_option(arguments: argparse.Namespace) -> str | None:
-    """What names the same configuration on another command line: ``-c FILE``, empty for the one that is taken anyway.
+    """Return the option that names the same configuration: ``-c FILE``, or nothing for the default.
 
-    None: the instance was named, or found running, and its configuration is not known.
+    None: the instance was named or found running, so its configuration is unknown.
     """
     if getattr(arguments, "instance", None) is not None:
         return None
@@ -79,12 +86,12 @@ def config_option(arguments: argparse.Namespace) -> str | None:
 
 
 def option_for(file: Path) -> str:
-    """What names this configuration on a command line; empty for the one that is taken anyway."""
+    """Return the option that names a configuration; empty for the default file."""
     return "" if file == DEFAULT_CONFIG else f"-c {shlex.quote(str(file))}"
 
 
 def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
-    """The answer of the instance's supervisor; ControlError as soon as it shows no sign of life."""
+    """Return the supervisor's answer to a request; ControlError as soon as it appears dead."""
     try:
         return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
     except UnreachableError as error:
@@ -92,7 +99,7 @@ def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[st
 
 
 def _named_in(file: Path) -> str:
-    """The name alone: an instance must be stoppable when its file has been spoilt since."""
+    """Read only the name from a file: an invalid file must not prevent stopping its instance."""
     tables = read_tables(file)
     try:
         name = tables["instance"]["name"]

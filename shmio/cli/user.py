@@ -1,4 +1,4 @@
-"""``shmio``: the user's tool, on a running instance of this host, or of another."""
+"""``shmio``: read, write and control a running instance on this host or another."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Verb = Callable[[Cell, argparse.Namespace], int]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of the console script; the exit status."""
+    """Run ``shmio`` and return its exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
     parser = _parser()
     complete(parser)
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
-    """The arguments, with paths that are written as in TIA Portal in our own spelling."""
+    """Return the arguments with paths in TIA Portal's spelling translated to shmio's."""
     patterns, pairs = getattr(arguments, "patterns", None) or (), getattr(arguments, "pairs", None) or ()
     if not any(map(may_be_tia_spelling, [*patterns, *(path for path, _ in pairs)])):
         return arguments

@@ -1,4 +1,4 @@
-"""``shmio watch``: values as they change, or again and again."""
+"""``shmio watch``: print values as they change, or at intervals."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Print until interrupted, until the instance ends, or until there are so many lines."""
+    """Print until interrupted, until the instance ends, or up to the number of lines."""
     lines = options.json or options.lines or options.count is not None
     if not lines and sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb":
         return _table(cell, options)
@@ -51,7 +51,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _table(cell: Cell, options: argparse.Namespace) -> int:
-    """A line for each register, brought up to date in place."""
+    """Show a line for each register, updated in place."""
     drawn = 0
     for read in _rounds(cell, options.patterns, options.every_s or TABLE_EVERY_S):
         columns, rows = shutil.get_terminal_size()
@@ -73,9 +73,12 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[list[Change]]:
-    """All that the patterns name, at once and then every so many seconds.
+    """Yield all that the patterns name, at once and then every ``every_s`` seconds.
 
-    PathError: they name nothing; NotRunningError: the instance has stopped, or a reload has taken them away.
+    Raises:
+        PathError: A pattern names nothing.
+        NotRunningError: The instance has stopped, or a reload has removed the registers.
+
     """
     chosen = choose(cell, patterns)
     due_s = time.monotonic()
@@ -101,7 +104,7 @@ def _line(news: Change, limit: int | None) -> str:
 
 
 def _clock(now: Reading) -> str:
-    """The value's own time; of one that is bad, when that was noticed."""
+    """Return the time of a value; for a bad value, the present time."""
     if now.quality is Quality.BAD:
         return datetime.now(UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]
     if now.source_time is None:

@@ -50,7 +50,7 @@ class LayoutFiles:
         return self._compile(key, section, paths, program, block.name)[0]
 
     def all(self, key: str, section: Source | Emulator) -> tuple[Layout, ...]:
-        """Return all layouts of a section's files; ConfigError for a missing file, or LayoutError."""
+        """Return all layouts of a section's files; ConfigError (missing file) or LayoutError."""
         return self._compile(key, section, *self._program(key, section), None)
 
     def _program(self, key: str, section: Source | Emulator) -> tuple[tuple[Path, ...], compiler.Program]:

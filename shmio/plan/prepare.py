@@ -328,7 +328,7 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
 
 
 def _not_emulated(config: Config) -> Iterator[str]:
-    """Yield warnings about sources that read this host where none of the file's emulators listens."""
+    """Yield warnings about sources that read this host where none of its emulators listens."""
     listening = {emulator.name: str(Address.parse(emulator.listen)) for emulator in config.emulator}
     for index, source in enumerate(config.source):
         device = peer(source)

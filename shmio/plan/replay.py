@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def given(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the command line's replay options as keys of ``[replay]``; ConfigError in other modes."""
+    """Return the command line's options as keys of ``[replay]``; ConfigError in other modes."""
     found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}
     if found and arguments.mode != "replay":
         raise ConfigError(f"--{next(iter(found))} goes with --mode replay only")
@@ -66,7 +66,7 @@ def options(keys: Mapping[str, Any]) -> list[str]:
 
 
 def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) -> Replayed:
-    """Return the configuration with only the recording's sources; ConfigError begins with the key."""
+    """Return the configuration with only the recording's sources; ConfigError with its key."""
     section = _section(config, keys)
     files = [str(config.path(file)) for file in _listed(section.file)]
     if not files:

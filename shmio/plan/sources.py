@@ -172,7 +172,7 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
-    """Return a simulation's layout and inputs; the layout is its files', or its model declares it."""
+    """Return a simulation's layout, of its files or as its model declares it, and its inputs."""
     from shmio.connectors.models.simulation import Simulation  # noqa: PLC0415
     from shmio.plan.models import describe  # noqa: PLC0415
 
