@@ -149,7 +149,7 @@ def _describe(job: Job, prepared: Prepared) -> str:
         return f"to {config['directory']}"
     if job.kind == "mqtt":
         return f"{config['broker']} on {config['listen']}" if job.name == BROKER else f"under {config['prefix']}/"
-    return f"on {', '.join(config['listen'])}"
+    return f"on {', '.join(job.listening)}"
 
 
 class _Console(logging.Formatter):

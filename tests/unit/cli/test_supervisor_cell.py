@@ -85,8 +85,12 @@ def cell(tmp_path: Path, instance: str, runtime: Path) -> Iterator[Cell]:
 
 
 def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
+    configured = cell.folder / "supervisor.toml"
+    both = 'listen = ["127.0.0.1:0"]\naddress = [{ listen = "127.0.0.1:0" }]'
+    configured.write_text(configured.read_text().replace('listen = ["127.0.0.1:0", "127.0.0.1:0"]', both))
     up = cell.run("up", "--detach", status=0).stdout
     assert f"{cell.instance}: mode live, segment shmio-{cell.instance}" in up
+    assert "  on 127.0.0.1:0, 127.0.0.1:0\n" in up
     assert "running, supervisor pid" in up
     status = cell.status()
     assert (status["instance"], status["mode"], status["state"]) == (cell.instance, "live", "running")
@@ -106,10 +110,9 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
         f"shmio-supervisor down --instance {cell.instance} stops it\n"
     )
     assert refused.stdout == ""
-    file = cell.folder / "supervisor.toml"
-    (cell.folder / "other.toml").write_text(file.read_text())
+    (cell.folder / "other.toml").write_text(configured.read_text())
     refused = cell.run("up", "-c", "other.toml", status=1)
-    assert f", started from {file}: shmio-supervisor down --instance {cell.instance} stops it; " in refused.stderr
+    assert f", started from {configured}: shmio-supervisor down --instance {cell.instance} stops it; " in refused.stderr
 
     pids = {process["name"]: process["pid"] for process in status["processes"]}
     os.kill(pids["plc"], signal.SIGKILL)
