@@ -100,11 +100,15 @@ def test_every_verb_refuses_by_the_file_of_another_plant(
     option = ["-c", str(other)] if named == "by option" else []
     assert run(words, *option) == 1
     output = capsys.readouterr()
-    assert output.out == ""
-    assert output.err == (
+    refusal = (
         f"the running instance {shared_instance!r} was started from {running}, not from {other}: "
-        f"to act on it all the same, name it: --instance {shared_instance}\n"
+        f"to act on it all the same, name it: --instance {shared_instance}"
     )
+    assert output.err == f"{refusal}\n"
+    if "--json" in words:
+        assert json.loads(output.out) == {"error": refusal}
+    else:
+        assert output.out == ""
     assert not (other.parent / "dumps").exists()
     unchanged(shared_instance)
 
