@@ -21,16 +21,16 @@ from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 
 NOTE = "to "
-"""How a recorder that is well begins its note; the name of its file follows."""
+"""Prefix of the note of a recorder without a problem; the name of its file follows."""
 WAITS = f"{NOTE}a file as soon as its trigger comes"
 
 
 def run(worker: Worker) -> None:
-    """Record until told to stop."""
+    """Record until the worker is stopped."""
     settings = msgspec.convert({k: v for k, v in worker.config.items() if k != "config_file"}, Settings)
     directory, segment = Path(settings.directory), worker.segment
-    worker.running()  # its search for what its predecessor has may take a while
-    segment.clock.abstain(worker.slot.index)  # for which no step waits: the rings have what comes meanwhile
+    worker.running()  # searching the predecessor's files may take a while
+    segment.clock.abstain(worker.slot.index)  # no step waits for that: the rings keep what comes meanwhile
     known = last_positions(directory, segment, SUPERVISED, worker.slot.beat)
     elsewhere = _elsewhere(worker.before, directory)
     start = StartPositions(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
@@ -58,7 +58,7 @@ def run(worker: Worker) -> None:
 
 
 def _elsewhere(before: Report, directory: Path) -> str:
-    """What to say of a predecessor whose file is not in this folder; empty if there was none, or it is here."""
+    """Describe a previous recorder whose file is not in this folder; empty if there is no such file."""
     name = before.note.removeprefix(NOTE)
     if before.note in (name, WAITS) or (directory / name).exists():
         return ""
@@ -66,7 +66,7 @@ def _elsewhere(before: Report, directory: Path) -> str:
 
 
 def _record(worker: Worker, series: RotatingRecorder | TriggeredRecorder) -> None:
-    """Turn after turn; in virtual time a step is over only when there was one for it, so that none of it is missed."""
+    """Record in turns. In virtual time each step waits for a turn, so that nothing of it is missed."""
     clock, slot = worker.segment.clock, worker.slot.index
     bell = clock.slot_bell(slot)
     seen, more, problem, told_s = bell.value(), False, "", 0.0

@@ -1,4 +1,4 @@
-"""The files that go with a recording: the instance's configuration and the sources of its layouts."""
+"""The files attached to a recording: the instance's configuration and the sources of its layouts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ log = logging.getLogger("shmio.recorder")
 
 
 class AttachedFile(NamedTuple):
-    """A file that goes with a recording."""
+    """A file attached to a recording."""
 
     name: str
     media_type: str
@@ -26,23 +26,23 @@ class AttachedFile(NamedTuple):
 
 
 AttachedFiles = Callable[[str | None, int], list[AttachedFile]]
-"""Gives the files to attach: those of the instance for None, those of a source for its name and its block's number."""
+"""Returns the files to attach, given a source's name and its block's number; for None those of the instance."""
 
 
 def no_attachments(_source: str | None, _block: int) -> list[AttachedFile]:
-    """None at all."""
+    """Attach no files."""
     return []
 
 
 class ConfigFiles:
-    """Gives the files that a configuration names. One that cannot be read is left out, and that is logged."""
+    """Reads the files that a configuration names. One that cannot be read is left out and logged."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._told: set[str] = set()
 
     def __call__(self, source: str | None, block: int) -> list[AttachedFile]:
-        """The configuration itself for None, the layout's sources for a source's block: as they are now."""
+        """Read the configuration (for None), or the files of a source's layout, as they are now."""
         if source is None:
             return self._read("config", [self._file], TOML)
         try:
@@ -71,7 +71,7 @@ class ConfigFiles:
         return found
 
     def _tell(self, why: str) -> None:
-        """Log it, once: it is looked at again and again."""
+        """Log a reason once, although the files are read again and again."""
         if why not in self._told:
             self._told.add(why)
             log.warning("%s", why)

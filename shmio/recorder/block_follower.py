@@ -1,4 +1,4 @@
-"""One block's frames and events, each once, in the order in which they happened; what was overwritten is a gap."""
+"""Follow a block: its frames and events, each once and in order, with gaps for overwritten ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Item = TypeVar("Item", bound=Frame | Event)
 
 
 class BlockEntry(NamedTuple):
-    """Something of a block that is to be recorded, with the time it has there."""
+    """A frame, event or gap of a block, with its time in the recording."""
 
     log_ns: int
     follower: BlockFollower
@@ -21,14 +21,14 @@ class BlockEntry(NamedTuple):
 
 
 class InstanceEntry(NamedTuple):
-    """Something of the instance that is to be recorded, with the time it has there."""
+    """A step or a change of a process, with its time in the recording."""
 
     log_ns: int
     item: StepMark | ProcessChange
 
 
 class _Stream(Generic[Item]):
-    """The frames, or the events."""
+    """Position in the frames, or in the events, of a block."""
 
     def __init__(self, what: str, cursor: Cursor[Item], log_ns: int, reason: Reason) -> None:
         self.what = what
@@ -45,7 +45,7 @@ class _Stream(Generic[Item]):
 
 
 class BlockFollower:
-    """Follows one block. ``done`` when a reload has ended the block and all of it was taken."""
+    """Follows one block. ``done`` is True once a reload has retired the block and all of it was taken."""
 
     def __init__(
         self,
@@ -58,10 +58,16 @@ class BlockFollower:
         over: bool = False,
         part: RecordedRegisters | None = None,
     ) -> None:
-        """``number``: of the block in the recording. ``reason``: why something may be missing at the beginning.
+        """Start to follow a block.
 
-        ``log_time`` turns CLOCK_MONOTONIC into the time in the recording. ``over``: a reload had ended it before.
-        ``part``: what is recorded of it; default: all.
+        Args:
+            block: The block.
+            number: Number of the block in the recording.
+            place: The position to start behind.
+            reason: Why entries at the start may be missing.
+            log_time: Converts CLOCK_MONOTONIC to the time in the recording.
+            over: Whether a reload had already retired the block.
+            part: The registers to record; None: all.
         """
         self.block = block
         self.number = number
@@ -75,36 +81,36 @@ class BlockFollower:
         self._events = _Stream("events", block.events.cursor(after=place.event), place.log_ns, reason)
 
     def take(self, limit: int) -> Iterator[BlockEntry]:
-        """At most about so many entries that are there by now."""
-        retired = self.block.retired  # before looking: what was published before the end is still read
+        """Yield the entries published by now, at most about ``limit``."""
+        retired = self.block.retired  # before reading: what was published before the end is still read
         for _ in range(limit):
             side = self._next()
             if side is None:
                 self.done = retired
-                self._frames.reason = self._events.reason = Reason.OVERTAKEN  # what comes now was not there before
+                self._frames.reason = self._events.reason = Reason.OVERTAKEN  # later entries are new
                 return
             yield from self._entries(side)
 
     def rest(self) -> Iterator[BlockEntry]:
-        """Gaps at the end, which no later entry has shown."""
+        """Yield the gaps at the end, behind the last entry."""
         for side in (self._frames, self._events):
             if side.cursor.last > side.last and side.held is None:
                 yield BlockEntry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
 
     def _next(self) -> _Stream[Frame] | _Stream[Event] | None:
-        """The side whose entry comes first."""
+        """Return the stream whose entry comes first."""
         frame = self._frames.peek()
         event = self._events.peek()
         if event is None:
             return None if frame is None else self._frames
         if frame is None and event.frame > self._frames.cursor.last:
-            frame = self._frames.peek()  # it was published between the two looks
+            frame = self._frames.peek()  # published between the two reads
         return self._events if frame is None or event.frame < frame.number else self._frames
 
     def _entries(self, side: _Stream[Frame] | _Stream[Event]) -> Iterator[BlockEntry]:
         item = side.held
         assert item is not None  # noqa: S101  _next has looked
-        # Never back: the order of one block is that of its numbers, whatever its clock does.
+        # Never decreasing: entries of a block stay in the order of their numbers, whatever its clock does.
         self._log_ns = log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(item.clock_ns)))
         if item.number > side.last + 1:
             yield BlockEntry(log_ns, self, self._gap(side, item.number - 1, log_ns))

@@ -1,4 +1,4 @@
-"""The index and the footer of a recording that has none yet."""
+"""Close a recording whose recorder died: write its index and footer."""
 
 from __future__ import annotations
 
@@ -33,10 +33,18 @@ from shmio.recording.reading.reader import Reader
 
 
 def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
-    """Close a file of this user's recorder; False if somebody is still writing it.
+    """Close a file that this user's recorder has left unclosed.
 
-    ``beat`` is called now and then. RecordingError: it is no recording, or damaged in a way that only ``recover`` may
-    judge. OSError: there is no room; then it is as it was but for what was cut off.
+    Args:
+        file: The file.
+        beat: Called regularly, as a sign of life.
+
+    Returns:
+        False if somebody is still writing the file.
+
+    Raises:
+        RecordingError: It is not a recording, or is damaged so that only ``recover`` can save it.
+        OSError: There is no room; apart from the cut-off end the file is unchanged.
     """
     with Reader(file, own=True, beat=beat) as reader:
         fd = os.open(file, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -56,7 +64,7 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
 
 
 def _write(fd: int, ending: RecordingEnd) -> None:
-    """Cut off, and append."""
+    """Cut off the incomplete end, and append index and footer."""
     data = ending.data()
     os.ftruncate(fd, ending.cut)
     try:
@@ -70,7 +78,7 @@ def _write(fd: int, ending: RecordingEnd) -> None:
 
 
 CHECKED: Final = 128
-"""So many chunks at the end are read, which a power cut may have left as zeros: the index names whole ones only."""
+"""How many chunks at the end are verified: a power cut may have left zeros, and the index names only intact chunks."""
 LOOK_BYTES: Final = 4096
 ZEROS_BYTES: Final = 1 << 20
 
@@ -80,7 +88,7 @@ _ENTRY_BYTES: Final = 16
 
 @dataclass(slots=True)
 class _Chunk:
-    """A chunk, and how many messages of which channels it has."""
+    """A chunk, with its number of messages by channel."""
 
     record: Record
     index: ChunkIndex
@@ -88,10 +96,10 @@ class _Chunk:
 
 
 class RecordingEnd:
-    """What belongs behind the last record that is whole."""
+    """The index and footer to write behind the last complete record."""
 
     def __init__(self, reader: Reader) -> None:
-        """RecordingError: it is no recording, or what would be cut off is more than a recorder that died leaves."""
+        """Read the file. RecordingError: not a recording, or more would be cut off than a dead recorder leaves."""
         self._reader = reader
         self._records = reader.records
         self._schemas: dict[int, bytes] = {}
@@ -100,9 +108,9 @@ class RecordingEnd:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self.cut = len(MAGIC)
-        """Where what is whole ends."""
+        """Offset of the end of the last complete record."""
         self._anew = b""
-        """Indexes of the last chunk."""
+        """New indexes of the last chunk."""
         self._walk()
         self._check()
 
@@ -134,7 +142,7 @@ class RecordingEnd:
             self._index_anew()
 
     def _tail(self) -> None:
-        """Make sure that what will be cut off is the beginning of one record, or nothing but zeros."""
+        """Check that only the start of one record, or zeros, will be cut off."""
         size = self._records.size - self.cut
         if size < HEAD.size:
             return
@@ -175,7 +183,7 @@ class RecordingEnd:
         self._chunks.append(_Chunk(record, index))
 
     def _index(self, record: Record) -> None:
-        """A message index of the chunk before; channels that are new are described in that chunk."""
+        """Take a message index of the last chunk. New channels are described in that chunk."""
         chunk = self._chunks[-1]
         number, size = INDEX.unpack(self._records.read(record.at, INDEX.size))
         if number not in self._channels:
@@ -192,12 +200,12 @@ class RecordingEnd:
                 known[number] = HEAD.pack(opcode, len(content)) + bytes(content)
 
     def _index_anew(self) -> None:
-        """Of the last chunk, whose indexes may be missing or cut off."""
+        """Create the indexes of the last chunk, which may be missing or cut off."""
         chunk = self._chunks[-1]
         self.cut = chunk.record.at + chunk.record.size
         found: dict[int, MessageIndex] = {}
         at = 0
-        with suppress(RecordingError, struct.error):  # the check finds out
+        with suppress(RecordingError, struct.error):  # _check() finds damage
             self._describe(chunk.record)
             for opcode, content in self._records.chunk(chunk.record):
                 if opcode == Opcode.MESSAGE:
@@ -228,7 +236,7 @@ class RecordingEnd:
         self._metadata.append(MetadataIndex(record.start, record.size + HEAD.size, name))
 
     def _check(self) -> None:
-        """Leave out of the index what is damaged near the end."""
+        """Leave damaged chunks near the end out of the index."""
         whole = self._chunks[:-CHECKED]
         for chunk in self._chunks[-CHECKED:]:
             with suppress(RecordingError):
@@ -239,7 +247,7 @@ class RecordingEnd:
     # ---- what is missing ---------------------------------------------------------------------------------------------
 
     def data(self) -> bytes:
-        """What is to follow behind :attr:`cut`."""
+        """Return the bytes to write from :attr:`cut` on."""
         builder = RecordBuilder()
         builder.write(self._anew)
         DataEnd(zlib.crc32(self._anew, self._records.crc(0, self.cut))).write(builder)
@@ -259,7 +267,7 @@ class RecordingEnd:
         return b"".join((data, summary, builder.end(), MAGIC))
 
     def _groups(self) -> Iterator[tuple[Opcode, bytes]]:
-        """The summary, kind by kind."""
+        """Yield the records of the summary, by kind."""
         yield Opcode.SCHEMA, b"".join(self._schemas.values())
         yield Opcode.CHANNEL, b"".join(self._channels.values())
         yield Opcode.STATISTICS, _written(self._statistics())

@@ -1,4 +1,4 @@
-"""Which files in a folder are a recorder's own."""
+"""Find a recorder's own files in a folder."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from shmio.recorder.output import SUFFIX
 from shmio.recording.reading.reader import Reader
 
 ABOUT_BYTES: Final = 1 << 20
-"""What a recorder says of the instance is its file's second record: far before this byte."""
+"""How far to read for the metadata about the instance, which is the second record of a file."""
 
 log = logging.getLogger("shmio.recorder")
 
 
 def own_files(directory: Path, instance: str) -> list[Path]:
-    """Regular files of this user that are named as recordings of this instance are.
+    """Return the regular files of this user with names of recordings of this instance.
 
-    What others may have put into the folder says nothing, and is not touched.
+    Files of other users are logged, and never touched.
     """
     name = re.compile(rf"{re.escape(instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # not of a50-test
     found: list[Path] = []
@@ -41,14 +41,26 @@ def own_files(directory: Path, instance: str) -> list[Path]:
 
 
 def is_own(status: os.stat_result) -> bool:
-    """Whether it is a regular file of this user."""
+    """Whether a status is that of a regular file of this user."""
     return stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
 
 
 def about_of(file: Path, instance: str, by: str, beat: Callable[[], object] = lambda: None) -> dict[str, str]:
-    """What a recorder of this kind (``by``) said of this instance at the beginning of its file; {}: it is no such file.
+    """Read the metadata that a recorder wrote about its instance.
 
-    One that was made of others is none. OSError, RecordingError: it is not this user's regular file, or no recording.
+    Args:
+        file: The file.
+        instance: Name of the instance.
+        by: Kind of recorder.
+        beat: Called regularly, as a sign of life.
+
+    Returns:
+        The metadata; empty if the file is of another instance or kind of recorder, or was made from
+        other recordings.
+
+    Raises:
+        OSError: The file is not a regular file of this user, or cannot be read.
+        RecordingError: It is not a recording.
     """
     with Reader(file, own=True, beat=beat) as reader:
         for record in reader.records.walk(to=ABOUT_BYTES):

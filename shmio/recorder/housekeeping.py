@@ -1,6 +1,6 @@
-"""Looks after the files of recorders before: closes what was not closed, deletes what is old or too much.
+"""Close files that earlier recorders left unclosed, and delete files that are too old or too many.
 
-In a thread of its own, so that neither many files nor a slow disk hold up the recording.
+This runs in a thread of its own, so that many files or a slow disk do not delay the recording.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ log = logging.getLogger("shmio.recorder")
 
 
 class _File(NamedTuple):
-    """A file as it was when it was looked at; it is looked into only once while it stays as it is."""
+    """Identity and size of a file when it was checked; it is read again only after a change."""
 
     path: Path
     inode: int
@@ -36,30 +36,31 @@ class _File(NamedTuple):
 
 
 class Housekeeper:
-    """The thread. It touches only recordings of this instance by this kind of recorder (``by``), of this user.
+    """Thread that closes and deletes recordings.
 
-    Never those that are being written, by whomever.
+    It touches only this user's recordings of this instance by this kind of recorder (``by``), and never
+    a file that somebody is writing.
     """
 
     def __init__(self, instance: str, settings: Settings, by: str, present: Callable[[], set[Path]]) -> None:
-        """``present``: the files that this recorder is writing."""
+        """``present`` returns the files that this recorder is writing."""
         self._instance = instance
         self._settings = settings
         self._by = by
         self._present = present
         self._own: dict[_File, bool] = {}
-        """Those that are this recorder's kind's: whether they are closed; others are looked into again."""
+        """The recordings by this kind of recorder, and whether each is closed."""
         self._strange: set[_File] = set()
         self._undeletable: set[_File] = set()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
 
     def start(self) -> None:
-        """Begin, with a first look."""
+        """Start the thread; it checks the folder at once."""
         self._thread.start()
 
     def stop(self, patience_s: float = 0.5) -> None:
-        """End, at the next file."""
+        """Stop the thread; it ends at the next file."""
         self._stop.set()
         self._thread.join(patience_s)
 
@@ -67,12 +68,12 @@ class Housekeeper:
         while not self._stop.is_set():
             try:
                 self.look()
-            except Exception:  # a recording must not end with what is beside it
+            except Exception:  # an error here must not end the recording
                 log.exception("looking after the recordings before failed")
             self._stop.wait(LOOK_S)
 
     def look(self) -> None:
-        """Close and delete what is to be."""
+        """Check the folder once: close and delete files."""
         present = self._present()
         files = [_file(path) for path in own_files(Path(self._settings.directory), self._instance)]
         found = [file for file in files if file is not None]
@@ -83,7 +84,7 @@ class Housekeeper:
             if self._stop.is_set():
                 return
             known = file.path in present or self._own.get(file) or file in self._strange
-            if file.size and not known:  # an empty one has just been made, or nothing ever came of it
+            if file.size and not known:  # an empty file is new, or was never used
                 self._take_in(file)
         self._delete([file for file in found if file.path in present])
 
@@ -103,7 +104,7 @@ class Housekeeper:
             log.warning("%s stays as it is: %s", file.path, error)
 
     def _delete(self, present: list[_File]) -> None:
-        """What is too old, then the oldest while there is too much; closed ones only."""
+        """Delete closed files that are too old, then the oldest while there are too many bytes."""
         settings = self._settings
         left = sum(file.size for file in (*present, *self._own))
         oldest = sorted((file for file, closed in self._own.items() if closed), key=lambda file: file.changed_ns)
@@ -134,7 +135,7 @@ class Housekeeper:
 
 
 def _is_held(path: Path) -> bool:
-    """Whether somebody plays it: its processes, started anew, would find nothing."""
+    """Whether a replay uses the file; a restarted replay would need it again."""
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -148,7 +149,7 @@ def _is_held(path: Path) -> bool:
 
 
 def _file(path: Path) -> _File | None:
-    """The file as it is now; None if it is no regular one of this user, or gone."""
+    """Return the file's present state; None if it is gone, or not a regular file of this user."""
     try:
         found = path.lstat()
     except OSError:

@@ -1,4 +1,4 @@
-"""What the blocks of an instance publish and what else happens in it, in order: what recordings are made of."""
+"""Follow an instance: everything its blocks publish, steps, and changes of processes, in order."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DOWN: Final[Mapping[Phase, ProcessEvent]] = {Phase.BACKOFF: ProcessEvent.DIED, 
 
 
 class _ProcessState(NamedTuple):
-    """A process at one look."""
+    """State of a process at one check."""
 
     kind: str
     phase: Phase
@@ -28,14 +28,14 @@ class _ProcessState(NamedTuple):
 
 
 class ProcessWatch:
-    """Compares the table with what it was at the last look. An end is told however soon the process is back."""
+    """Finds changes in the process table. It reports an end even if the process is back at once."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._known = self._now()
 
     def look(self) -> list[ProcessChange]:
-        """What has happened since the last look, or since it was made."""
+        """Return the changes since the last check, or since the watch was created."""
         before, self._known = self._known, self._now()
         changes = []
         for name, old in before.items():
@@ -46,7 +46,7 @@ class ProcessWatch:
         return changes
 
     def standing(self) -> list[ProcessChange]:
-        """What runs, or fails to, as of the last look."""
+        """Return the processes that run, or fail to, as of the last check."""
         found = []
         for name, state in self._known.items():
             what = ProcessEvent.IS if state.phase is Phase.RUNNING else _DOWN.get(state.phase)
@@ -71,7 +71,7 @@ def _between(name: str, old: _ProcessState | None, now: _ProcessState) -> Iterat
     phase = old.phase if old else Phase.STOPPED
     again = now.phase is Phase.STARTING or (old is not None and now.restarts > old.restarts)
     if old and phase is Phase.RUNNING and again and now.phase not in _DOWN:
-        crashed = now.restarts > old.restarts and now.why  # one that was told to begin anew leaves no reason
+        crashed = now.restarts > old.restarts and now.why  # a requested restart leaves no reason
         yield _change(name, old._replace(why=now.why), ProcessEvent.DIED if crashed else ProcessEvent.ENDED)
     if now.phase in _DOWN and now.phase is not phase:
         yield _change(name, now, _DOWN[now.phase])
@@ -83,45 +83,45 @@ def _between(name: str, old: _ProcessState | None, now: _ProcessState) -> Iterat
 
 TURN_S: Final = 0.1
 LIVELY: Final = 256
-"""Entries of one block in one turn from which on the next turn comes sooner: many commands turn an event ring fast."""
+"""With more entries of a block in a turn the next turn comes sooner: many commands fill an event ring fast."""
 BATCH_BYTES: Final = 2 << 20
-"""About as much of one block in one turn; what is left comes in the next, at once."""
+"""About how much of one block is read in a turn; the rest follows at once in the next."""
 
 
 class StartPositions(NamedTuple):
-    """Where to begin: behind these places, by section; blocks without one at their first frame, or at the present."""
+    """Where to start: behind these positions, by section. Other blocks start at their first frame, or now."""
 
     places: Mapping[int, BlockPosition] = {}
     first: bool = True
     reason: Reason = Reason.NOT_RUNNING
-    """Why something may be missing at the beginning."""
+    """Why entries at the start may be missing."""
 
 
 FROM_THE_FIRST: Final = StartPositions()
 
 
 class InstanceFollower:
-    """Takes from the blocks of a segment what they publish, each entry once. Use from one thread.
+    """Reads everything that the blocks of an instance publish, each entry once. Use it from one thread.
 
-    Blocks that a reload adds or puts in the place of others are followed too. Files may follow each other on one tap:
-    nothing is lost between them.
+    It also follows blocks that a reload adds or replaces. Several files may be recorded from it one after
+    another, without losses in between.
     """
 
     def __init__(
         self, segment: Segment, start: StartPositions = FROM_THE_FIRST, selection: Selection | None = None
     ) -> None:
-        """``selection``: what of it; default: all."""
+        """``selection``: the sources and registers to record; None: all."""
         self.segment = segment
         self.start = start
         self.followers: list[BlockFollower] = []
-        """Of the blocks that are there, or whose end has not been taken yet."""
+        """Followers of the present blocks, and of retired ones that are not read to their end."""
         self.done = 0
-        """The last step of virtual time of which all has been taken."""
+        """The last step of virtual time that was read completely."""
         self._selection = selection or Selection()
         self._watched: set[str] = set()
         self._watching: list[BlockFollower] = []
         self._seen: set[int] = set()
-        """Sections whose blocks are followed, were, or need not be."""
+        """Sections of the blocks that were already considered."""
         self._blocks = 0
         self._lively = False
         self._watch = ProcessWatch(segment)
@@ -129,15 +129,15 @@ class InstanceFollower:
         self._follow(start)
 
     def again(self, start: StartPositions) -> InstanceFollower:
-        """Another tap of the same that is to be recorded, from elsewhere on."""
+        """Create a follower of the same instance and selection with another start."""
         tap = InstanceFollower(self.segment, start, self._selection)
         tap.done = self.done
         return tap
 
     def watch(self, sources: Collection[str]) -> None:
-        """Take from these sources, too, from now on; of those that are not to be recorded the followers have number 0.
+        """Read these sources, too, from now on, even if they are not recorded.
 
-        They are not among :attr:`followers`.
+        The followers of sources that are not recorded have number 0, and are not in :attr:`followers`.
         """
         self._watched |= set(sources)
         followed = {follower.block.section for follower in (*self.followers, *self._watching)}
@@ -150,17 +150,17 @@ class InstanceFollower:
         self._watching.append(BlockFollower(block, 0, place, Reason.OVERTAKEN, self.log_time))
 
     def log_time(self, monotonic_ns: int) -> int:
-        """Time in a recording, UTC by the instance's start: it goes on evenly whatever is done to the wall clock."""
+        """Convert CLOCK_MONOTONIC to log time: UTC that no change of the host's clock affects."""
         head = self.segment.header
         return max(0, head.started_utc_ns + monotonic_ns - head.started_ns)
 
     def now(self) -> int:
-        """The time in a recording now."""
+        """Return the present log time."""
         return self.log_time(time.monotonic_ns())
 
     def take(self) -> tuple[list[BlockEntry | InstanceEntry], bool]:
-        """What has been published, in order; whether there is more at once."""
-        state = self.segment.clock.read()  # before looking: what was published for the step that is done is there
+        """Read what has been published, in order; also returns whether there is more."""
+        state = self.segment.clock.read()  # before reading, so that all frames of the finished step are there
         self.segment.refresh()
         if self.segment.blocks is not self._known:
             self._follow(FROM_THE_FIRST)
@@ -187,7 +187,7 @@ class InstanceFollower:
         return entries, more
 
     def standing(self) -> list[InstanceEntry]:
-        """How the processes are at present."""
+        """Return the present state of the processes as entries."""
         return self._asides(self._watch.standing())
 
     def _asides(self, changes: Iterable[ProcessChange]) -> list[InstanceEntry]:
@@ -195,27 +195,27 @@ class InstanceFollower:
         return [InstanceEntry(now_ns, change) for change in changes]
 
     def rest(self) -> list[BlockEntry]:
-        """What was missed at the very end, which no later entry has shown: there will be none."""
+        """Return the gaps at the very end, behind the last entries."""
         return [entry for follower in self.followers for entry in follower.rest()]
 
     @property
     def pause_s(self) -> float:
-        """How long to wait between two turns: far less than any ring holds."""
+        """Time to wait between two turns, far less than any ring holds."""
         rings = [follower.block.ring for follower in (*self.followers, *self._watching)]
         return min(
             [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]
         )
 
     def _step(self, state: ClockState) -> list[InstanceEntry]:
-        """The end of this step, of which all has been taken, and of those before it."""
+        """Return the end of a step that was read completely."""
         self.done = state.done
-        if state.done != state.step or not state.dt_ns:  # nobody tells how far that one went
+        if state.done != state.step or not state.dt_ns:  # the length of that step is unknown
             return []
         log_ns = self.log_time(self.segment.clock.monotonic_ns(state.time_ns))
         return [InstanceEntry(log_ns, StepMark(state.step, state.time_ns, state.dt_ns))]
 
     def _follow(self, start: StartPositions) -> None:
-        """Follow what is not followed yet: blocks that a reload has ended, too, unless all they have is recorded."""
+        """Follow new blocks, and retired ones that are not recorded completely."""
         self._known = self.segment.blocks
         ended = self.segment.ended
         for block in (*ended, *self._known.values()):

@@ -1,4 +1,4 @@
-"""The file that a recording goes to. A thread of its own writes it, so that a slow or full disk holds up no reader."""
+"""The output file of a recording, written by a thread so that a slow or full disk delays nobody."""
 
 from __future__ import annotations
 
@@ -15,19 +15,25 @@ from typing import Final
 from shmio.errors import RecordingError
 
 RETRY_S: Final = 0.5
-"""How often a disk that refuses is tried again."""
+"""How often to retry a failed write."""
 WAIT_S: Final = 0.02
-"""How often it is looked whether the file before is whole."""
+"""How often to check whether the previous file is complete."""
 SLOW_S: Final = 2.0
-"""A write that takes longer is told."""
+"""A write that takes longer is reported as a problem."""
 SUFFIX: Final = ".mem"
 _NAMES: Final = 1000
 
 
 def create(directory: Path, instance: str, now: datetime | None = None) -> tuple[Path, int]:
-    """Make a new file, named after the instance and the time (UTC), and its folder; path and descriptor.
+    """Create a new file, named after the instance and the time (UTC), and its directory if needed.
 
-    A file that is there is never touched; a new one is its user's alone, as the segment is. RecordingError.
+    An existing file is never touched. Only the user may read the new one.
+
+    Returns:
+        Path and file descriptor.
+
+    Raises:
+        RecordingError: No file can be created.
     """
     stem = f"{instance}-{(now or datetime.now(UTC)).strftime('%Y%m%dT%H%M%SZ')}"
     try:
@@ -44,30 +50,38 @@ def create(directory: Path, instance: str, now: datetime | None = None) -> tuple
 class Output:
     """Takes bytes from one thread and writes them in another.
 
-    What was written between two calls of :meth:`flush` is a piece; the file holds whole pieces only, also while the
-    disk is full: a piece that does not fit is taken back and tried again. The file is locked (flock) for as long, so
-    that nobody takes it for what a recorder that died has left.
+    The bytes between two calls of :meth:`flush` are a piece. The file holds only whole pieces, even if the
+    disk is full: a piece that does not fit is removed and retried. The file is locked (flock) meanwhile,
+    so that nobody mistakes it for the file of a dead recorder.
     """
 
     def __init__(
         self, path: Path, fd: int, *, limit_bytes: int, fsync_s: float = 0.0, after: Output | None = None
     ) -> None:
-        """``limit_bytes``: from where on :attr:`full`. ``fsync_s``: how often to fsync; 0: at the end.
+        """Lock the file, and start the thread.
 
-        ``after``: the file before, which must be whole before anything of this one is written.
+        Args:
+            path: Path of the file.
+            fd: Descriptor of the file.
+            limit_bytes: Above this number of waiting bytes the output is :attr:`full`.
+            fsync_s: Time between two fsyncs; 0: only at the end.
+            after: The previous file, which must be complete before this one is written.
         """
         with suppress(OSError):  # a file system without locks
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self.path = path
         self.error = ""
-        """Why the disk does not take what waits; empty while it does."""
+        """Why the disk does not accept the waiting bytes; empty while it does."""
         self.doubt = ""
-        """Whether an fsync has failed, and what that may cost. It stays: the kernel takes for written what it could not
-        write, so that no later fsync of this file tells of it again."""
+        """Why bytes of the file may be lost; empty: no fsync has failed.
+
+        It stays: after a failed fsync the kernel counts the pages as written, so that a later fsync of this
+        file does not report the failure again.
+        """
         self.written = 0
         """Bytes in the file."""
         self.synced = 0
-        """Bytes that are on the disk for certain: an fsync has confirmed them, and none before it has failed."""
+        """Bytes that are certainly on the disk: an fsync has confirmed them, and none failed before."""
         self._fd = fd
         self._limit = limit_bytes
         self._fsync_s = fsync_s
@@ -78,7 +92,7 @@ class Output:
         self._news = threading.Condition()
         self._after = after
         self.whole = False
-        """Whether no more is to come, and all is in the file."""
+        """Whether the file is complete: everything was written, and no more will come."""
         self._ending = False
         self._closing = False
         self._busy_since_s: float | None = None
@@ -89,16 +103,16 @@ class Output:
     # ---- the recorder's thread ---------------------------------------------------------------------------------------
 
     def write(self, data: bytes | memoryview) -> int:
-        """Add to the present piece; never waits."""
+        """Append to the present piece, without waiting."""
         self._piece += data
         return len(data)
 
     def tell(self) -> int:
-        """Bytes given so far."""
+        """Return the number of bytes given so far."""
         return self._given + len(self._piece)
 
     def flush(self) -> None:
-        """End the present piece and have it written."""
+        """End the present piece, and queue it for writing."""
         if self._piece:
             self._given += len(self._piece)
             with self._news:
@@ -108,18 +122,18 @@ class Output:
 
     @property
     def waiting(self) -> int:
-        """Bytes that were given and are not in the file yet."""
+        """Number of bytes that are not in the file yet."""
         return self.tell() - self.written
 
     @property
     def full(self) -> bool:
-        """Whether no more should be given: too much waits. It ends when half of it has been written."""
+        """Whether too many bytes wait. It stays True until only half the limit waits."""
         self._full = self.waiting > (self._limit // 2 if self._full else self._limit)
         return self._full
 
     @property
     def problem(self) -> str:
-        """What is wrong with the file or its disk at present, by name; empty: nothing."""
+        """The present problem of the file or its disk, with the path; empty: none."""
         since_s = self._busy_since_s
         if self.error:
             return f"{self.path}: {self.error}"
@@ -130,12 +144,12 @@ class Output:
         return ""
 
     def check(self) -> None:
-        """RecordingError when the file was removed: what is written now nobody will find."""
+        """Raise RecordingError if the file was removed: nobody could find what is written now."""
         if os.fstat(self._fd).st_nlink == 0:
             raise RecordingError(f"{self.path} was removed while it was being written")
 
     def end(self) -> None:
-        """No more will be given: what waits is written, however long the disk takes for it."""
+        """End the file: the waiting bytes are written, however long the disk takes."""
         self.flush()
         with self._news:
             self._ending = True
@@ -143,11 +157,11 @@ class Output:
 
     @property
     def ended(self) -> bool:
-        """Whether nothing waits any more, and none will: :meth:`close` will not wait either."""
+        """Whether the thread has ended, so that :meth:`close` will not wait."""
         return not self._thread.is_alive()
 
     def close(self, patience_s: float) -> bool:
-        """Write what waits, as far as the disk takes it in this time; whether all of it is there, for certain."""
+        """Write the waiting bytes within ``patience_s``; returns whether all of them are certainly there."""
         self.flush()
         with self._news:
             self._ending = self._closing = True
@@ -184,7 +198,7 @@ class Output:
         self._sync()
 
     def _is_next(self) -> bool:
-        """Wait for the file before to be written; False if that, or the time for it, has come to an end without."""
+        """Wait until the previous file is complete; returns False if it will not be."""
         after, self._after = self._after, None
         while after is not None and not after.whole:
             if self._closing or after.ended:
@@ -194,7 +208,7 @@ class Output:
         return True
 
     def _put(self, piece: bytes) -> bool:
-        """Write a piece as a whole, or leave nothing of it."""
+        """Write a whole piece, or nothing of it."""
         self._busy_since_s = time.monotonic()
         view, at = memoryview(piece), 0
         try:
@@ -211,7 +225,7 @@ class Output:
         return True
 
     def _wait(self) -> bool:
-        """Wait for the disk to have room again; False when there is no time for it."""
+        """Wait before a retry; returns False if the file is being closed."""
         with self._news:
             if not self._closing:
                 self._news.wait_for(lambda: self._closing, RETRY_S)

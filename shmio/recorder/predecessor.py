@@ -1,4 +1,4 @@
-"""Where the recorder before this one came to: so much of it as is still in the rings need not be missed."""
+"""Find where the previous recorder stopped, so that this one can continue with what the rings still hold."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shmio.recording.reading.survey import survey
 from shmio.segment import Block, Segment
 
 MAX_FILES: Final = 256
-"""How many recordings, the newest by their names first, are looked at."""
+"""How many recordings are checked, the newest by name first."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -24,9 +24,16 @@ log = logging.getLogger("shmio.recorder")
 def last_positions(
     directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None
 ) -> dict[int, BlockPosition]:
-    """By section the last frame and event of each block that recorders of this kind (``by``) have of this run.
+    """Find the last recorded frame and event of each block in this run of the instance.
 
-    Blocks that were not recorded are left out. ``beat`` is called now and then.
+    Args:
+        directory: Directory of the recordings.
+        segment: The instance's segment.
+        by: Kind of recorder.
+        beat: Called regularly, as a sign of life.
+
+    Returns:
+        The positions by section; blocks that were not recorded are missing.
     """
     found: dict[int, BlockPosition] = {}
     blocks = {block.section: block for block in (*segment.ended, *segment.blocks.values())}
@@ -44,7 +51,7 @@ def last_positions(
 
 
 def trigger_interrupted(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> bool:
-    """Whether the recorder before died within what a trigger had begun."""
+    """Whether the previous recorder died while it wrote a triggered recording."""
     for file in _of_this_run(directory, segment, by, beat)[:1]:
         with suppress(OSError, RecordingError), Reader(file, own=True, beat=beat) as reader:
             return reader.records.footer() is None and "trigger" in about_of(file, segment.instance, by)
@@ -52,7 +59,7 @@ def trigger_interrupted(directory: Path, segment: Segment, by: str, beat: Callab
 
 
 def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], object]) -> list[Path]:
-    """The recordings of this run, the newest first; not by name, for the host's clock may go back."""
+    """Return the recordings of this run, the newest first; not by name, as the host's clock may go back."""
     epoch = f"{segment.header.epoch:016x}"
     found: list[tuple[int, Path]] = []
     for file in sorted(own_files(directory, segment.instance), reverse=True)[:MAX_FILES]:
@@ -67,7 +74,7 @@ def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], 
 
 
 def _positions(reader: Reader, blocks: dict[int, Block]) -> dict[int, BlockPosition]:
-    """Where a file ends: where it began, if nothing came of a block, or its last chunk is damaged."""
+    """Return the positions at the end of a file, or at its start for a block without intact entries."""
     found = survey(reader)
     positions = {section: place for section, place in reader.places.items() if section in blocks}
     for channel in reader.channels.values():

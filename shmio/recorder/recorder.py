@@ -1,4 +1,4 @@
-"""One file of a recording, filled from a tap."""
+"""Record to one file what an instance publishes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shmio.segment import Event, Frame
 
 @dataclass(slots=True)
 class _LostRange:
-    """What could not be taken because there was no room: numbers from, to."""
+    """Numbers of frames or events that were lost for want of room."""
 
     first: int
     last: int
@@ -34,7 +34,7 @@ class _LostRange:
 
 @dataclass(slots=True)
 class RecordedBlock:
-    """A block in one file. ``begin``: where that begins; then the last frame and event that are in it, or in a gap."""
+    """A block in one file: where it begins there, and the last frame and event written, or in a gap."""
 
     follower: BlockFollower
     begin: BlockPosition
@@ -43,20 +43,20 @@ class RecordedBlock:
     log_ns: int
     channels: Channels | None = None
     lost: dict[str, _LostRange] = field(default_factory=dict)
-    """By what it is."""
+    """Lost frames and events, not yet recorded as gaps."""
 
     @property
     def place(self) -> BlockPosition:
-        """Behind what was written last."""
+        """The position behind the last written entry."""
         return BlockPosition(self.frame, self.event, self.log_ns)
 
     @property
     def losses(self) -> int:
-        """How many are lost, and not told yet."""
+        """Number of lost frames and events that are not yet recorded as gaps."""
         return sum(lost.count for lost in self.lost.values())
 
     def come_to(self, what: str, number: int, log_ns: int) -> None:
-        """Up to this frame or event it was written, or is in a gap that was."""
+        """Note that frames or events up to this number were written, or are in a written gap."""
         self.log_ns = log_ns
         if what == "frames":
             self.frame = number
@@ -64,7 +64,7 @@ class RecordedBlock:
             self.event = number
 
     def lose(self, item: Frame | Event | Gap) -> int:
-        """There is no room for it; how many frames or events that costs."""
+        """Note that there is no room for an item; returns how many frames or events are lost."""
         if isinstance(item, Gap):
             what, first, last = item.what, item.first, item.last
         else:
@@ -74,7 +74,7 @@ class RecordedBlock:
         return last - first + 1
 
     def found(self, before_ns: int) -> list[Gap]:
-        """What was lost, now that there is room again; it is not kept any longer."""
+        """Return the lost entries as gaps, and forget them."""
         block = self.follower.block
         lost, self.lost = self.lost, {}
         return [
@@ -87,16 +87,16 @@ class RecordedBlock:
 
 
 CHUNK_S: Final = 0.8
-"""A chunk is no longer than this: with a turn, and the time to write it, less than the second that a kill may cost."""
+"""Maximum duration of a chunk. With a turn and the time to write it, a kill costs less than a second."""
 CLOSE_S: Final = 3.0
 CHECK_S: Final = 1.0
 CONFIG_S: Final = 5.0
-"""How often it is looked whether the configuration has changed."""
+"""How often to check whether the configuration has changed."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """What came of it so far. ``missed``: frames and events."""
+    """Numbers of recorded frames and events, and of missed ones."""
 
     frames: int = 0
     events: int = 0
@@ -104,7 +104,7 @@ class Counters:
 
 
 class Recorder:
-    """One file. Use from one thread: :meth:`turn` again and again, then :meth:`close`."""
+    """Records to one file. From one thread, call :meth:`turn` repeatedly, then :meth:`close`."""
 
     def __init__(
         self,
@@ -117,21 +117,27 @@ class Recorder:
         counters: Counters | None = None,
         attachments: AttachedFiles = no_attachments,
     ) -> None:
-        """``by``: who records. ``about``: what else is to be told of this recording.
+        """Start a file.
 
-        ``places``: where the recording before ended, by section; default: where the tap began.
-        ``counters``: what came of the recordings before, if it goes on from there.
+        Args:
+            tap: Follows the instance.
+            output: The file.
+            by: Kind of recorder.
+            places: Positions by section where the previous file ended; None: where ``tap`` started.
+            about: Further metadata about the recording.
+            counters: Counters to continue; None: new ones.
+            attachments: Returns the files to attach.
         """
         self.tap = tap
         self.output = output
         self.counters = counters or Counters()
         self.places = dict(tap.start.places if places is None else places)
-        """Where the recording had come to, by section, when :meth:`settle` was called last."""
+        """Positions of the recording by section, as of the last :meth:`settle`."""
         self.confirmed: Mapping[int, BlockPosition] = dict(self.places)
-        """Where it had come to when what was written last that is on the disk for certain."""
+        """Positions of the recording by section up to which it is certainly on the disk."""
         self._ended = False
         self.empty = True
-        """Whether nothing has happened yet."""
+        """Whether nothing was recorded yet except changes of processes."""
         self._attachments = attachments
         self._writer = Writer(output, {**self._about(by), **(about or {})})
         self._followed: dict[int, RecordedBlock] = {}
@@ -139,7 +145,7 @@ class Recorder:
         self._config = attachments(None, 0)
         self._attach(self._config)
         self._unaware = True
-        """Whether the file does not say how the processes are."""
+        """Whether the file does not have the state of the processes yet."""
         self._to_confirm: tuple[int, dict[int, BlockPosition]] | None = None
         self._writer.places(self.places)
         for follower in tap.followers:
@@ -165,13 +171,13 @@ class Recorder:
         }
 
     def turn(self) -> bool:
-        """Take what has been published; whether there is more at once. RecordingError: the file was removed."""
+        """Record what has been published; returns whether there is more. RecordingError: the file was removed."""
         entries, more = self.tap.take()
         self.put(entries)
         return more
 
     def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
-        """Add what the tap gave; end the chunk if it is time. RecordingError: the file was removed."""
+        """Record entries, and end the chunk if it is due. RecordingError: the file was removed."""
         for follower in self.tap.followers:
             self._known(follower)
         full = self.output.full
@@ -185,7 +191,7 @@ class Recorder:
                 self._write(entry)
         if not full:
             for followed in self._followed.values():
-                if followed.lost and followed.follower.done:  # nothing comes before which it could be told
+                if followed.lost and followed.follower.done:  # no later entry would trigger the gap
                     self._tell_lost(followed, 0)
         now_s = time.monotonic()
         if now_s - self._flushed_s >= CHUNK_S - TURN_S / 2:
@@ -200,7 +206,7 @@ class Recorder:
             self._look()
 
     def _confirm(self) -> None:
-        """See what the disk has for certain; what was written by now is the next that it is to have."""
+        """Update :attr:`confirmed` from the synced bytes, and note the present position as the next one."""
         if self._to_confirm and self.output.synced >= self._to_confirm[0]:
             self.confirmed, self._to_confirm = self._to_confirm[1], None
         if not self._to_confirm and not self.losing:
@@ -213,18 +219,18 @@ class Recorder:
 
     @property
     def losing(self) -> bool:
-        """Whether something could not be taken for want of room, which is not told in the file yet."""
+        """Whether entries were lost for want of room, and are not yet recorded as gaps."""
         return any(followed.lost for followed in self._followed.values())
 
     @property
     def problem(self) -> str:
-        """What is wrong at present, in words; empty: nothing."""
+        """Description of the present problem; empty: none."""
         problem = self.output.problem
         lost = sum(followed.losses for followed in self._followed.values())
         return f"{problem}; {lost} frames and events lost so far" if problem and lost else problem
 
     def end(self) -> None:
-        """Have index and footer written behind what was put in; the disk may take its time. Once is enough."""
+        """Write index and footer, without waiting for the disk. Further calls do nothing."""
         if self._ended:
             return
         self._ended = True
@@ -235,7 +241,7 @@ class Recorder:
         self.output.end()
 
     def close(self, patience_s: float = CLOSE_S) -> bool:
-        """Take what is there, write it, close the file; False if the disk did not take all of it in this time."""
+        """Record what is there, and close the file; returns False if the disk was too slow."""
         while self.turn():
             pass
         self.put(self.tap.rest())
@@ -248,7 +254,7 @@ class Recorder:
         return self._followed.get(follower.block.section) or self._follow(follower)
 
     def _follow(self, follower: BlockFollower) -> RecordedBlock:
-        """Begin with a block: attach what is needed to read it."""
+        """Start with a block: attach the files that are needed to read it."""
         block = follower.block
         place = self.places.get(block.section, follower.begin)
         followed = self._followed[block.section] = RecordedBlock(follower, place, *place)
@@ -256,12 +262,12 @@ class Recorder:
         if layout.hash not in self._attached:
             self._attached.add(layout.hash)
             self._attach([AttachedFile(f"layouts/{layout.hash.hex()}.json", JSON, layout.to_json())])
-        if not follower.over:  # the files on the disk are of its successor
+        if not follower.over:  # the files on disk belong to the block's successor
             self._attach(self._attachments(block.source, follower.number))
         return followed
 
     def _look(self) -> None:
-        """Attach the configuration again if it is not what it was."""
+        """Attach the configuration again if it has changed."""
         now = self._attachments(None, 0)
         if now and [(one.name, one.data) for one in now] != [(one.name, one.data) for one in self._config]:
             self._config = now
@@ -313,7 +319,7 @@ class Recorder:
             self.counters.missed += self._known(entry.follower).lose(entry.item)
 
     def _tell_lost(self, followed: RecordedBlock, before_ns: int) -> None:
-        """Put down what there was no room for, before what follows it."""
+        """Record lost entries as gaps, before the entry that follows them."""
         for gap in followed.found(before_ns):
             log_ns = before_ns or self.tap.now()
             self._writer.gap(gap, log_ns)
@@ -321,5 +327,5 @@ class Recorder:
 
 
 def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:
-    """Whether it is what has happened to a process."""
+    """Whether an entry is a change of a process."""
     return isinstance(entry.item, ProcessChange)

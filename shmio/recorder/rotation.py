@@ -1,4 +1,4 @@
-"""Recordings of one recorder, one file after the other."""
+"""Record to a sequence of files, with rotation by size and age."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from shmio.recording.format.encoding import BlockPosition, Reason
 
 FIRST_WAIT_S: Final = 1.0
 MAX_WAIT_S: Final = 600.0
-"""A disk whose fsync fails for good gets a new file so often at last, and twice as often each time before."""
+"""Longest time between new files for a disk whose fsync keeps failing; the time doubles up to this."""
 
 log = logging.getLogger("shmio.recorder")
 
 
 class RotatingRecorder:
-    """Takes a new file when the present one is large or old enough, from the entry on with which that ends.
+    """Records to a new file whenever the present one is large or old enough; nothing is lost in between.
 
-    Also when an fsync of a file has failed: of that nobody can say any more what the disk has. Then the new file begins
-    where the disk had the old one for certain: what the rings still hold of it is recorded again, the rest is a gap
-    there.
+    It also starts a new file after a failed fsync, when it is unknown what the disk has of the old one. The
+    new file begins where the old one is certainly on the disk: it records again what the rings still hold,
+    and a gap for the rest.
     """
 
     def __init__(
@@ -43,9 +43,20 @@ class RotatingRecorder:
         about: Mapping[str, str] | None = None,
         counters: Counters | None = None,
     ) -> None:
-        """``places``: where it begins, by section, if the caller takes from the tap: then it must :meth:`put`.
+        """Start the first file.
 
-        ``about``: what else is to be told of this recording. RecordingError: no file can be made.
+        Args:
+            tap: Follows the instance.
+            settings: Settings of the recorder.
+            by: Kind of recorder.
+            attachments: Returns the files to attach.
+            places: Positions by section where the recording begins. With them the caller reads from
+                ``tap`` and calls :meth:`put`.
+            about: Further metadata about the recording.
+            counters: Counters to continue; None: new ones.
+
+        Raises:
+            RecordingError: No file can be created.
         """
         self._settings = settings
         self._by = by
@@ -53,7 +64,7 @@ class RotatingRecorder:
         self._wait_s = FIRST_WAIT_S
         self._again_s = 0.0
         self._ending: list[Recorder] = []
-        """Files that are complete but for what the disk has not taken yet."""
+        """Recorders of earlier files that still wait for the disk."""
         self.counters = counters or Counters()
         self._takes = places is None
         self._why = dict(about or {})
@@ -82,50 +93,50 @@ class RotatingRecorder:
         )  # fmt: skip
 
     def turn(self) -> bool:
-        """Record what has been published; whether there is more at once. RecordingError: the file was removed."""
+        """Record what has been published; returns whether there is more. RecordingError: the file was removed."""
         return self.recorder.turn()
 
     def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
-        """Record what the tap gave. RecordingError: the file was removed."""
+        """Record entries. RecordingError: the file was removed."""
         self.recorder.put(entries)
 
     def end(self) -> Mapping[int, BlockPosition]:
-        """Nothing more comes: have all files closed, however long the disk takes; where it ended, by section."""
+        """End the recording, without waiting for the disk; returns the last positions by section."""
         self.recorder.end()
         return self.recorder.places
 
     @property
     def ended(self) -> bool:
-        """Whether the disk has all, after :meth:`end`."""
+        """Whether the disk has everything, after :meth:`end`."""
         return all(recorder.output.ended for recorder in (*self._ending, self.recorder))
 
     @property
     def tap(self) -> InstanceFollower:
-        """What is recorded from: another one after a file that was given up."""
+        """The follower of the instance; it is replaced when a file is given up."""
         return self.recorder.tap
 
     @property
     def file(self) -> Path:
-        """What is being written."""
+        """Path of the present file."""
         return self.recorder.output.path
 
     @property
     def written(self) -> int:
-        """Bytes in the present file."""
+        """Number of bytes in the present file."""
         return self.recorder.output.written
 
     @property
     def waiting(self) -> int:
-        """Bytes that wait for the disk."""
+        """Number of bytes that wait for the disk."""
         return sum(recorder.output.waiting for recorder in (*self._ending, self.recorder))
 
     @property
     def problem(self) -> str:
-        """What is wrong at present, in words; empty: nothing."""
+        """Description of the present problem; empty: none."""
         return next(filter(None, (recorder.problem for recorder in (*self._ending, self.recorder))), "")
 
     def tend(self) -> bool:
-        """Begin a new file if that is called for; whether a doubtful one was given up."""
+        """Start a new file if one is due; returns whether a doubtful file was given up."""
         for old in [old for old in self._ending if old.output.ended and not old.output.doubt]:
             old.output.close(0)
             self._ending.remove(old)
@@ -139,12 +150,12 @@ class RotatingRecorder:
         return False
 
     def present(self) -> set[Path]:
-        """What is being written; asked from another thread."""
+        """Return the files being written. Another thread may call it."""
         return {recorder.output.path for recorder in (*self._ending, self.recorder)}
 
     @property
     def _due(self) -> bool:
-        """Whether the present file is to end: never while the disk has trouble, which a new file would not help."""
+        """Whether rotation is due; never while the disk has a problem, which a new file would not solve."""
         settings, recorder = self._settings, self.recorder
         old = bool(settings.rotate_min) and time.monotonic() - self._begun_s >= settings.rotate_min * 60
         large = bool(settings.rotate_mb) and recorder.output.tell() >= settings.rotate_mb * 1e6
@@ -173,7 +184,7 @@ class RotatingRecorder:
         tap, places = self.tap, None
         if self._takes:
             tap = tap.again(StartPositions(doubtful.confirmed, True, Reason.UNSURE))
-        else:  # somebody else's, who has no more of what is in doubt
+        else:  # the caller reads the instance, and cannot repeat the doubtful entries
             self.recorder.settle()
             places = self.recorder.places
         try:
@@ -196,7 +207,7 @@ class RotatingRecorder:
         return self.recorder.output.close(patience_s)
 
     def close(self, patience_s: float = CLOSE_S) -> list[str]:
-        """Take what is there, write it, close all files; what is wrong with those that are not whole."""
+        """Record what is there, and close all files; returns a problem for each incomplete one."""
         until_s = time.monotonic() + patience_s
         files = [*self._ending, self.recorder]
         closed = [old.output.close(max(0.0, until_s - time.monotonic())) for old in self._ending]

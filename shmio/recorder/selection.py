@@ -1,4 +1,4 @@
-"""Which sources, and of their blocks which registers, are recorded."""
+"""Select the sources and registers to record."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from shmio.segment import Block, Frame
 
 
 class RecordedRegisters:
-    """Registers of a block. ``layout`` has only these, each at its place."""
+    """The recorded registers of a block. ``layout`` has only these, at their original offsets."""
 
     def __init__(self, layout: Layout, mask: npt.NDArray[np.uint8] | None = None) -> None:
-        """``mask``: the bits that are theirs; None: all of the block."""
+        """``mask``: the bits of these registers; None: the whole block."""
         self.layout = layout
         self._mask = mask
 
     def keep(self, frame: Frame) -> Frame:
-        """The frame with zeros where none of the registers is."""
+        """Return the frame with all other bits set to zero."""
         if self._mask is None:
             return frame
         effective = None if frame.effective is None else _kept(frame.effective, self._mask)
@@ -36,14 +36,18 @@ def _kept(image: bytes, mask: npt.NDArray[np.uint8]) -> bytes:
 
 
 class Selection:
-    """Without ``sources`` all; ``registers`` are patterns as for ``shmio get``, none: all. An element is its array."""
+    """The sources and registers to record.
+
+    ``sources``: names; None: all. ``registers``: patterns as for ``shmio get``; none: all. A pattern for an
+    element selects its whole array.
+    """
 
     def __init__(self, sources: Collection[str] | None = None, registers: Sequence[str] = ()) -> None:
         self._sources = sources
         self._registers = registers
 
     def part(self, block: Block, sources: Collection[str]) -> RecordedRegisters | None:
-        """What is recorded of a block; None: nothing. ``sources``: all there are."""
+        """Return the registers to record of a block; None: nothing. ``sources``: names of all sources."""
         if self._sources is not None and block.source not in self._sources:
             return None
         if not self._registers:
@@ -56,7 +60,7 @@ class Selection:
         return RecordedRegisters(replace(block.layout, registers=registers), mask) if registers else None
 
     def nothing(self, layouts: Mapping[str, Layout]) -> list[str]:
-        """What of it names nothing: sources that are not there, patterns without registers. ``layouts``: by source."""
+        """Describe the selected sources and patterns that do not exist. ``layouts``: by source."""
         missing = [
             f"no source {source!r}; there are: {', '.join(layouts)}"
             for source in self._sources or ()
@@ -71,7 +75,7 @@ class Selection:
 
 
 def _near(pattern: str, layouts: Mapping[str, Layout]) -> str:
-    """What may have been meant, to go on with after a message."""
+    """Return similar paths, as the end of a message."""
     try:
         topic = parse_topic(pattern, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     except PathError:
@@ -81,7 +85,7 @@ def _near(pattern: str, layouts: Mapping[str, Layout]) -> str:
 
 
 def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) -> set[str]:
-    """The registers of a source that a pattern names; none if it is no pattern for it."""
+    """Return the registers of a source that a pattern names; none if it is for another source."""
     try:
         topic = parse_topic(pattern, sources, next(iter(sources)) if len(sources) == 1 else None)
         if topic.source != source or topic.direction == "in":

@@ -1,4 +1,4 @@
-"""Recordings of what a trigger is about: a file a trigger, with the seconds before."""
+"""Record when a trigger fires: a file for each trigger, including the seconds before it."""
 
 from __future__ import annotations
 
@@ -24,22 +24,25 @@ from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.segment import Block, Frame, Quality
 
 ENTRY_BYTES: Final = 800
-"""About as much an entry takes in memory beside its images."""
+"""Approximate memory of an entry besides its images."""
 
 log = logging.getLogger("shmio.recorder")
 
 
 class Trigger:
-    """The condition, looked at with each frame of a source that it reads: of what consumers saw of good frames."""
+    """The trigger's condition, evaluated at each frame of a source that it reads.
+
+    It uses the values that consumers see, and ignores bad frames.
+    """
 
     def __init__(self, when: str, blocks: Mapping[str, Block]) -> None:
-        """ConfigError: it is no condition, or reads what is not there."""
+        """Compile the condition. ConfigError: it is invalid, or reads unknown registers."""
         self.when = when
         self._blocks = blocks
         self._bind(blocks)
 
     def follow(self, blocks: Mapping[str, Block]) -> None:
-        """Find the registers anew if a reload has changed the blocks; as long as one is not there it is not true."""
+        """Find the registers again after a reload. While one is missing, the condition is false."""
         if blocks is not self._blocks:
             try:
                 self._bind(blocks)
@@ -52,12 +55,12 @@ class Trigger:
         self._blocks = blocks
         self._sections = {block.section: name for name, block in blocks.items()}
         self.sources = {source for source, _ in self._condition.reads}
-        """Which it reads."""
+        """The sources that the condition reads."""
         self._images: dict[str, bytes | None] = {}
         self._memory = Memory()
 
     def sees(self, entry: BlockEntry | InstanceEntry) -> bool:
-        """Whether it is true with this entry."""
+        """Whether the condition is true with this entry."""
         if isinstance(entry, InstanceEntry) or not isinstance(entry.item, Frame):
             return False
         source = self._sections.get(entry.follower.block.section, "")
@@ -75,20 +78,20 @@ class Trigger:
 
 
 class PreTriggerBuffer:
-    """What was published in the last seconds, as far as a bound of memory lasts; older entries are let go."""
+    """The entries of the last seconds before a trigger, within a limit of memory."""
 
     def __init__(self, before_s: float, limit_bytes: int, places: Mapping[int, BlockPosition]) -> None:
-        """``places``: behind which it begins, by section."""
+        """``places``: positions by section behind which the buffer starts."""
         self._before_ns = round(before_s * 1e9)
         self._limit = limit_bytes
         self._entries: deque[BlockEntry | InstanceEntry] = deque()
         self._size = 0
         self._told = False
         self.places = dict(places)
-        """Behind which it begins now, by section."""
+        """Positions by section behind which the buffer starts now."""
 
     def add(self, entry: BlockEntry | InstanceEntry) -> None:
-        """The next one. What was lost before this recorder ran is not missed."""
+        """Add an entry. Gaps from before this recorder ran are ignored."""
         item = entry.item
         if isinstance(item, Gap) and item.reason is not Reason.OVERTAKEN:
             self._pass(entry)
@@ -106,7 +109,7 @@ class PreTriggerBuffer:
             self._drop()
 
     def before(self, log_ns: int) -> list[BlockEntry | InstanceEntry]:
-        """What was published in the seconds before this time, the oldest first; :attr:`places` is where it begins."""
+        """Return the entries of the seconds before a time, the oldest first, from :attr:`places` on."""
         self._trim(log_ns)
         return list(self._entries)
 
@@ -148,7 +151,10 @@ class TriggeredRecorder:
         self, tap: InstanceFollower, settings: Settings, trigger: TriggerSettings, by: str, attachments: AttachedFiles,
         *, going: bool = False,
     ) -> None:  # fmt: skip
-        """``going``: a recorder that died was within such a recording. ConfigError: the condition cannot be."""
+        """Wait for the trigger, or continue.
+
+        ``going``: the previous recorder died during a triggered recording. ConfigError: the condition is wrong.
+        """
         self.counters = Counters()
         self.tap = tap
         self._settings = settings
@@ -168,7 +174,7 @@ class TriggeredRecorder:
             self._begin(tap.now())
 
     def turn(self) -> bool:
-        """Look what has been published, and record what is to be; whether there is more at once. RecordingError."""
+        """Read what was published, and record it if triggered; returns whether there is more. RecordingError."""
         self._trigger.follow(self.tap.segment.blocks)
         entries, more = self.tap.take()
         if entries:
@@ -181,7 +187,7 @@ class TriggeredRecorder:
             if self._trigger.sees(entry):
                 self._begin(entry.log_ns)
             if isinstance(entry, BlockEntry) and not entry.follower.number:
-                continue  # it is only watched
+                continue  # only the condition needs it
             if self._series:
                 batch.append(entry)
             else:
@@ -190,11 +196,11 @@ class TriggeredRecorder:
             self._series.put(batch)
             silent_s = time.monotonic() - self._came_s
             if not self.tap.segment.clock.read().virtual and silent_s > self._times.after_s + TURN_S:
-                self._end([])  # nothing comes any more that would tell; a replay's times are not the host's
+                self._end([])  # no later entry would end it; a replay's times are not the host's
         return more
 
     def _begin(self, log_ns: int) -> None:
-        """Begin a file with what was before, or have the present one go on."""
+        """Start a file with the seconds before, or prolong the present one."""
         self._until_ns = log_ns + round(self._times.after_s * 1e9)
         if self._series is not None:
             return
@@ -211,7 +217,7 @@ class TriggeredRecorder:
                 self.tap, self._settings, self._by, self._attachments,
                 places=self._backlog.places, about=about, counters=self.counters,
             )  # fmt: skip
-        except RecordingError as error:  # the seconds before are kept; with the next frame that fires it is tried again
+        except RecordingError as error:  # retried with the next frame that fires
             if not self._problem:
                 log.error("%s: %s", self._trigger.when, error)
             self._problem = str(error)
@@ -225,7 +231,7 @@ class TriggeredRecorder:
         if series := self._series:
             series.put(last)
             self._backlog = self._anew(series.end())
-            self._ending.append(series)  # before it is the present one no longer: another thread may look
+            self._ending.append(series)  # first, as another thread may call present()
             self._series = None
 
     def _anew(self, places: Mapping[int, BlockPosition]) -> PreTriggerBuffer:
@@ -237,7 +243,7 @@ class TriggeredRecorder:
         return [*self._ending, *([present] if present else [])]
 
     def tend(self) -> bool:
-        """Look after the files; whether a doubtful one was given up."""
+        """Close finished files; returns whether a doubtful file was given up."""
         for series in [series for series in self._ending if series.ended]:
             for unclosed in series.close(0):
                 log.error("%s", unclosed)
@@ -246,25 +252,25 @@ class TriggeredRecorder:
 
     @property
     def problem(self) -> str:
-        """What is wrong at present, in words; empty: nothing."""
+        """Description of the present problem; empty: none."""
         return next(filter(None, (series.problem for series in self._all)), self._problem)
 
     @property
     def file(self) -> Path | None:
-        """What is being written; None: it waits for its trigger."""
+        """Path of the present file; None while it waits for the trigger."""
         return self._series.file if self._series else None
 
     @property
     def written(self) -> int:
-        """Bytes in the present file."""
+        """Number of bytes in the present file."""
         return self._series.written if self._series else 0
 
     def present(self) -> set[Path]:
-        """What is being written; asked from another thread."""
+        """Return the files being written. Another thread may call it."""
         return {path for series in self._all for path in series.present()}
 
     def close(self, patience_s: float = CLOSE_S) -> list[str]:
-        """Take what is there, close all files; what is wrong with those that are not whole."""
+        """Record what is there, and close all files; returns a problem for each incomplete one."""
         while self.turn():
             pass
         self._end(self.tap.rest())

@@ -1,4 +1,4 @@
-"""A recording as MCAP: channels for the frames and events of each block, for gaps, steps and processes."""
+"""Write a recording as MCAP: channels for frames and events of each block, gaps, steps and processes."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ TEXT: Final = "text/plain"
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """Where the messages of one block go."""
+    """The channel numbers of a block."""
 
     frames: int
     events: int
 
 
 class Writer:
-    """Writes one recording; one thread. With an :class:`Output` nothing here waits for the disk."""
+    """Writes one recording, from one thread. With an :class:`Output` nothing here waits for the disk."""
 
     def __init__(self, output: Output | IO[bytes], about: Mapping[str, str]) -> None:
-        """``output``: or any other file. ``about``: what the reader is told of the instance."""
+        """Start the recording. ``output``: an output or any binary file; ``about``: metadata of the instance."""
         self._output = output
         self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._mcap.start(PROFILE, f"shmio {__version__}")
@@ -68,7 +68,7 @@ class Writer:
         self.flush()
 
     def places(self, places: Mapping[int, BlockPosition]) -> None:
-        """Tell where the recorder before had come to, by section: it may be all that there is of a block."""
+        """Write the positions, by section, where the previous recorder stopped."""
         if places:
             self._mcap.add_metadata(PLACES, {str(section): encode_position(place) for section, place in places.items()})
 
@@ -85,9 +85,15 @@ class Writer:
         layout: Layout | None = None,
         of: str = "",
     ) -> Channels:
-        """Begin a block: the ``number``-th in this recording, behind these numbers. Its layout was attached before.
+        """Create the channels of a block, whose layout is already attached.
 
-        ``layout``: what is recorded of it, if that is not all; ``of``: the hash of the whole, if that is another's.
+        Args:
+            block: The block.
+            number: Number of the block in this recording.
+            after_frame: Number of the frame before the first recorded one.
+            after_event: Number of the event before the first recorded one.
+            layout: Layout of the recorded registers; None: all.
+            of: Hash of the whole layout, if it is not that of ``block``.
         """
         layout = layout or block.layout
         self.flush()  # a channel's record is in the chunk of its block's first message, for readers without an index
@@ -127,21 +133,21 @@ class Writer:
         self._mcap.add_message(channels.events, log_ns, encode_event(event), told_ns, event.number & 0xFFFFFFFF)
 
     def gap(self, gap: Gap, log_ns: int) -> None:
-        """Tell what was missed; it comes before what follows it."""
+        """Add a gap, before the entry that follows it."""
         self._mcap.add_message(self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA), log_ns, encode_json(gap), log_ns)
 
     def step(self, mark: StepMark, log_ns: int) -> None:
-        """Tell that a step is done; it comes after all its frames."""
+        """Add the end of a step, after all its frames."""
         channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
         self._mcap.add_message(channel, log_ns, encode_json(mark), log_ns, mark.step & 0xFFFFFFFF)
 
     def process(self, change: ProcessChange, log_ns: int) -> None:
-        """Tell what has happened to a process."""
+        """Add a change of a process."""
         channel = self._channel(PROCESSES_TOPIC, "shmio.process.v1", PROCESS_SCHEMA)
         self._mcap.add_message(channel, log_ns, encode_json(change), log_ns)
 
     def _channel(self, topic: str, schema: str, text: bytes) -> int:
-        """A channel of the instance's own, described in the chunk of its first message."""
+        """Return a channel of the instance, which is described in the chunk of its first message."""
         if topic not in self._own:
             self.flush()
             number = self._mcap.register_schema(schema, "jsonschema", text)
@@ -149,7 +155,7 @@ class Writer:
         return self._own[topic]
 
     def flush(self) -> None:
-        """End the chunk; what was added is on its way to the file."""
+        """End the present chunk, and pass it to the output."""
         self._mcap.flush()
 
     def finish(self) -> None:
