@@ -1,1 +1,1 @@
-"""What a recording holds, and reading it (docs/reference/dump-format.md). It is written by `shmio.recorder`."""
+"""Read recordings, and their format (docs/reference/dump-format.md). `shmio.recorder` writes them."""

@@ -1,4 +1,4 @@
-"""Columns as a table of Apache Arrow."""
+"""Convert columns to an Apache Arrow table."""
 
 from __future__ import annotations
 
@@ -17,10 +17,14 @@ if TYPE_CHECKING:
 
 
 def table(columns: Columns) -> pyarrow.Table:
-    """A table: time (UTC, ns), the source's time, number, cycle, quality, provenance, and a column for each register.
+    """Convert columns to a table: time (UTC, ns), source time, number, cycle, quality, provenance, registers.
 
-    Native types; arrays are lists of fixed size, POINTER and ANY bytes. Null: no value of its type, or the source never
-    had an image. A register that has the name of another column has its source before it. MissingLibraryError.
+    Types are native: arrays are lists of fixed size, POINTER and ANY are bytes. Null means that the bytes
+    are no value of the type, or that the source never had an image. A register with the name of another
+    column is prefixed by its source.
+
+    Raises:
+        MissingLibraryError: pyarrow is not installed.
     """
     arrow = library("pyarrow", ANALYSIS)
     unknown = columns.source_ns == 0
@@ -39,12 +43,12 @@ def table(columns: Columns) -> pyarrow.Table:
 
 
 def _named(arrow: Any, codes: npt.NDArray[np.uint8], names: tuple[str, ...]) -> Any:
-    known = np.where(codes < len(names), codes, 0).astype(np.int8)  # as a reader takes what it does not know
+    known = np.where(codes < len(names), codes, 0).astype(np.int8)  # unknown codes count as the first name
     return arrow.DictionaryArray.from_arrays(arrow.array(known), arrow.array(names))
 
 
 def _nested(arrow: Any, values: npt.NDArray[Any], unknown: npt.NDArray[np.bool_]) -> Any:
-    """(n, …) values as an array of n values, or of lists of lists."""
+    """Convert values of shape (n, …) to an array of n values or nested lists."""
     mask = np.repeat(unknown, values[0].size) if len(values) and values.ndim > 1 else unknown
     plain = np.ascontiguousarray(values).reshape(-1)
     if plain.dtype.kind in "mM":

@@ -1,4 +1,4 @@
-"""What was injected in a recording, as declared injections that do the same again."""
+"""Derive declared injections that repeat the injections of a recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NS = 1e9
 
 @dataclass(slots=True)
 class _HeldValue:
-    """A value that a client gave, since when."""
+    """A value that a client gave, and its time."""
 
     place: Place
     since_ns: int
@@ -26,7 +26,7 @@ class _HeldValue:
 
 @dataclass(slots=True)
 class _RecordedInjection:
-    """An injection from the time when it was laid, the ``place``-th."""
+    """An injection of the recording, the ``place``-th of its source."""
 
     place: int
     name: str
@@ -35,14 +35,14 @@ class _RecordedInjection:
     """None: a client gave it values."""
     priority: int = 0
     held: dict[str, _HeldValue] = field(default_factory=dict)
-    """By path, what it gave last."""
+    """The last given value of each path."""
 
 
 @dataclass(slots=True)
 class Derived:
-    """Declarations, source by source, as they were laid (of several over one register the newest is outermost).
+    """Declarations by source, in the order in which they were laid.
 
-    ``left_out``: what of the recording's injections is not in them.
+    ``left_out`` describes the injections of the recording that cannot be declared.
     """
 
     declarations: list[Declaration] = field(default_factory=list)
@@ -50,11 +50,11 @@ class Derived:
 
     @property
     def begin_s(self) -> float:
-        """When the first of them begins; 0: there is none, or it is there from the start."""
+        """Start of the first declaration, in s; 0: there is none, or it has no start."""
         return min((one.start_s or 0.0 for one in self.declarations), default=0.0)
 
     def shifted(self, by_s: float) -> list[Declaration]:
-        """The declarations, by so much earlier."""
+        """Return the declarations with times that are ``by_s`` earlier."""
         return [
             msgspec.structs.replace(
                 one,
@@ -66,11 +66,11 @@ class Derived:
 
 
 def derive(dump: Dump) -> Derived:
-    """Declarations that do what was injected while it was recorded, by the times of the instance's clock.
+    """Derive declarations that repeat the injections of a recording, by times of the instance's clock.
 
-    A declared injection is there as it was declared, with its seed; from when it was laid, and until it was lifted.
-    What a client's injection gave to consumers is a ``set`` from each value to the next. A client's injection over
-    ``/in``, whose values depend on what is written, cannot be declared.
+    A declared injection keeps its declaration and seed, limited to the time from laying to lifting. Each value
+    that a client's injection gave to consumers becomes a ``set`` until the next value. A client's injection
+    over ``/in`` cannot be declared, because its values depend on what is written.
     """
     found = Derived()
     for source in dump.sources:
@@ -150,7 +150,7 @@ class _Source:
             self._declare(laid, laid.declaration, None if event.text == "over" else event.clock_ns)
 
     def end(self) -> None:
-        """What stands at the recording's end stands for ever."""
+        """End the recording: the injections that are left have no end."""
         for laid in self._laid.values():
             for held in laid.held.values():
                 self._set(laid, held, None)
@@ -171,7 +171,7 @@ class _Source:
     def _declare(
         self, laid: _RecordedInjection, one: Declaration, until_ns: int | None, since_ns: int | None = None
     ) -> None:
-        """Within these times, too. A change is seen from the next cycle on: in virtual time that is a later moment."""
+        """Add a declaration, limited to a time. A change is seen from the next cycle on, hence the extra ns."""
         since_s = (max(0, laid.since_ns if since_ns is None else since_ns) + 1) / NS
         if since_s > max(one.start_s or 0.0, 1 / NS):
             one = msgspec.structs.replace(one, start_s=_round(since_s))
@@ -182,7 +182,7 @@ class _Source:
 
 
 def _named(found: Derived) -> Iterator[Declaration]:
-    """Each with a name of its own; what is random in one that gets another name is not what it was."""
+    """Yield the declarations with unique names. A new name changes the random values of an injection."""
     seen: dict[str, int] = {}
     for one in found.declarations:
         count = seen[one.name] = seen.get(one.name, 0) + 1
@@ -196,5 +196,5 @@ def _named(found: Derived) -> Iterator[Declaration]:
 
 
 def _round(seconds: float) -> float:
-    """To the ns, as times are kept."""
+    """Round to 1 ns, the resolution of recorded times."""
     return round(seconds, 9)

@@ -1,4 +1,4 @@
-"""Where registers change, looked for in many frames at once."""
+"""Find changes of registers in many frames at once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _Bytes = npt.NDArray[np.uint8]
 
 
 def register_bytes(registers: Sequence[Register]) -> tuple[npt.NDArray[np.intp], _Bytes]:
-    """(place, mask) of each byte of an image that holds data of the registers; padding belongs to nobody."""
+    """Return offset and mask of each byte of an image that holds data of the registers, without padding."""
     places: list[int] = []
     masks: list[int] = []
     for register in registers:
@@ -28,14 +28,14 @@ def register_bytes(registers: Sequence[Register]) -> tuple[npt.NDArray[np.intp],
 
 
 class Changes:
-    """Compares each frame with the one before it; bytes are compared, never values."""
+    """Compares the bytes of each frame with those of the previous frame."""
 
     def __init__(self, chosen: Mapping[DumpBlock, Sequence[Register]]) -> None:
         self._bytes = {block: register_bytes(registers) for block, registers in chosen.items()}
         self._before: dict[DumpBlock, npt.NDArray[Any]] = {}
 
     def begin(self, block: DumpBlock, image: bytes) -> None:
-        """What stood before the first frame."""
+        """Set the image before the first frame."""
         if block in self._bytes:
             self._before[block] = self._of(block, np.frombuffer(image, np.uint8)[None, :])[0]
 
@@ -45,7 +45,7 @@ class Changes:
         return found
 
     def first(self, block: DumpBlock, batch: Batch) -> int | None:
-        """Which frame is the first that differs; the first frame of a block differs from none."""
+        """Return the index of the first frame that differs; the first frame of a block counts as unchanged."""
         if block not in self._bytes:
             return None
         now = self._of(block, batch.images)

@@ -1,4 +1,4 @@
-"""Reads all of a recording and holds it to what its format promises (docs/reference/dump-format.md)."""
+"""Verify a recording completely against its format (docs/reference/dump-format.md)."""
 
 from __future__ import annotations
 
@@ -18,34 +18,40 @@ from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
 
 MAX_TOLD: Final = 1000
-"""Damaged places, and contradictions, that are kept one by one; all are counted."""
+"""How many damaged places and problems are listed; all are counted."""
 
 
 @dataclass(slots=True)
 class Findings:
-    """What a check has found."""
+    """Result of a check."""
 
     chunks: int = 0
-    """That are whole."""
+    """Number of intact chunks."""
     messages: int = 0
     damage: list[Damage] = field(default_factory=list)
-    """The first places that cannot be read."""
+    """The first unreadable places."""
     problems: list[str] = field(default_factory=list)
-    """What can be read and contradicts itself: the first ones."""
+    """The first readable but inconsistent places."""
     count: int = 0
-    """Of both."""
+    """Total number of damaged places and problems."""
 
     @property
     def whole(self) -> bool:
-        """Whether all that the recorder wrote is there, unchanged."""
+        """Whether the recording is intact."""
         return self.count == 0
 
 
 def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findings:
-    """Read the whole file: every CRC, every message, and that the numbers of each block go on without a hole but gaps.
+    """Verify every CRC and every message, and that the numbers of each block continue except in gaps.
 
-    ``at`` is told which byte it has come to.
-    A file that was not closed is held to what is there of it. RecordingError: it is no recording of ours.
+    Of a file that was not closed the existing part is checked.
+
+    Args:
+        reader: Reader of the file.
+        at: Called with the byte offset reached, as progress.
+
+    Raises:
+        RecordingError: The file is not a recording of shmio.
     """
     work = _Check(reader)
     for record in reader.records.walk():
@@ -62,17 +68,17 @@ class _Check:
         self._log = DamageLog(self._damaged)
         self._numbers = _Numbers(self._problem)
         self._chunk: Record | None = None
-        """The last one, and the messages in it, which its indexes are to agree with."""
+        """The last chunk, whose messages are compared with its indexes."""
         self._counts: dict[int, Count] = {}
         self._indexes: dict[int, Count] = {}
 
     def take(self, record: Record) -> None:
-        """The next record."""
+        """Check the next record."""
         try:
             if record.opcode == Opcode.MESSAGE_INDEX:
                 self._index(record)
                 return
-            if record.opcode != BROKEN:  # which may be the rest of the indexes
+            if record.opcode != BROKEN:  # a broken record may be the rest of the indexes
                 self._compare_indexes()
             self._chunk, self._counts, self._indexes = None, {}, {}
             if record.opcode == Opcode.CHUNK:
@@ -89,7 +95,7 @@ class _Check:
             self._log.add(record, error)
 
     def end(self) -> Findings:
-        """What was found; RecordingError."""
+        """Return the findings. RecordingError: not a recording of shmio."""
         self._log.end()
         self._reader.require_ours()
         return self._found
@@ -151,7 +157,7 @@ class _Check:
     # ---- the rest ----------------------------------------------------------------------------------------------------
 
     def _check_data(self, record: Record) -> None:
-        """The CRC of everything, for what has none of its own: metadata, times, indexes."""
+        """Check the CRC of the whole data, which covers metadata, times and indexes."""
         self._log.end()
         (crc,) = U32.unpack(self._records.read(record.at, U32.size))
         if crc and self._found.whole and self._records.crc(0, record.start) != crc:
@@ -159,7 +165,7 @@ class _Check:
 
 
 class _Numbers:
-    """Holds the numbers of each block's frames and events to going on by one, messages and gaps taken together."""
+    """Checks that the numbers of each block's frames and events have no holes except gaps."""
 
     def __init__(self, problem: Callable[[str], None]) -> None:
         self._problem = problem
@@ -168,7 +174,7 @@ class _Numbers:
         self._known: set[int] = set()
 
     def take(self, channel: Channel, number: int) -> None:
-        """A frame's or an event's number."""
+        """Check the number of a frame or event."""
         key = channel.source, channel.block, "frames" if channel.encoding == FRAME else "events"
         if channel.number not in self._known:
             self._known.add(channel.number)
@@ -178,7 +184,7 @@ class _Numbers:
         self._go_on(key, number, number)
 
     def gap(self, gap: Gap) -> None:
-        """What was missed."""
+        """Take a gap into account."""
         self._go_on((gap.source, gap.block, gap.what), gap.first, gap.last)
 
     def _go_on(self, key: tuple[str, int, str], first: int, last: int) -> None:

@@ -1,4 +1,4 @@
-"""Registers of a recording as numpy arrays, and as tables of other libraries."""
+"""Registers of a recording as numpy arrays, or as tables of pyarrow, pandas and polars."""
 
 from __future__ import annotations
 
@@ -26,20 +26,27 @@ if TYPE_CHECKING:
 Array = npt.NDArray[Any]
 
 FIELDS: Final = ("number", "cycle", "source_ns", "quality", "provenance")
-"""What a frame's header gives a column of."""
+"""Fields of a frame's header that become columns."""
 OF_FRAMES: Final = frozenset({"time", "source_time", "number", "cycle", "quality", "provenance"})
-"""What tables call that, and the times."""
+"""Names of these columns and the times in tables."""
 DECODED_BYTES: Final = 1 << 20
-"""So many bytes of frames are decoded at once."""
+"""How many bytes of frames to decode at once."""
 
 
 @dataclass(frozen=True)
 class Columns(Mapping[str, Array]):
-    """Registers of one source over n frames: a mapping of paths to arrays (n, …), of the types of ``framecodec.py``.
+    """Registers of one source over n frames: a mapping of paths to arrays of shape (n, …).
 
-    ``time_ns``: (n,) int64, log times in UTC; ``source_ns``: the source's own time stamps, 0 while it never had an
-    image, whose values are zeros then. ``quality``: 0 bad, 1 uncertain, 2 good; ``provenance``: 0 live, 1 simulated,
-    2 replayed, 3 injected.
+    Attributes:
+        source: Name of the source.
+        registers: The registers.
+        time_ns: Log times, UTC, shape (n,).
+        number: Numbers of the frames, shape (n,).
+        cycle: Cycles of the source's schedule, shape (n,).
+        source_ns: The source's time stamps, shape (n,); 0 while it had no image, and values are zeros.
+        quality: 0 bad, 1 uncertain, 2 good; shape (n,).
+        provenance: 0 live, 1 simulated, 2 replayed, 3 injected; shape (n,).
+        values_by_path: The values, by path without the source.
     """
 
     source: str
@@ -53,7 +60,7 @@ class Columns(Mapping[str, Array]):
     values_by_path: Mapping[str, Array]
 
     def __getitem__(self, path: str) -> Array:
-        """A register's values, by its path without the source."""
+        """Return a register's values, by its path without the source."""
         return self.values_by_path[path]
 
     def __iter__(self) -> Iterator[str]:
@@ -63,19 +70,31 @@ class Columns(Mapping[str, Array]):
         return len(self.values_by_path)
 
     def to_arrow(self) -> pyarrow.Table:
-        """A table: time, number, cycle, quality, and each register, arrays as lists. MissingLibraryError."""
+        """Convert to a pyarrow table with a column for each register; arrays become lists.
+
+        Raises:
+            MissingLibraryError: pyarrow is not installed.
+        """
         from shmio.recording.arrow import table  # noqa: PLC0415  pyarrow only for those who ask for it
 
         return table(self)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """A frame indexed by time, a column for each register and each element of an array. MissingLibraryError."""
+        """Convert to a pandas data frame, indexed by time, with a column for each register and array element.
+
+        Raises:
+            MissingLibraryError: pandas is not installed.
+        """
         pandas = library("pandas", ANALYSIS)
         data = {"number": self.number, "cycle": self.cycle, "quality": self.quality, **self._flat()}
         return pandas.DataFrame(data, index=pandas.to_datetime(self.time_ns, utc=True).rename("time"))
 
     def to_polars(self) -> polars.DataFrame:
-        """The same, with ``time`` as its first column. MissingLibraryError."""
+        """Convert to a polars data frame, with ``time`` as the first column, otherwise as :meth:`to_pandas`.
+
+        Raises:
+            MissingLibraryError: polars is not installed.
+        """
         polars = library("polars", ANALYSIS)
         time = polars.Series("time", self.time_ns).cast(polars.Datetime("ns", "UTC"))
         data = {"number": self.number, "cycle": self.cycle, "quality": self.quality, **self._flat()}
@@ -90,12 +109,12 @@ class Columns(Mapping[str, Array]):
 
 
 def heading(source: str, path: str, taken: Collection[str] = OF_FRAMES) -> str:
-    """What a table calls the column of a register: its path, with its source if the frame's own columns have that."""
+    """Return a register's column name: its path, with the source before it if the name is taken."""
     return f"{source}/{path}" if path in taken else path
 
 
 def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:
-    """(path, (n,) values) of a register, or of each element of an array; POINTER and ANY in hexadecimal digits."""
+    """Yield path and values, of shape (n,), of a register or each element; POINTER and ANY as hex digits."""
     if values.dtype.kind == "V":
         texts = [bytes(value).hex() for value in values.reshape(-1)]
         values = np.array(texts, f"U{2 * values.dtype.itemsize}").reshape(values.shape)
@@ -109,7 +128,7 @@ def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:
 
 
 class Collector:
-    """Puts batches together to columns."""
+    """Collects batches of frames into columns."""
 
     def __init__(self, source: str) -> None:
         self._source = source
@@ -123,11 +142,11 @@ class Collector:
 
     @property
     def begun(self) -> bool:
-        """Whether it is known which registers there are."""
+        """Whether the registers are known."""
         return self._codec is not None
 
     def begin(self, block: DumpBlock, registers: Sequence[Register]) -> None:
-        """Of this block, these registers. RecordingError: they were others until now."""
+        """Set the registers of a block. RecordingError: their types differ from the previous ones."""
         codec = record_codec(tuple(registers), block.layout.size, block.layout.byte_order)
         if self._codec is codec:
             return
@@ -139,7 +158,7 @@ class Collector:
         self._codec, self._registers = codec, tuple(registers)
 
     def add(self, block: DumpBlock, registers: Sequence[Register], batch: Batch) -> None:
-        """The next frames; RecordingError as :meth:`begin`."""
+        """Add frames. RecordingError: as :meth:`begin`."""
         self.begin(block, registers)
         self._waiting.append(batch)
         self._waiting_bytes += batch.records.nbytes
@@ -160,11 +179,11 @@ class Collector:
 
     @property
     def bytes(self) -> int:
-        """About how much is held."""
+        """Approximate number of bytes held."""
         return self._waiting_bytes + sum(some.nbytes for some in self._decoded)
 
     def columns(self) -> Columns:
-        """What was added since the last call."""
+        """Return the columns of the frames added since the last call."""
         self._flush()
         assert self._codec is not None  # noqa: S101  begin() came first
         decoded = np.concatenate([np.empty(0, self._codec.dtype), *self._decoded])
@@ -178,6 +197,6 @@ class Collector:
 
 @lru_cache(maxsize=64)
 def record_codec(registers: tuple[Register, ...], size: int, byte_order: ByteOrder) -> FrameCodec:
-    """What decodes registers out of a batch's records: of images of this size behind a header."""
+    """Return a codec for registers in a batch's records: images of ``size`` bytes behind a header."""
     shifted = tuple(replace(register, offset=register.offset + HEAD.itemsize) for register in registers)
     return FrameCodec(Layout("", None, HEAD.itemsize + size, False, shifted, byte_order))

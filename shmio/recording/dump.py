@@ -1,4 +1,4 @@
-"""A recording as a program reads it: :func:`shmio.open_dump`."""
+"""Read recordings from a program: :func:`shmio.open_dump`."""
 
 from __future__ import annotations
 
@@ -25,17 +25,25 @@ from shmio.segment import Event, Frame
 
 MAX_FILES: Final = 512
 OVERLAP_NS: Final = 1_000_000_000
-"""A recorder's file may begin so long before the one before it ends: a turn of the recorder, and more."""
+"""How long two consecutive files of a recorder may overlap: more than a turn of the recorder."""
 
 
 def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], damaged: Damaged | None = None) -> Dump:
-    """Open a recording: a file, or several of one run of an instance, in whatever order.
+    """Open a recording: one file, or several files of one run of an instance, in any order.
 
-    Nothing is loaded: a file's index is read, or of one that was not closed the headers of its chunks.
-    ``damaged(file, damage)`` is told of each place that cannot be read, and what is whole behind it follows; without it
-    RecordingError is raised there.
+    Only the index of a file is read, or, if it was not closed, the headers of its chunks.
 
-    OSError, RecordingError: a file cannot be opened, is no recording, or not of the same run as the others.
+    Args:
+        files: Path of a file, or paths of several.
+        damaged: Called with the file and the damage for each place that cannot be read; reading then
+            continues behind it. None: reading such a place raises RecordingError.
+
+    Returns:
+        The recording, a context manager.
+
+    Raises:
+        OSError: A file cannot be opened.
+        RecordingError: A file is not a recording, or not of the same run as the others.
     """
     paths = [Path(files)] if isinstance(files, str | os.PathLike) else [Path(file) for file in files]
     if not 0 < len(paths) <= MAX_FILES:
@@ -51,17 +59,18 @@ def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], 
 
 
 class Dump:
-    """A recording: one file, or several of one run. A context manager. All times are log times: ns, UTC.
+    """A recording: one file, or several files of one run. All times are log times: ns, UTC.
 
-    Iterators read on as they are asked, a chunk at a time; several may be at work at once, in one thread.
+    Use it as a context manager, or call :meth:`close`. Iterators read one chunk at a time, on demand; several
+    may be in use at once, in one thread. In all methods ``from_ns`` and ``to_ns`` belong to the range.
     """
 
     def __init__(self, parts: Iterable[Part]) -> None:
-        """Use :func:`open_dump`. RecordingError: the files are of different runs."""
+        """Open with :func:`open_dump` instead. RecordingError: the files are of different runs."""
         self._parts = sorted(parts, key=lambda part: (part.begin_ns, part.end_ns))
         first = self._parts[0]
         self.about = first.reader.about
-        """What the recorder of the first file said of the instance (docs/reference/dump-format.md)."""
+        """The first file's metadata about the instance (docs/reference/dump-format.md)."""
         for part in self._parts[1:]:
             for key in ("instance", "epoch"):
                 if part.reader.about.get(key) != self.about.get(key):
@@ -69,7 +78,7 @@ class Dump:
         blocks: dict[tuple[str, int, str], DumpBlock] = {}
         self._contents = [contents(part, blocks) for part in self._parts]
         self.blocks = tuple(blocks.values())
-        """In the order in which they began."""
+        """The blocks, in the order in which they began."""
         self._names = Names(self.blocks)
         spans = [(part.begin_ns, part.end_ns) for part in self._parts if part.begin_ns]
         self.begin_ns = min((begin for begin, _ in spans), default=0)
@@ -80,7 +89,7 @@ class Dump:
         )
 
     def _has_twice(self) -> bool:
-        """Whether a file may have frames or events of a block that one before it has."""
+        """Whether a file may repeat frames or events of an earlier file."""
         come_to: dict[tuple[DumpBlock, str], int] = {}
         for part, within in zip(self._parts, self._contents, strict=True):
             for number, block in within.blocks.items():
@@ -93,12 +102,12 @@ class Dump:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """In the order of time."""
+        """The files, in the order of time."""
         return tuple(part.file for part in self._parts)
 
     @property
     def readers(self) -> tuple[Reader, ...]:
-        """Of the files, for what is not of a time: attachments."""
+        """The readers of the files, which give access to attachments."""
         return tuple(part.reader for part in self._parts)
 
     @property
@@ -113,17 +122,17 @@ class Dump:
 
     @property
     def closed(self) -> bool:
-        """Whether all files were closed in good order."""
+        """Whether all files were closed properly."""
         return all(part.reader.records.closed for part in self._parts)
 
     @property
     def gaps(self) -> list[Gap]:
-        """What the recorders missed: of each file at most the first 1000. ``block`` is the number within the file."""
+        """The gaps in the files, at most 1000 of each; ``block`` is the block's number within the file."""
         return [gap for part in self._parts for gap in part.found.gaps]
 
     @property
     def damage(self) -> list[str]:
-        """What was found damaged when the files were opened: a few texts."""
+        """Descriptions of the damage that was found when the files were opened."""
         return list(dict.fromkeys(text for part in self._parts for text in part.found.damage))
 
     # ---- one by one --------------------------------------------------------------------------------------------------
@@ -131,9 +140,17 @@ class Dump:
     def items(
         self, sources: str | Collection[str] | None = None, from_ns: int = 0, to_ns: int = MAX_NS
     ) -> Iterator[Entry[Item]]:
-        """Everything of these sources, and of the instance, in recorded order; None: of all sources.
+        """Iterate over everything of some sources, and of the instance, in recorded order.
 
-        What is in two files comes once; what is missing between two files comes as a gap. PathError: no such source.
+        An entry that is in two files comes once. What is missing between two files comes as a gap.
+
+        Args:
+            sources: Names of sources; None: all.
+            from_ns: Start of the range.
+            to_ns: End of the range.
+
+        Raises:
+            PathError: There is no such source.
         """
         wanted = self._names.several(sources)
         channels = [
@@ -145,7 +162,16 @@ class Dump:
                 yield entry
 
     def frames(self, source: str | None = None, from_ns: int = 0, to_ns: int = MAX_NS) -> Iterator[Entry[Frame]]:
-        """Frames of a source, decoded; None if there is only one source. PathError."""
+        """Iterate over the frames of a source.
+
+        Args:
+            source: Name of the source; None if there is only one.
+            from_ns: Start of the range.
+            to_ns: End of the range.
+
+        Raises:
+            PathError: There is no such source.
+        """
         name = self._names.one(source)
         if self._overlap:
             for time_ns, block, item in self._read([within.frames(name) for within in self._contents], from_ns, to_ns):
@@ -163,14 +189,34 @@ class Dump:
     def events(
         self, sources: str | Collection[str] | None = None, from_ns: int = 0, to_ns: int = MAX_NS
     ) -> Iterator[Entry[Event]]:
-        """Events of these sources; None: of all. Chunks without any are not read. PathError."""
+        """Iterate over the events of some sources. Chunks without events are not read.
+
+        Args:
+            sources: Names of sources; None: all.
+            from_ns: Start of the range.
+            to_ns: End of the range.
+
+        Raises:
+            PathError: There is no such source.
+        """
         wanted = self._names.several(sources)
         for time_ns, block, item in self._read([within.events(wanted) for within in self._contents], from_ns, to_ns):
             if isinstance(item, Event):
                 yield Entry(time_ns, block, item)
 
     def latest(self, source: str | None = None, time_ns: int = MAX_NS) -> Entry[Frame] | None:
-        """The last frame of a source not after a time: what stood then. PathError."""
+        """Return the last frame of a source at or before a time.
+
+        Args:
+            source: Name of the source; None if there is only one.
+            time_ns: The time.
+
+        Returns:
+            The frame; None before the first.
+
+        Raises:
+            PathError: There is no such source.
+        """
         name = self._names.one(source)
         found: Entry[Frame] | None = None
         for part, within in zip(reversed(self._parts), reversed(self._contents), strict=True):
@@ -182,13 +228,30 @@ class Dump:
         return found
 
     def next_event(self, source: str | None = None, after_ns: int = -1) -> Entry[Event] | None:
-        """The first event of a source, or of any, after a time. PathError."""
+        """Return the first event after a time; None if there is none.
+
+        Args:
+            source: Name of the source; None: any source.
+            after_ns: The time.
+
+        Raises:
+            PathError: There is no such source.
+        """
         return next(self.events(source, after_ns + 1), None)
 
     def next_change(self, path: str, after_ns: int = -1, to_ns: int = MAX_NS) -> Entry[Frame] | None:
-        """The first frame after a time in which what consumers saw of a register, structure or pattern changed.
+        """Return the first frame after a time in which registers changed for consumers.
 
-        None: it stays. PathError: there is no such register.
+        Args:
+            path: Register, structure or pattern of one source.
+            after_ns: The time after which to search.
+            to_ns: End of the search.
+
+        Returns:
+            The frame; None if there is no change.
+
+        Raises:
+            PathError: There is no such register.
         """
         chosen = self._names.of_one_source(path)
         source = next(iter(chosen)).source
@@ -208,9 +271,16 @@ class Dump:
     def batches(
         self, source: str | None = None, from_ns: int = 0, to_ns: int = MAX_NS, *, raw: bool = False
     ) -> Iterator[tuple[DumpBlock, Batch]]:
-        """Frames of a source as arrays, chunk by chunk; PathError.
+        """Iterate over the frames of a source as arrays, chunk by chunk.
 
-        Images are what consumers saw; with ``raw`` what the source delivered.
+        Args:
+            source: Name of the source; None if there is only one.
+            from_ns: Start of the range.
+            to_ns: End of the range.
+            raw: Whether the images are those that the source delivered, not those that consumers saw.
+
+        Raises:
+            PathError: There is no such source.
         """
         name = self._names.one(source)
         if self._overlap:  # one file may have what another missed
@@ -227,11 +297,22 @@ class Dump:
     def columns(
         self, paths: str | Iterable[str], from_ns: int = 0, to_ns: int = MAX_NS, *, raw: bool = False
     ) -> Columns:
-        """Registers of one source as numpy arrays of their own types, one value for each frame.
+        """Read registers of one source as numpy arrays of their own types, one value for each frame.
 
-        ``paths``: registers, elements, structures, globs. Blocks of the source that have none of them are left out.
-        PathError: no such register, or of several sources; RecordingError: a reload changed the registers within this
-        time.
+        Blocks of the source without any of the registers are left out. The result is held in memory.
+
+        Args:
+            paths: Registers, elements, structures or globs.
+            from_ns: Start of the range.
+            to_ns: End of the range.
+            raw: Whether to read what the source delivered, not what consumers saw.
+
+        Returns:
+            Arrays of shape (n, …) by path, for n frames, with the frames' times and qualities.
+
+        Raises:
+            PathError: There is no such register, or the registers are of several sources.
+            RecordingError: A reload changed the registers within the range.
         """
         chosen = self._names.of_one_source(paths)
         source = next(iter(chosen)).source
@@ -244,11 +325,11 @@ class Dump:
         return collector.columns()
 
     def select(self, paths: Iterable[str]) -> dict[DumpBlock, list[Register]]:
-        """By block the registers that paths name, of whatever form, as :meth:`columns` takes them; PathError."""
+        """Return the registers that paths name, by block. Paths are as in :meth:`columns`; PathError."""
         return self._names.select(paths)
 
     def _channels(self, source: str, from_ns: int, to_ns: int) -> Iterator[tuple[Part, int, DumpBlock]]:
-        """Files and channels in them that may have frames of a source in a range of times, in order."""
+        """Yield the files and their channels that may have frames of a source in a range, in order."""
         for part, within in zip(self._parts, self._contents, strict=True):
             if part.end_ns >= from_ns and part.begin_ns <= to_ns:
                 for number in within.frames(source):

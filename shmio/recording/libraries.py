@@ -1,4 +1,4 @@
-"""Libraries that not everybody has."""
+"""Import optional libraries."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any, Final
 from shmio.errors import MissingLibraryError
 
 ANALYSIS: Final = "pip install 'shmio[analysis]'"
-"""The extra with all that tables of recordings need."""
+"""Command that installs the libraries for tables of recordings."""
 
 
 def library(name: str, remedy: str) -> Any:
-    """A module; MissingLibraryError with the remedy where it is not installed."""
+    """Import a module. MissingLibraryError: it is not installed; the message has the remedy."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

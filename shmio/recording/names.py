@@ -1,4 +1,4 @@
-"""Sources and registers of a dump, by the names that a user gives."""
+"""Resolve the names of sources and registers in a dump."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Chosen = dict[DumpBlock, list[Register]]
 
 
 class Names:
-    """Looks up in the blocks of a dump."""
+    """Resolves names in the blocks of a dump."""
 
     def __init__(self, blocks: Sequence[DumpBlock]) -> None:
         self._blocks = blocks
         self.sources = tuple(dict.fromkeys(block.source for block in blocks))
 
     def one(self, name: str | None) -> str:
-        """A source's name, checked; None stands for the only one. PathError."""
+        """Check a source's name, and return it; None stands for the only one. PathError: unknown source."""
         if name is None and len(self.sources) == 1:
             return self.sources[0]
         if name not in self.sources:
@@ -29,13 +29,13 @@ class Names:
         return name
 
     def several(self, names: str | Collection[str] | None) -> set[str]:
-        """Names of sources, checked; None stands for all. PathError."""
+        """Check names of sources, and return them; None stands for all. PathError: unknown source."""
         if names is None:
             return set(self.sources)
         return {self.one(name) for name in ([names] if isinstance(names, str) else names)}
 
     def select(self, paths: Iterable[str]) -> Chosen:
-        """By block the registers that paths name, of whatever form; PathError."""
+        """Return the registers that paths of any form name, by block. PathError: no such register."""
         default = self.sources[0] if len(self.sources) == 1 else None
         chosen: dict[DumpBlock, dict[str, Register]] = {}
         for path in paths:
@@ -47,7 +47,7 @@ class Names:
         return {block: list(chosen[block].values()) for block in self._blocks if block in chosen}
 
     def of_one_source(self, paths: str | Iterable[str]) -> Chosen:
-        """The same, all of one source; PathError."""
+        """Return the registers that paths name, by block. PathError: none, or of several sources."""
         chosen = self.select([paths] if isinstance(paths, str) else paths)
         sources = sorted({block.source for block in chosen})
         if len(sources) != 1:
@@ -55,7 +55,7 @@ class Names:
         return chosen
 
     def _named(self, path: str, topic: Topic) -> Chosen:
-        """A layout may have it that came after a change, or that was before."""
+        """Look in all blocks of the source, as a reload may have changed the layout."""
         found: Chosen = {}
         problem = PathError(f"{path}: no register of this recording has such a path")
         for block in self._blocks:

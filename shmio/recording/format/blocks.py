@@ -30,7 +30,7 @@ class DumpBlock:
     period_ns: int
     stale_ns: int
     of: str = ""
-    """The hash of the whole layout, where only some of its registers were recorded."""
+    """Hash of the whole layout, if only some of its registers were recorded."""
     frames: int = 0
     """How many were recorded; those that two files have are counted twice."""
     events: int = 0
@@ -55,15 +55,15 @@ class DumpBlock:
         self.end_ns = max(self.end_ns, track.last_ns)
 
     def register(self, path: str) -> Register:
-        """A register or an array's element, named with its source or without; PathError."""
+        """Return a register or array element, by its path with or without the source; PathError."""
         return find(self.layout, parse_topic(path, (self.source,), self.source).path)
 
     def named(self, topic: Topic) -> list[Register]:
-        """The registers that a topic names, of whatever form; PathError."""
+        """Return the registers that a topic of any form names; PathError."""
         return named(self.layout, topic)
 
     def value(self, frame: Frame, path: str) -> Value:
-        """What consumers saw of a register in a frame of this block; PathError."""
+        """Return the value that consumers saw of a register in a frame of this block; PathError."""
         return codec(self.register(path), self.layout.byte_order).decode(frame.image)
 
 
