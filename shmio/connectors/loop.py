@@ -120,13 +120,13 @@ class SourceLoop:
         self._connected_ns: int | None = None
         self._accepting = False
         self._under_way: deque[_Submitted] = deque()
-        self._condition = QualityLog(writer)
+        self._quality_log = QualityLog(writer)
         self.counters = Counters()
 
     @property
     def note(self) -> str:
         """Why quality is not good; empty if it is."""
-        return self._condition.note
+        return self._quality_log.note
 
     def run(self) -> None:
         """Poll until the clock says stop, then publish the end of the source."""
@@ -203,7 +203,7 @@ class SourceLoop:
     def _publish(self, asked: _Submitted, raw: bytes) -> None:
         doubt = self._connector.doubt
         quality = Quality.UNCERTAIN if doubt else Quality.GOOD
-        self._condition.tell(quality, doubt, asked.cycle, f", connected {self._connector.describe()}")
+        self._quality_log.update(quality, doubt, asked.cycle, f", connected {self._connector.describe()}")
         self._output.publish(
             Image(raw, asked.cycle, asked.utc_ns, quality, self._connector.provenance, doubt, asked.monotonic_ns)
         )
@@ -236,7 +236,7 @@ class SourceLoop:
     def _disconnected(self, cycle: int, reason: str) -> None:
         """Publish one bad frame for each new reason, with the last known bytes."""
         self.commands.close(reason)
-        if self._condition.tell(Quality.BAD, reason, cycle):
+        if self._quality_log.update(Quality.BAD, reason, cycle):
             provenance = self._connector.provenance
             raw, source_ns = self._output.raw, self._output.source_ns
             self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, provenance, reason))

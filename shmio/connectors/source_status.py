@@ -47,7 +47,7 @@ class QualityLog:
         self.note = ""
         """Why quality is not good, for the process table; empty if it is good."""
 
-    def tell(self, quality: Quality, reason: str, cycle: int, well: str = "") -> bool:
+    def update(self, quality: Quality, reason: str, cycle: int, well: str = "") -> bool:
         """Report the quality if it or its reason has changed; numbers in the reason do not count.
 
         Args:

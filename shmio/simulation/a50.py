@@ -1,9 +1,9 @@
 """The A50 cell (D6.5, section 5.1): three robots, two engine test units, a conveyor for trolleys, a rack of frames.
 
-What moves when is told by the tables of ``a50_plant`` and follows from the time alone. A cycle: a trolley brings two
-engines and is clamped; Robot_825 and Robot_850 carry them to the test units, whose two actuators each take hold; the
-units' axes run the test while Robot_800 fetches a frame from the rack; the engines go back, the frame is put on the
-trolley, the trolley leaves. An operator, which is whoever writes the orders below, can hold the cell and drive its
+The tables below say what moves when; all motion follows from the time alone. In a cycle, a trolley brings two
+engines and is clamped. Robot_825 and Robot_850 carry them to the test units, whose two actuators each grip. The
+units' axes run the test while Robot_800 fetches a frame from the rack. The engines go back, the frame is put on the
+trolley, and the trolley leaves. An operator, any client that writes the orders below, can pause the cell and drive its
 actuators by hand.
 
 The real cell's I/O assignment is not public. This one is shmio's own, in the first bytes of ``Inputs`` and

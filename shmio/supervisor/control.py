@@ -64,9 +64,9 @@ def cut_lines(text: str, most_chars: int) -> str:
 def shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
     """Return the answer shortened to fit as JSON; lines left out are counted."""
     short = dict(answer)
-    told = {key: [cut(line) for line in lines] for key in _MORE if isinstance(lines := answer.get(key), list)}
-    short.update(told)
-    for key, lines in told.items():
+    shortened = {key: [cut(line) for line in lines] for key in _MORE if isinstance(lines := answer.get(key), list)}
+    short.update(shortened)
+    for key, lines in shortened.items():
         excess = len(msgspec.json.encode(short)) - most_bytes
         if excess <= 0:
             break

@@ -53,7 +53,7 @@ class Health:
                 qualities.append(None if frame is None else block.assess(frame)[0])
         return qualities
 
-    def tell(self, now_ns: int, *, started: bool, stopping: bool) -> None:
+    def publish(self, now_ns: int, *, started: bool, stopping: bool) -> None:
         """Publish the state of the instance. This is the supervisor's heartbeat too."""
         note = self._logs.problem(now_ns)
         state = self._assess(now_ns, note) if started and not stopping else InstanceState.STARTING
@@ -66,9 +66,9 @@ class Health:
                 self._notifier.ready()
             self._state = state
             reasons = ", ".join([*self._weak(), *filter(None, [note])]) if state is InstanceState.DEGRADED else ""
-            told = f"{state}: {reasons}" if reasons else str(state)
-            log.info("instance %s", told)
-            self._notifier.status(told)
+            text = f"{state}: {reasons}" if reasons else str(state)
+            log.info("instance %s", text)
+            self._notifier.status(text)
             self._on_state(state)
 
     def _assess(self, now_ns: int, note: str) -> InstanceState:

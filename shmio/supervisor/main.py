@@ -73,7 +73,7 @@ START_TICK_S: Final = 0.01
 MAX_ADDRESSES: Final = 16
 """Most listening addresses of a process in an answer."""
 NAME_S: Final = 1.0
-"""How often it is made sure that the segment can still be found."""
+"""How often to check that the segment can still be found."""
 
 
 class Supervisor:
@@ -219,7 +219,7 @@ class Supervisor:
             self._reload(answer)
         else:
             plan, read_ns = self._reloader.plan, self._reloader.read_ns
-            listen = {job.name: told for job in plan.jobs if (told := job.listening[:MAX_ADDRESSES])}
+            listen = {job.name: found for job in plan.jobs if (found := job.listening[:MAX_ADDRESSES])}
             answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
 
     def _busy(self) -> str | None:
@@ -280,7 +280,7 @@ class Supervisor:
         if self._stopping:
             self._fleet.stop_due()
             self._follow_stop()
-        self._health.tell(now_ns, started=self._started, stopping=self._stopping)
+        self._health.publish(now_ns, started=self._started, stopping=self._stopping)
         return self._stopping and policy.all_gone(self._fleet.ranked)
 
     def _follow_stop(self) -> None:

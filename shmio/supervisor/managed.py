@@ -78,9 +78,9 @@ class ManagedProcess:
 
     def adopt(self, child: AdoptedProcess) -> None:
         """Adopt a running process of another supervisor."""
-        told = self.slot.supervised
+        supervised = self.slot.supervised
         self.child = child
-        self.life = policy.adopted(told.spawned_ns, told.restarts)
+        self.life = policy.adopted(supervised.spawned_ns, supervised.restarts)
 
     @property
     def ready(self) -> bool:

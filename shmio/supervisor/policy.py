@@ -79,9 +79,9 @@ def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") 
     stuck = killed and (life.stuck or (life.killed and event is Event.ELAPSED))
     if state is State.HUNG and life.state is not State.HUNG:
         life = replace(life, hang=_hang(life, limits))
-    told = (note or life.note) if stuck else _note(life, state, note)
+    text = (note or life.note) if stuck else _note(life, state, note)
     crashes = _crashes(life, event, state, now_ns, limits)
-    life = replace(life, crashes=crashes, note=told, killed=killed, stuck=stuck)
+    life = replace(life, crashes=crashes, note=text, killed=killed, stuck=stuck)
     if action is Action.SPAWN:
         life = replace(life, starts=life.starts + 1, spawned_ns=now_ns, ready_ns=None)
     elif event is Event.READY:

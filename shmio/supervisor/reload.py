@@ -49,7 +49,7 @@ class InstanceChange:
         self._injections: list[str] = []
         segment.processes.require(len(self.changes.started) - len(self.changes.stopped))
         segment.reserve(self.changes.add)  # last, because it cannot be undone
-        self._told = [name for name in self.changes.kept if self._fleet.named(name).keep(self._jobs[name])]
+        self._signalled = [name for name in self.changes.kept if self._fleet.named(name).keep(self._jobs[name])]
 
     @property
     def _leaving(self) -> tuple[str, ...]:
@@ -119,7 +119,7 @@ class InstanceChange:
     def outcome(self) -> tuple[list[str], list[str]]:
         """Return what was done and which problems there are, one line each."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
-        done += [f"{name}: told to take its tokens and roles anew" for name in self._told]
+        done += [f"{name}: told to take its tokens and roles anew" for name in self._signalled]
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)
@@ -247,14 +247,14 @@ class Reloader:
             expected = isinstance(error, ShmioError)
             reason = str(error) if expected else f"the reload failed: {brief(error)}"
             log.error("nothing is changed: %s", reason, exc_info=None if expected else error)
-            self._tell(lambda answer: answer.error(reason))
+            self._answer_client(lambda answer: answer.error(reason))
             return
         self.plan, self.read_ns = plan, planning.read_ns
 
     def _follow(self, change: InstanceChange) -> None:
         if not change.step():
             if stuck := change.stuck:
-                self._tell(lambda answer: answer.error(f"{stuck}; the reload goes on as soon as it has ended"))
+                self._answer_client(lambda answer: answer.error(f"{stuck}; the reload goes on as soon as it has ended"))
             return
         done, problems = change.outcome()
         for line in done:
@@ -264,10 +264,10 @@ class Reloader:
         kept = list(change.changes.kept)
         log.info("the change is over", extra=fields(kept=len(kept)))
         self._change = None
-        told = {"warnings": list(change.plan.warnings), "done": done, "problems": problems, "kept": kept}
-        self._tell(lambda answer: answer.ok(**told))
+        result = {"warnings": list(change.plan.warnings), "done": done, "problems": problems, "kept": kept}
+        self._answer_client(lambda answer: answer.ok(**result))
 
-    def _tell(self, how: Callable[[Answer], None]) -> None:
+    def _answer_client(self, how: Callable[[Answer], None]) -> None:
         """Answer the client that asked for the reload, unless it was answered."""
         if self._answer is not None:
             self._notifier.ready()

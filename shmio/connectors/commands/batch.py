@@ -106,8 +106,8 @@ def ends(
 
     """
     lost = any(isinstance(outcome, Lost) for outcome in outcomes)
-    told = _WriteOutcomes((write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost)
-    found = [_end(told.about(item.write), error) for item in items]
+    known = _WriteOutcomes((write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost)
+    found = [_end(known.about(item.write), error) for item in items]
     for place, item in enumerate(items):
         if found[place][0] is not EventKind.WRITTEN:
             continue
@@ -124,16 +124,16 @@ class _WriteOutcomes:
     Confirmed writes may be left out unless some were lost.
     """
 
-    def __init__(self, told: Iterable[tuple[Write, str | Lost]]) -> None:
-        self._told = sorted(told, key=lambda pair: pair[0].offset)
-        self._starts = [write.offset for write, _ in self._told]
-        self._stops = list(accumulate((write.offset + len(write.data) for write, _ in self._told), max))
+    def __init__(self, known: Iterable[tuple[Write, str | Lost]]) -> None:
+        self._known = sorted(known, key=lambda pair: pair[0].offset)
+        self._starts = [write.offset for write, _ in self._known]
+        self._stops = list(accumulate((write.offset + len(write.data) for write, _ in self._known), max))
 
     def about(self, write: Write) -> list[str | Lost]:
         """Return the outcomes of all writes that share bits with this one."""
         first = bisect_right(self._stops, write.offset)
         last = bisect_left(self._starts, write.offset + len(write.data))
-        return [outcome for other, outcome in self._told[first:last] if _share_bits(write, other)]
+        return [outcome for other, outcome in self._known[first:last] if _share_bits(write, other)]
 
 
 def _end(outcomes: Sequence[str | Lost], error: str) -> End:

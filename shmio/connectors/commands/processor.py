@@ -240,11 +240,11 @@ class CommandProcessor:
             reason = self._injections.declared.overload
         if reason:
             count = max(1, len(command.writes))
-            told = Record(EventKind.REJECTED, reason, command.writer, command.id, 0, count)
+            record = Record(EventKind.REJECTED, reason, command.writer, command.id, 0, count)
             if write:
                 offset, mask, data = command.writes[0]
-                told = told._replace(offset=offset, mask=mask, size=len(data))
-            self._writer.event(told)
+                record = record._replace(offset=offset, mask=mask, size=len(data))
+            self._writer.event(record)
         if reason or not write:
             return True
         if not self._has_room(command):

@@ -164,8 +164,8 @@ class DeclaredInjections:
         with self._output.turn:
             layer.activation.state = State.LIFTED
             self._publisher.publish()
-            told = [*lost(layer, "the injection was lifted"), *self._publisher.computed(self._output.base)]
-            self._output.show([*told, layer_event(EventKind.LIFTED, layer, "lifted", command)])
+            records = [*lost(layer, "the injection was lifted"), *self._publisher.computed(self._output.base)]
+            self._output.show([*records, layer_event(EventKind.LIFTED, layer, "lifted", command)])
         return ""
 
     def follow(self) -> None:
@@ -279,9 +279,9 @@ class DeclaredInjections:
         over = {layer.id for layer in self._layers if _finished(layer)}
         if not over:
             return []
-        told = self._publisher.removed(lambda layer: layer.id in over, "over")
+        records = self._publisher.removed(lambda layer: layer.id in over, "over")
         self._settle()
-        return told
+        return records
 
     def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
         """Return the writes whose delay over ``/in`` ends before ``cycle`` writes."""

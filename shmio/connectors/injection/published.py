@@ -95,8 +95,8 @@ class LayerPublisher:
         These events precede ``end``, the event that caused the change.
         """
         for layer in layers:
-            told = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
-            yield from _parts(told, self.injections.inner_values(self.output.base, layer))
+            record = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
+            yield from _parts(record, self.injections.inner_values(self.output.base, layer))
 
     def computed(self, base: bytes) -> Iterator[Record]:
         """Yield the changed values that clients' layers over ``/out`` get from declared ones.
@@ -107,13 +107,13 @@ class LayerPublisher:
         for layer in self.injections.layers:
             inner = self.injections.inner(layer) if layer.given else []
             declared = any(isinstance(one, DeclaredLayer) and (one.cover & layer.cover).any() for one in inner)
-            told = self._computed.pop(layer.id, None)
-            if not declared and told is None:
+            before = self._computed.pop(layer.id, None)
+            if not declared and before is None:
                 continue
             writes = self.injections.inner_values(base, layer)
             if declared:
                 self._computed[layer.id] = writes
-            if writes != told:
+            if writes != before:
                 parts = list(_parts(Record(EventKind.DIVERTED, layer.name, injection=layer.id), writes))
                 yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
 
@@ -196,16 +196,16 @@ def pieces(
     return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number), writes)
 
 
-def _parts(told: Record, writes: Iterable[Write]) -> Iterator[Record]:
+def _parts(record: Record, writes: Iterable[Write]) -> Iterator[Record]:
     for offset, mask, data in writes:
         for start in range(0, len(data), EVENT_DATA_SIZE):
             part = data[start : start + EVENT_DATA_SIZE]
-            yield told._replace(offset=offset + start, mask=mask, size=len(part), data=part)
+            yield record._replace(offset=offset + start, mask=mask, size=len(part), data=part)
 
 
-def in_parts(told: Record, document: bytes) -> Iterator[Record]:
+def in_parts(record: Record, document: bytes) -> Iterator[Record]:
     """Yield the events that carry a JSON document in parts."""
-    yield from _parts(told, [Write(0, 0, document)])
+    yield from _parts(record, [Write(0, 0, document)])
 
 
 def layer_event(kind: EventKind, layer: Layer, text: str, command: Command | None = None) -> Record:

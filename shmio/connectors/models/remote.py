@@ -65,7 +65,7 @@ class Remote(Computed):
         self._options = options
         self.timeout_s = options.timeout_ms / 1000
         self._doubt = ""
-        self._told: ConnectedModel | None = None  # the model connected when begin() or step() last looked
+        self._last_model: ConnectedModel | None = None  # the model connected when begin() or step() last looked
         self._stopped = False
 
     @property
@@ -107,13 +107,13 @@ class Remote(Computed):
             ConnectorError: No model is connected.
 
         """
-        self._told = self._link.model()
-        self._connected(self._told)
+        self._last_model = self._link.model()
+        self._connected(self._last_model)
         return bytes(self._images.shown)
 
     def news(self) -> bool:
         """Return whether a model has connected, changed or left."""
-        return self._link.model() != self._told
+        return self._link.model() != self._last_model
 
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Command registers; outputs refuse."""
@@ -127,8 +127,8 @@ class Remote(Computed):
             ModelError: The model failed.
 
         """
-        self._told = self._link.model()
-        model = self._connected(self._told)
+        self._last_model = self._link.model()
+        model = self._connected(self._last_model)
         until_ns = time.monotonic_ns() + round(1e9 * self.timeout_s)
         images = self._images
         shown = images.with_given(images.shown)

@@ -117,7 +117,7 @@ class SteppedLoop:
             self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
             blocks=blocks, accepted=clock.nudge,
         )  # fmt: skip
-        self._condition = QualityLog(writer)
+        self._quality_log = QualityLog(writer)
         self._handled = 0  # the last step computed or skipped
         self._time_ns: int | None = None  # the instance's clock at what was computed last
         self._published = False
@@ -126,7 +126,7 @@ class SteppedLoop:
     @property
     def note(self) -> str:
         """Why quality is not good; empty if it is."""
-        return self._condition.note
+        return self._quality_log.note
 
     def run(self) -> None:
         """Compute until the clock says stop, then publish the end of the source."""
@@ -282,7 +282,7 @@ class SteppedLoop:
     def _publish(self, raw: bytes, asked_ns: int, doubt: str = "") -> None:
         quality = Quality.UNCERTAIN if doubt else Quality.GOOD
         cycle = self._writer.cycle
-        self._condition.tell(quality, doubt, cycle)
+        self._quality_log.update(quality, doubt, cycle)
         image = Image(raw, cycle, self._utc_ns(), quality, Provenance.SIMULATED, doubt, asked_ns)
         self._output.publish(image)
         self._published = True
@@ -290,7 +290,7 @@ class SteppedLoop:
 
     def _fail(self, cycle: int, reason: str) -> None:
         """Publish a bad frame: in virtual time always, in wall time for each new reason."""
-        new = self._condition.tell(Quality.BAD, reason, cycle)
+        new = self._quality_log.update(Quality.BAD, reason, cycle)
         if new or self._in_virtual_time:
             raw, source_ns = self._output.raw, self._output.source_ns
             self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, Provenance.SIMULATED, reason))

@@ -93,7 +93,7 @@ class Recording:
 
         None without frames.
         """
-        if self._dump.damage:  # then the index need not tell of all that can be read
+        if self._dump.damage:  # then the index may be incomplete
             first, last = next(self._dump.frames(name), None), self._dump.latest(name)
             return Span(first.time_ns, last.time_ns + last.block.period_ns) if first and last and last.block else None
         blocks = [block for block in self._dump.blocks if block.source == name and block.frames]

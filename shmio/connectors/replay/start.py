@@ -65,9 +65,9 @@ def _done_ns(block: Block, play: PlayState) -> int | None:
     last = block.latest()
     if last is None:
         return None
-    told = block.events.read(block.events.head())
-    behind = told is not None and told.frame == last.number and told.writer == NO_WRITER
-    return max(last.publish_ns, told.publish_ns if told is not None and behind else 0) - play.base_ns
+    event = block.events.read(block.events.head())
+    behind = event is not None and event.frame == last.number and event.writer == NO_WRITER
+    return max(last.publish_ns, event.publish_ns if event is not None and behind else 0) - play.base_ns
 
 
 def _is_of(source: Replay, play: PlayState) -> bool:
