@@ -13,9 +13,10 @@ TURN_S: Final = 10.0
 
 
 class LogRateLimit(logging.Filter):
-    """Limits the records of one kind, by their unformatted text, per turn. Safe for loggers in any thread.
+    """Limits the records of one kind per turn. Safe for loggers in any thread.
 
-    The first record of a later turn says how many were left out.
+    The unformatted text of a record is its kind. The first record of a later turn says how many
+    were left out.
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic, *, one_kind: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""The common part of all child processes: read the description, attach, take the role, log, beat, stop on request.
+"""The common part of all child processes: attach, take the role, log, beat, stop on request.
 
 A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))`` with ``run(worker)`` as
 its work. Exit status: 0 stopped as requested; 1 failed, start it again; 2 it can never work as
@@ -101,9 +101,9 @@ class Worker:
             call()
 
     def on_reread(self, call: Callable[[], object]) -> None:
-        """Call ``call`` in a thread of its own whenever a reload may have changed the worker's rules.
+        """Call ``call`` in a thread of its own after each reload of the worker's rules.
 
-        If that has happened since the process began, it is called at once.
+        If a reload has happened since the process began, it is called at once.
         """
         self._on_reread = call
         if self._rereads:

@@ -178,7 +178,7 @@ class SourceLoop:
         return _Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns())
 
     def _drain(self) -> None:
-        """Publish the images requested before a write, so that no older frame follows the write's event."""
+        """Publish the images requested before a write: no older frame may follow its event."""
         while self._under_way:
             self._collect(self._clock.now_ns() + round(self._connector.timeout_s * 1e9))
 

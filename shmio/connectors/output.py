@@ -83,7 +83,7 @@ class Output:
 
     @property
     def base(self) -> bytes:
-        """The image to which injections are applied: :attr:`raw`, or the recorded one in a replay."""
+        """The image to which injections are applied: :attr:`raw`, in a replay the recorded one."""
         return self.raw if self._last is None else self._last.base
 
     @property

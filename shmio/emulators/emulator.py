@@ -20,7 +20,7 @@ from shmio.layout.model import Layout
 
 
 class Emulator:
-    """Runs a program on a data block, and serves that block and others over S7. Start and stop it once.
+    """Runs a program on a data block, and serves that block and others over S7. Start it once.
 
     The program's cycles follow an absolute schedule, so they do not drift; late cycles are skipped
     and counted. Clients read and write between cycles, never within one. A client that stops the

@@ -41,7 +41,7 @@ _STRIDE = 0x9E37_79B9_7F4A_7C15
 
 
 class Counter:
-    """Fills the block with big-endian 64-bit words: the generation (cycles since start), mixed with the place.
+    """Fills the block with big-endian 64-bit words: the cycle number mixed with the place.
 
     A remainder of less than eight bytes holds the first bytes of its word and is checked too.
     """
@@ -59,9 +59,10 @@ class Counter:
 
 
 def generations(frame: bytes | bytearray | memoryview) -> list[int]:
-    """Return the distinct generations in a frame of a ``Counter``, ascending: one if it is of one cycle.
+    """Return the distinct cycle numbers in a frame of a ``Counter``, ascending.
 
-    A byte that no cycle wrote shows as a generation far from the others.
+    A frame of a single cycle has one. A byte that no cycle wrote shows as a number far from the
+    others.
     """
     size = len(frame)
     whole = size // 8 * 8

@@ -57,13 +57,15 @@ _SERVICE_ARGUMENT = 8  # where, in the parameters, a job for a service has the l
 _MODE_LIST = 0x0424
 _RUN, _STOP = 0x08, 0x04  # operating modes in that list
 _IS_IT_RUNNING = bytes((0, 1, 0, 0, READ))
-"""Sizes and parameters of a read without items: ``get_cpu_state()`` of python-snap7 3. It takes any acknowledgement for
-RUN, so in STOP it is refused."""
+"""Sizes and parameters of a read without items: ``get_cpu_state()`` of python-snap7 3.
+
+It takes any acknowledgement for RUN, so in STOP the read is refused.
+"""
 _JOIN_TIMEOUT_S = 10
 
 
 class S7Server(Server):
-    """Serves data blocks to S7 clients on one address. Start it once, stop it once; or use ``with``.
+    """Serves data blocks to S7 clients on one address. Start and stop it once; or use ``with``.
 
     ``lock`` is held during each job: whoever holds it changes blocks between jobs.
     """
@@ -101,9 +103,10 @@ class S7Server(Server):
         return Address(host, port)
 
     def start(self, tcp_port: int | None = None) -> int:
-        """Listen and serve in threads of its own; EndpointError, naming the address, if it cannot be had.
+        """Listen and serve in threads; EndpointError with the address if it is not available.
 
-        No other socket can listen there too: SO_REUSEADDR, unlike SO_REUSEPORT, only passes over closed connections.
+        No other socket can listen there too: SO_REUSEADDR, unlike SO_REUSEPORT, only ignores closed
+        connections.
         """
         if self.running or self._stopping.is_set():
             raise ShmioError("an S7 server is started once")
@@ -209,7 +212,7 @@ class S7Server(Server):
                 client_socket.close()
 
     def _serve(self, client: socket.socket, address: tuple[str, int]) -> None:
-        """Answer one client until it leaves or breaks the protocol, with a fixed amount of memory."""
+        """Answer one client until it leaves or breaks the protocol, with a fixed buffer."""
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEPALIVE.items():
@@ -270,7 +273,7 @@ class S7Server(Server):
         return None
 
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
-        """Return the operating mode as in the reference manual of S7-300/400: one record of 20 bytes.
+        """Return the operating mode as in the manual of S7-300/400: one record of 20 bytes.
 
         The previous mode, in the same byte, is left out: Snap7's ``Cli_GetPlcStatus`` takes RUN
         after STOP for STOP.
@@ -284,11 +287,12 @@ class S7Server(Server):
 
 
 def _is_served(job: bytes) -> bool:
-    """Whether a PLC control job is for one of ``_SERVICES``.
+    """Return whether a PLC control job is for one of ``_SERVICES``.
 
-    Its parameters, as Wireshark's S7 dissector has them: function and 7 bytes; two bytes of length and the argument;
-    one of length and the service's name. Python-snap7 looks for names anywhere in them and takes what has none for a
-    start; so no other name may be there.
+    Its parameters, named as in Wireshark's S7 dissector, are: the function and 7 bytes; two bytes
+    of length and the argument; one byte of length and the name of the service. Python-snap7 looks
+    for names anywhere in them, and takes a job without a name for a start. So no other name may be
+    there.
     """
     parameters = job[10 : 10 + int.from_bytes(job[6:8], "big")]
     argument_size = int.from_bytes(parameters[_SERVICE_ARGUMENT : _SERVICE_ARGUMENT + 2], "big")

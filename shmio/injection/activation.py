@@ -1,7 +1,8 @@
-"""Decides when a declared injection is active: between two times, while a condition holds, or for some time after.
+"""Decides when a declared injection is active.
 
-York's metamodel of tests calls these activation at a fixed time, on a condition, and on a condition
-for a limited time.
+It is active between two times, while a condition holds, or for some time after that. York's
+metamodel of tests calls these activation at a fixed time, on a condition, and on a condition for a
+limited time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Random numbers that depend only on a seed and their purpose, not on when or how often they are drawn.
+"""Random numbers that depend only on a seed and their purpose.
 
 They are counter-based: there is no state that an extra frame or a restarted process could shift.
 The mixing function is that of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number

@@ -92,7 +92,9 @@ class Expression(NamedTuple):
     """The registers that it reads, as written."""
 
     def holds(self, values: Sequence[Number | None], memory: Memory) -> bool:
-        """Return whether the expression is true; false if a value is unknown, or on a division by zero.
+        """Return whether the expression is true.
+
+        It is false if a value is unknown, or on a division by zero.
 
         Args:
             values: One value for each reference; None if it is unknown.

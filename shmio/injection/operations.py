@@ -151,7 +151,7 @@ class Freeze(Operation):
 
 
 class Drop(Operation):
-    """``drop`` over ``/out``: the values of a cycle are lost, and consumers keep those of the cycle before.
+    """``drop`` over ``/out``: a cycle's values are lost, and consumers keep the previous ones.
 
     The caller decides which cycles are lost, and reports the others by :meth:`passed`.
     """

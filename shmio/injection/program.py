@@ -1,4 +1,4 @@
-"""Compiles declarations: finds their registers, encodes their values and parses their conditions."""
+"""Compiles declarations: finds registers, encodes values and parses conditions."""
 
 from __future__ import annotations
 

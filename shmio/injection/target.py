@@ -27,7 +27,9 @@ class Target(NamedTuple):
 
 
 def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
-    """Return the target that several texts name together; patterns, structures and sources are allowed.
+    """Return the target that several texts name together.
+
+    Patterns, structures and whole sources are allowed.
 
     Raises:
         PathError: There is no such register, more than one source or direction, an overlap, or too

@@ -1,4 +1,4 @@
-"""Simulation models: small classes that compute a source's registers step by step. Pure; no I/O, no segment.
+"""Simulation models: small classes that compute a source's registers step by step. No I/O.
 
 A model declares what it reads and computes, and computes it in ``step``: see
 docs/how-to/write-a-model.md. ``ModelRunner`` runs it on the image of a block, ``ServedModel`` for

@@ -18,11 +18,11 @@ _OWN: Final = frozenset({"declarations", "random", "start", "step"})
 
 
 class Model(ABC):
-    """Base class of all models. ``ModelRunner`` creates, seeds and steps it; do not override ``__init__``.
+    """Base class of all models. ``ModelRunner`` creates, seeds and steps them.
 
-    What a model computes must depend only on its inputs, its parameters, its time and ``random``:
-    no clock, no other source of randomness, no thread. Then the same steps with the same inputs and
-    seed give the same bytes.
+    Do not override ``__init__``. What a model computes must depend only on its inputs, its
+    parameters, its time and ``random``: no clock, no other source of randomness, no thread. Then
+    the same steps with the same inputs and seed give the same bytes.
     """
 
     declarations: ClassVar[Mapping[str, Declaration]] = {}

@@ -19,7 +19,7 @@ def smooth(u: float) -> float:
 
 
 class Track:
-    """A cyclic path of several axes: from each key pose to the next, all axes start and stop together.
+    """A cyclic path of several axes. Between key poses all axes start and stop together.
 
     A slow sine on top of ``smooth``, the play of a servo loop, changes the value of an axis at rest
     too.

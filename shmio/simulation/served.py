@@ -45,9 +45,10 @@ class Source(Protocol):
 
 
 class ServedModel:
-    """Computes a source of connector "remote": :meth:`shmio.client.Client.simulate` takes ``step`` and ``start``.
+    """Computes a source of connector "remote".
 
-    It continues from what the source shows, like a model in a restarted process.
+    :meth:`shmio.client.Client.simulate` takes its ``step`` and ``start``. It continues from what
+    the source shows, like a model in a restarted process.
     """
 
     def __init__(self, model: type[Model], parameters: Mapping[str, object] = NOTHING, seed: int = 0) -> None:

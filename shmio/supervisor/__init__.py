@@ -1,5 +1,6 @@
 """Starts, watches, restarts and stops the processes of an instance.
 
-``states`` is the graph and ``policy`` the decisions, both without I/O; ``process`` spawns, ``main`` runs the loop,
-``control`` takes requests, ``status`` reads the segment for whoever asks.
+``states`` is the graph of states and ``policy`` makes the decisions, both without I/O. ``process``
+spawns, ``fleet`` carries decisions out, ``main`` runs the loop, ``reload`` applies changes, and
+``control`` takes requests.
 """

@@ -143,9 +143,10 @@ class Answer:
 
 
 class ControlServer:
-    """The supervisor's end of the control socket, driven by its selector; no call waits for a client.
+    """The supervisor's end of the control socket. No call waits for a client.
 
-    The data of its selector keys are functions without arguments.
+    The supervisor's selector drives it. The data of its selector keys are functions without
+    arguments.
     """
 
     def __init__(self, path: str, selector: selectors.BaseSelector, handle: Callable[[Request, Answer], None]) -> None:

@@ -116,7 +116,7 @@ class Supervisor:
         """What was found of an earlier supervisor and done about it, one line each."""
 
     def run(self) -> None:
-        """Start everything or take over what a dead supervisor left; return when all was stopped as asked.
+        """Start everything, or take over what a dead supervisor left; return after a stop.
 
         Raises:
             AlreadyRunningError: Another supervisor has the instance.

@@ -213,7 +213,7 @@ def start_failure(life: Life, limits: Limits) -> str | None:
 def start_over(
     processes: Ranked, qualities: Sequence[Quality | None], since_ns: int, now_ns: int, limits: Limits
 ) -> bool:
-    """Return whether the instance's start is over: all processes have run, and all sources have a quality.
+    """Return whether the instance's start is over: all processes ran, all sources have a quality.
 
     Args:
         processes: Rank and life of each process.

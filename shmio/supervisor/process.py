@@ -32,9 +32,13 @@ class ChildProcess:
 
     @classmethod
     def spawn(cls, module: str, description: bytes, log_file: Path) -> ChildProcess:
-        """Start ``python -m module`` with ``description`` as its standard input; OSError if that fails.
+        """Start ``python -m module`` with ``description`` on its standard input.
 
         What it prints, such as the traceback of a dying interpreter, is appended to its log file.
+
+        Raises:
+            OSError: The process cannot be started.
+
         """
         log = _open_log(log_file)
         try:
@@ -142,10 +146,10 @@ def describe_end(code: int | None) -> str:
 
 
 def child_environment() -> dict[str, str]:
-    """Return the environment of a child: it imports the supervisor's shmio and no modules of this folder.
+    """Return the environment of a child: it imports the supervisor's shmio.
 
-    Hence ``-P``, and the folder of a shmio that is not installed (never site-packages, which would
-    precede the standard library).
+    The current folder must not provide modules, hence ``-P``, and the folder of a shmio that is not
+    installed (never site-packages, which would precede the standard library).
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
     # gRPC prints a line for each bad handshake, which any client may send, into a log that would not even rotate then.

@@ -135,7 +135,7 @@ class InstanceChange:
 
 
 class _PendingPlan:
-    """Makes a plan in a thread: a large layout takes seconds to compile, and a file system may hang."""
+    """Makes a plan in a thread: compiling takes seconds, and a file system may hang."""
 
     def __init__(self, replan: Callable[[], Plan], limit_s: float) -> None:
         self.read_ns = time.time_ns()

@@ -166,7 +166,7 @@ def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[
 
 
 def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
-    """Yield the events about the ends of items, one for neighbours in a command that ended alike."""
+    """Yield the events about the ends of items; neighbours that ended alike share one."""
     both = zip(items, ends, strict=True)
     for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
         for first, count in _runs([item for item, _ in group]):

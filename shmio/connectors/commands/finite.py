@@ -41,7 +41,7 @@ class FiniteCheck:
                 self._starts[starts + at] = starts
 
     def refusal(self, writes: Iterable[Write]) -> str:
-        """Return why these writes are refused, naming the first such register; empty if they are fine.
+        """Return why these writes are refused, naming one register; empty if they are fine.
 
         A write of a part of a number must not set all exponent bits in that part either. So no
         sequence of writes can set them all.

@@ -1,7 +1,7 @@
-"""The declared injections of one source, from commands and from the configuration; advanced each cycle.
+"""The declared injections of one source, from commands and from the configuration.
 
-Nothing here blocks. The work per cycle is bounded by the limits on declarations, and is nothing
-without any.
+They advance once a cycle. Nothing here blocks. The work per cycle is bounded by the limits on
+declarations, and is nothing without any.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The layers of a source: which bits each one covers, and what becomes of images and writes. No I/O.
+"""The layers of a source: which bits each covers, and what becomes of images and writes. No I/O.
 
 Images on ``/out`` pass the layers from the innermost to the outermost, writes on ``/in`` the other
 way. The layer with the highest priority is outermost; of equal priorities the newest.
@@ -167,7 +167,7 @@ class LayerStack:
         return merge(self.seen(raw, inner).tobytes(), bits.tobytes(), [(0, self.size)] if inner else [])
 
     def onward(self, raw: bytes, layer: Layer, write: Write) -> list[tuple[Layer, list[Write]]]:
-        """Return the values of a write to a layer over ``/out`` that go to clients' layers further out.
+        """Return the parts of a write over ``/out`` that go to clients' layers further out.
 
         Consumers do not see these values. Layers in between have been applied to them.
         """

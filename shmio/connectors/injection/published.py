@@ -152,7 +152,7 @@ class LayerPublisher:
 def divert_command(
     output: Output, command: Command, above: Layer | None
 ) -> tuple[list[tuple[Item, Layer | None]], list[Item]]:
-    """Pass a command's items through the layers below ``above``, and publish what these take or change.
+    """Pass a command's items through the layers below ``above``, and publish what these change.
 
     Returns:
         The items with bits left for the device, each with the layer that sent or changed it last;

@@ -32,9 +32,10 @@ class Remote(Computed):
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """Its keys. ``outputs`` and ``inouts`` are patterns, at least one; ``timeout_ms`` is real time.
+        """Its keys. ``outputs`` and ``inouts`` are patterns; ``timeout_ms`` is real time.
 
-        The limit of ``timeout_ms`` is below the 10 s that a step waits for its sources.
+        At least one pattern is needed. The limit of ``timeout_ms`` is below the 10 s that a step
+        waits for its sources.
         """
 
         outputs: list[str] = []

@@ -166,7 +166,7 @@ ASK_TURN_NS: Final = 1_000_000
 Its end causes no wake-up.
 """
 BEHIND_NS: Final = 3_000_000_000
-"""What was due before a request is played first if that takes at most this long, else it is skipped."""
+"""A request of at most this age waits until what was due before it was played."""
 
 Asked = tuple[int, PlayheadRequest | None] | None
 

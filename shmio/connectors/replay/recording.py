@@ -126,7 +126,7 @@ class Recording:
         return span
 
     def moment(self, key: str, text: Moment) -> int:
-        """Return the position of a time: seconds from the begin, or a date and time, local without a zone.
+        """Return the position of seconds from the begin, or of a date and time (local by default).
 
         Raises:
             RecordingError: The text is neither.

@@ -1,9 +1,9 @@
 """The S7 connector: reads and writes a data block of a Siemens controller over ISO-on-TCP.
 
-``options`` is what the config can say. ``pdu`` and ``writepdu`` are the bytes; ``blockread``, ``blockwrite``, ``mode``
-and ``blocksize`` are what is asked, each with the answers it expects; ``window`` has them share the jobs that the
-controller granted; ``transport`` is the socket; ``client`` puts them together. ``explain`` has the words for what goes
-wrong.
+``options`` has the configuration keys and ``pdu`` encodes and parses PDUs. ``block_read``,
+``block_write``, ``block_size`` and ``mode`` are the operations, each with its requests and answers.
+``window`` shares the granted jobs among them, ``transport`` is the socket, and ``client`` combines
+all. ``explain`` has the texts of errors.
 """
 
 from shmio.connectors.s7.client import S7Client

@@ -1,4 +1,4 @@
-"""An S7 client that reads and writes one data block as fast as the controller answers. For one thread.
+"""An S7 client that reads and writes one data block at the controller's pace. For one thread.
 
 ``submit`` sends the requests of a read and returns; ``collect`` waits for the image. In between,
 more reads may be submitted, up to ``depth``, and writes may be sent at any time. ``window`` matches
@@ -85,7 +85,9 @@ class S7Client:
         return self._mode.doubt
 
     def connect(self) -> None:
-        """Open a session and query the operating mode, within ``timeout`` plus the host name lookup.
+        """Open a session and query the operating mode.
+
+        It takes at most ``timeout``, plus the host name lookup.
 
         Raises:
             ConnectorError: No controller answers, it does not speak S7, or it refuses the session.

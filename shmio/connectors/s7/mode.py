@@ -111,7 +111,7 @@ class ModeQuery:
 
 
 def parse_mode_answer(frame: memoryview) -> int | None:
-    """Return the operating mode in an answer to a read of SZL 0x0424; None if the controller has none.
+    """Return the operating mode in an answer to a read of SZL 0x0424; None without one.
 
     Raises:
         ConnectorError: The answer is malformed.
