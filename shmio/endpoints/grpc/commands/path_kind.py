@@ -1,4 +1,4 @@
-"""What a path names: a register, an array's element, or all below a structure."""
+"""Resolves a path to a register, an array's element, or all registers below a structure."""
 
 from __future__ import annotations
 

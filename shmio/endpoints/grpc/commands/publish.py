@@ -64,7 +64,7 @@ class _Destination(NamedTuple):
 
 
 class Request(NamedTuple):
-    """One value for one topic. ``read`` returns it by register path, or raises ValueRangeError."""
+    """A value for a topic. ``read`` returns it by register path, or raises ValueRangeError."""
 
     path: str
     read: Callable[[Shape], Mapping[str, object]]
@@ -75,7 +75,7 @@ Parse = Callable[[bytes], Request]
 
 
 class _PublishCall:
-    """One Publish call, with the number of its values in flight."""
+    """A Publish call, with the number of its values in flight."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -99,7 +99,7 @@ class _PublishCall:
 
 
 class _PublishedValue:
-    """One value of a Publish call."""
+    """A value of a Publish call."""
 
     def __init__(self, stream: _PublishCall) -> None:
         self._stream = stream

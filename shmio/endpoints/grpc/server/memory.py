@@ -17,7 +17,7 @@ AFTER_S: Final = 60.0
 
 
 def limit_arenas() -> None:
-    """Have all threads share few malloc arenas; to be called before threads start."""
+    """Limit the malloc arenas that all threads share. Call this before threads start."""
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(M_ARENA_MAX, ARENAS)
 

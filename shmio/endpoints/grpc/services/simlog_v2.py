@@ -66,7 +66,7 @@ class _Subscription:
 
 
 class Subscriber:
-    """One CreateSubscriber call with its topics."""
+    """A CreateSubscriber call with its topics."""
 
     def __init__(
         self, topics: Topics, shadows: Shadows, time_topics: TimeTopics, name: str, outbox: Outbox, holder: object

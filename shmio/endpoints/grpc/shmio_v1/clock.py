@@ -25,7 +25,7 @@ STEPS: Final = wire.StepsResponse.DESCRIPTOR.fields_by_name["steps"].number
 
 
 class StepsCall:
-    """One call of Steps: makes steps and collects their answers."""
+    """A Steps call: makes steps and collects their answers."""
 
     def __init__(self, stepper: Stepper, peer: str) -> None:
         """``peer``: the client, as gRPC names it."""

@@ -43,7 +43,7 @@ _KINDS: Final = {
 
 
 class DeclareCall:
-    """One call of Declare, with its injections."""
+    """A Declare call with its injections."""
 
     def __init__(self, feeds: Mapping[str, Feed], request: wire.DeclareRequest, turn: asyncio.Lock) -> None:
         """Check the declarations. ``turn``: a lock, so that calls are checked one after another.
@@ -183,7 +183,7 @@ def _check(
 
 
 class DeclaredInjection(InjectionFollower):
-    """One injection of a Declare call."""
+    """An injection of a Declare call."""
 
     def __init__(self, campaign: DeclareCall, source: str, commands: CommandClient) -> None:
         self.source = source

@@ -34,7 +34,7 @@ _PIECES: Final = wire.Update.DESCRIPTOR.fields_by_name["pieces"].number
 
 
 class InjectTarget(NamedTuple):
-    """What an injection is over: a source and direction, topics, and byte ranges."""
+    """The target of an injection: a source and direction, topics, and byte ranges."""
 
     place: SourceDirection
     topics: tuple[Topic, ...]
@@ -151,7 +151,7 @@ _ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].numb
 
 
 class InjectCall(InjectionFollower):
-    """One call of Inject, with its injection."""
+    """An Inject call with its injection."""
 
     def __init__(self, topics: Topics, selections: Selections, wake_ups: WakeUps, lay: wire.Lay) -> None:
         """Check the request. Raises PathError or ValueRangeError."""

@@ -150,7 +150,7 @@ class ShmioV1:
             subscription.close()
 
     async def deliver(self, step: Step) -> None:
-        """Have all streams send a step's changes and its marker, and wait until they have."""
+        """Send a step's changes and its marker on all streams, and wait until they are sent."""
         marks = {subscription.mark(step): subscription for subscription in self._open}
         if marks:
             _, late = await asyncio.wait(marks, timeout=PATIENCE_S)
@@ -158,7 +158,7 @@ class ShmioV1:
                 marks[mark].give_up()
 
     def release(self) -> None:
-        """Have all streams send values as they come, because time is real again."""
+        """Wake all streams to send values as they come, because time is real again."""
         for subscription in self._open:
             subscription.wake()
 

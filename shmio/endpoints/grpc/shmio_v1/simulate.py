@@ -154,7 +154,9 @@ class SimulateCalls:
             self._ring(simulation.block)
             taking = asyncio.get_running_loop().create_task(simulation.take(requests))
             taking.add_done_callback(simulation.taken)
-            taking.add_done_callback(partial(self._release, simulation))  # however long nobody reads that it is over
+            taking.add_done_callback(
+                partial(self._release, simulation)
+            )  # even if the client does not read the stream's end
             yield first
             async for message in simulation.messages():
                 yield message
@@ -218,7 +220,7 @@ class SimulateCalls:
 
 
 class SimulateCall:
-    """One call of Simulate: a model that computes a source."""
+    """A Simulate call: a model that computes a source."""
 
     def __init__(self, block: Block, segment: Segment, name: str, peer: str) -> None:
         self.block = block
@@ -230,7 +232,7 @@ class SimulateCall:
         self._joined = False
         self._over = False
         self._wake = asyncio.Event()
-        self._bell: WakeUp | None = None  # rings when the source has asked for a step
+        self._bell: WakeUp | None = None  # called when the source asks for a step
         self._handed = 0
         self._asked: ModelRequest | None = None  # the step that the model computes now
         self._given: DecodedImage | None = None

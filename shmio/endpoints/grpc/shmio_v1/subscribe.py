@@ -50,7 +50,7 @@ def check(request: wire.SubscribeRequest) -> None:
 
 
 class SubscribeCall:
-    """One call of Subscribe."""
+    """A Subscribe call: follows its blocks and collects their updates."""
 
     def __init__(
         self, selections: Selections, wake_ups: WakeUps, virtual_time: VirtualTime, request: wire.SubscribeRequest
@@ -109,7 +109,7 @@ class SubscribeCall:
         self._wake.set()
 
     def mark(self, step: Step) -> asyncio.Future[None]:
-        """Have a step's marker sent after its changes.
+        """Queue a step's marker, to be sent after the step's changes.
 
         Returns:
             A future that is done when the marker was sent or the call has ended. Before

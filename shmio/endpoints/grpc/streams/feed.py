@@ -106,7 +106,7 @@ class Feed:
         if not channel.listeners:
             del self._channels[subject]
             self._free.append(channel.slot)
-            if not self._outdated:  # once for all who leave together
+            if not self._outdated:  # once for all listeners that leave together
                 self._outdated = True
                 self._loop.call_soon(self._rebuild)
 
@@ -183,7 +183,7 @@ class Feed:
         self._owed.clear()
 
     def _turn_bad(self, frame: int) -> None:
-        """Have listeners from before ``frame`` drop their values: quality is bad from it on."""
+        """Drop the values of listeners from before ``frame``: quality is bad from it on."""
         for channel in self._channels.values():
             for listener in channel.listeners:
                 if listener.since < frame:

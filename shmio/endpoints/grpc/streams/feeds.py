@@ -12,7 +12,7 @@ from shmio.segment import Segment
 
 
 class Feeds(Mapping[str, Feed]):
-    """One feed for each block of a segment, by source name; for the event loop's thread."""
+    """The feeds of a segment's blocks, by source name; for the event loop's thread."""
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ EVENT_BOUND: Final = 2 * EVENT_SLOTS
 STEP_BOUND: Final = 16_384
 """Bound of the values of one step that wait in a stream; none of them may be dropped."""
 STEP_BOUND_BYTES: Final = 64 << 20
-"""The same in bytes."""
+"""Bound of the size of these values, in bytes."""
 
 Finish = Callable[[Any], bytes]
 
@@ -103,7 +103,7 @@ class Outbox:
         self._tell()
 
     def end(self) -> None:
-        """Have the reader end after the messages that wait."""
+        """End the reader after the messages that wait."""
         self._ended = True
         self._wake()
 
@@ -117,7 +117,7 @@ class Outbox:
             asyncio.get_running_loop().call_soon(self.on_failure)  # later: the caller may iterate over what it leaves
 
     def owe(self) -> None:
-        """Have :meth:`taken` wait for all messages that were added so far."""
+        """Make :meth:`taken` wait for all messages that were added so far."""
         self._owed = self._next
 
     @property

@@ -87,7 +87,7 @@ class WakeUps:
         self._stopped: list[WakeUp] = []
 
     def join(self, block: Block, ring: Callback, *, patient: bool = False) -> None:
-        """Have ``ring`` called when the block has a new frame or event, and periodically.
+        """Call ``ring`` when the block has a new frame or event, and periodically.
 
         ``patient``: the listener can wait while all others :meth:`rest`.
         """

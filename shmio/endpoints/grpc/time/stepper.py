@@ -323,7 +323,7 @@ class Stepper:
             return step
 
     async def _change(self, call: Callable[[], None], *, end: bool = False) -> None:
-        """Have the coordinator change how time moves."""
+        """Change how time moves, by a call of the coordinator."""
         async with self._moved():
             call()
             self.timeline.ended = end

@@ -100,11 +100,11 @@ class Timeline:
             (self._page.mute if owns else self._page.unmute)()
 
     def add_receiver(self, receiver: StepReceiver) -> None:
-        """Have each step delivered to ``receiver`` too."""
+        """Deliver each step to ``receiver`` too."""
         self._delivery.receivers.append(receiver)
 
     def watch(self, watcher: Callable[[TimeStatus], None]) -> None:
-        """Have ``watcher`` called with each step's status and with each change."""
+        """Call ``watcher`` with each step's status and with each change."""
         self._watchers.append(watcher)
 
     @property
@@ -149,7 +149,7 @@ class Timeline:
         self._tell(self._status(state), state)
 
     def _attend(self) -> None:
-        """Have steps wait for this process while it has open streams."""
+        """Make steps wait for this process while it has open streams."""
         if self._open_streams:
             self.look()  # delivers what is over; steps wait from the next one on
             self._awaited = True

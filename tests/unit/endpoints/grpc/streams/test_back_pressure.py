@@ -9,7 +9,7 @@ from contextlib import closing
 import pytest
 
 from shmio.endpoints.grpc.streams import back_pressure, outbox, wakeups
-from shmio.endpoints.grpc.streams.back_pressure import LossMonitor
+from shmio.endpoints.grpc.streams.back_pressure import BEHIND_S, WINDOW_S, LossMonitor
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import Outbox, StateLane
 from shmio.endpoints.grpc.streams.wakeups import WakeUps
@@ -297,3 +297,22 @@ def test_whoever_sees_two_frames_at_once_sees_that_nothing_came_between_them_for
         assert followed.told == [True, False, True]
 
     follow(segment, test, False)
+
+
+def far_behind(now_s: float) -> LossMonitor:
+    """Return a monitor of a client that loses most of its values."""
+    losses = LossMonitor()
+    losses.offer(now_s - WINDOW_S)
+    losses.lose(1)
+    losses.offer(now_s)
+    assert losses.behind
+    return losses
+
+
+def test_all_who_are_far_behind_are_tried_again_together() -> None:
+    together_s = 7 * BEHIND_S
+    monitors = [far_behind(together_s - before_s) for before_s in (0.9 * BEHIND_S, 0.4 * BEHIND_S, 0.001)]
+    for now_s, behind in ((together_s - 0.0005, True), (together_s, False)):
+        for losses in monitors:
+            losses.offer(now_s)
+        assert [losses.behind for losses in monitors] == [behind] * 3
