@@ -1,4 +1,4 @@
-"""The blocks of a dump: a source with one layout each."""
+"""The blocks of a dump: each is a source with one layout."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from shmio.segment import Frame
 
 @dataclass(slots=True, eq=False)
 class DumpBlock:
-    """One source with one layout. A reload that changes the layout begins another.
+    """A source with one layout. A reload that changes the layout starts another block.
 
-    ``section`` tells the blocks of one run apart, also across files; ``layout_hash`` is SHA-256 in hexadecimal digits.
+    ``section`` is unique among the blocks of a run, also across files. ``layout_hash`` is a SHA-256 in hex.
     """
 
     source: str
@@ -32,19 +32,19 @@ class DumpBlock:
     of: str = ""
     """Hash of the whole layout, if only some of its registers were recorded."""
     frames: int = 0
-    """How many were recorded; those that two files have are counted twice."""
+    """Number of recorded frames; those in two files count twice."""
     events: int = 0
     after: dict[str, int] = field(default_factory=dict)
-    """Numbers behind which the recording of its ``frames`` and ``events`` began."""
+    """Numbers before the first recorded frame and event, by ``frames`` and ``events``."""
     begin_ns: int = 0
     end_ns: int = 0
-    """Log times of its first and last frame or event."""
+    """Log times of the first and last frame or event."""
     first_ns: int = 0
     last_ns: int = 0
-    """Log times of its first and last frame."""
+    """Log times of the first and last frame."""
 
     def add(self, kind: str, track: Track) -> None:
-        """A file has these frames or events of it."""
+        """Add the frames or events of a file."""
         if kind == FRAME:
             self.frames += track.count
             self.first_ns = min(self.first_ns or track.first_ns, track.first_ns)

@@ -1,4 +1,4 @@
-"""What a recording says of its channels."""
+"""Descriptions of a recording's channels."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ _OWN: Final = {GAPS_TOPIC: GAP, STEPS_TOPIC: STEP, PROCESSES_TOPIC: PROCESS}
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Where the messages of one kind of one block are. ``layout``: the hash of its layout, in hexadecimal digits.
+    """The channel of a block's frames or events, or of gaps, steps or processes.
 
-    ``encoding`` is FRAME for frames of either version, and empty for messages that are not a recorder's.
+    ``layout``: hash of the block's layout, in hex. ``encoding`` is FRAME for frames of either version, and
+    empty for messages that no recorder wrote.
     """
 
     number: int
@@ -41,18 +42,18 @@ class Channel:
     block: int = 0
     section: int = 0
     after: int = 0
-    """Number behind which the recording of this kind began."""
+    """Number before the first recorded frame or event."""
     layout: str = ""
     period_ns: int = 0
     stale_ns: int = 0
     of: str = ""
-    """The hash of the whole layout, where only some of its registers were recorded."""
+    """Hash of the whole layout, if only some of its registers were recorded."""
     differences: bool = False
-    """Whether its frames are as FRAME_V2 has them."""
+    """Whether frames are encoded as FRAME_V2."""
 
 
 def describe(content: memoryview) -> Channel:
-    """The channel that a record describes; ValueError, KeyError, struct.error, McapError."""
+    """Decode a channel's record. ValueError, KeyError, struct.error, McapError: it is malformed."""
     found = ChannelRecord.read(stream(content))
     about = found.metadata
     if found.message_encoding in (FRAME, FRAME_V2, EVENT):

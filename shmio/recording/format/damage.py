@@ -1,4 +1,4 @@
-"""What of a recording cannot be read: from where to where, and what was recorded before and after it."""
+"""Damaged places of a recording."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from shmio.recording.format.records import Record
 
 
 class Damage(NamedTuple):
-    """Bytes ``first`` to ``last`` of a file, which are lost, or some of what is in them.
+    """Bytes ``first`` to ``last`` of a file, which cannot be read, or only in part.
 
-    ``after_ns``, ``before_ns``: log times of what is there before and after it; 0: nothing.
+    ``after_ns``, ``before_ns``: log times of the readable entries before and after them; 0: none.
     """
 
     first: int
@@ -22,7 +22,7 @@ class Damage(NamedTuple):
 
 
 class DamageLog:
-    """Collects damage on a walk from front to back. What lies between two whole chunks is told as one.
+    """Collects damage while a file is read from front to back. Between two intact chunks it is reported as one.
 
     Use: :meth:`end` before a chunk that can be read, :meth:`after` behind it, :meth:`end` at the end.
     """
@@ -33,7 +33,7 @@ class DamageLog:
         self._found: Damage | None = None
 
     def add(self, record: Record, why: object) -> None:
-        """A record that cannot be read as a whole."""
+        """Add a record that cannot be read completely."""
         first, last = record.at, record.at + record.size - 1
         if self._found is None:
             self._found = Damage(first, last, str(why), self._after_ns, 0)
@@ -41,11 +41,11 @@ class DamageLog:
             self._found = self._found._replace(last=last)
 
     def after(self, last_ns: int) -> None:
-        """It was read, up to this log time."""
+        """Note that a chunk was read, up to this log time."""
         self._after_ns = last_ns
 
     def end(self, before_ns: int = 0) -> None:
-        """Tell what is still to be told: nothing comes after it, or something of this log time."""
+        """Report pending damage. ``before_ns``: log time of the entry behind it; 0: there is none."""
         if self._found is not None:
             self._tell(self._found._replace(before_ns=before_ns))
             self._found = None

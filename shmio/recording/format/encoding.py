@@ -78,26 +78,26 @@ PROCESS_SCHEMA: Final = b"""{"type": "object", "properties": {"name": {"type": "
 
 
 class Reason(StrEnum):
-    """Why something is not in a recording."""
+    """Reason of a gap."""
 
     OVERTAKEN = "overtaken"
-    """The source had overwritten it before the recorder came to it."""
+    """The source overwrote the entries before the recorder read them."""
     NOT_RUNNING = "not running"
-    """It was overwritten while no recorder ran."""
+    """The entries were overwritten while no recorder ran."""
     ELSEWHERE = "elsewhere"
-    """The recorder before wrote to another folder: ``recorder.directory`` was changed, or its file taken away."""
+    """The previous recorder's file is not in this folder: it was moved, or ``recorder.directory`` has changed."""
     NO_ROOM = "no room"
-    """The disk was full or too slow, and so was the memory set aside for that."""
+    """The disk was full or too slow, and the buffer for that was full."""
     UNSURE = "unsure"
-    """It is in the file before, at whose fsync the disk failed: it may be lost."""
+    """The entries are in the previous file, whose fsync failed: they may be lost."""
     DAMAGED = "damaged"
-    """It was in a file that this one was made from, and could not be read there."""
+    """The entries could not be read in a file that this one was made from."""
 
 
 class Gap(msgspec.Struct, frozen=True):
-    """Frames or events of one block that are not in the recording: numbers ``first`` to ``last``, ``count`` in all.
+    """Frames or events of a block that are missing in the recording: numbers ``first`` to ``last``.
 
-    ``after_ns``, ``before_ns``: log times of what was recorded before and after it; 0 for nothing.
+    ``after_ns``, ``before_ns``: log times of the entries before and after them; 0: none.
     """
 
     source: str
@@ -112,9 +112,9 @@ class Gap(msgspec.Struct, frozen=True):
 
 
 class StepMark(msgspec.Struct, frozen=True):
-    """A step of virtual time is done: every frame of it comes before.
+    """The end of a step of virtual time; all its frames come before.
 
-    ``time_ns``: the instance's clock after it, which it has moved by ``dt_ns``.
+    ``time_ns``: the instance's clock after the step. ``dt_ns``: length of the step.
     """
 
     step: int
@@ -123,24 +123,24 @@ class StepMark(msgspec.Struct, frozen=True):
 
 
 class ProcessEvent(StrEnum):
-    """What has happened to a process of the instance."""
+    """Kind of a change of a process."""
 
     IS = "is"
-    """It runs where the recording, or what the recorder sees of it, begins."""
+    """The process runs at the start of the recording."""
     STARTED = "started"
-    """It works: its predecessor's end was told before."""
+    """The process runs now; the end of its predecessor was recorded before."""
     ENDED = "ended"
-    """It ended as told, or was told to begin anew."""
+    """The process ended, or was restarted, on request."""
     DIED = "died"
-    """It ended otherwise; it is started again."""
+    """The process ended unexpectedly; it is restarted."""
     GAVE_UP = "gave up"
-    """It cannot work as configured; it is not started again."""
+    """The process cannot work as configured; it is not restarted."""
     REMOVED = "removed"
-    """A reload has taken it out of the instance."""
+    """A reload has removed the process from the instance."""
 
 
 class ProcessChange(msgspec.Struct, frozen=True):
-    """What has happened to a process, and why; ``pid`` is 0 if it is not known, ``restarts`` counts its life long."""
+    """A change of a process, with the reason. ``pid`` is 0 if unknown."""
 
     name: str
     kind: str
@@ -151,7 +151,7 @@ class ProcessChange(msgspec.Struct, frozen=True):
 
 
 class BlockPosition(NamedTuple):
-    """Where a recording begins, or ends: behind these numbers of a block, which were recorded at ``log_ns``."""
+    """A position in a block: behind these numbers of a frame and an event, recorded at ``log_ns``."""
 
     frame: int = 0
     event: int = 0
@@ -159,7 +159,7 @@ class BlockPosition(NamedTuple):
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """One frame as it is in its ring."""
+    """Encode a frame, with all fields that it has in its ring."""
     reason = frame.reason.encode()
     head = _FRAME.pack(
         frame.number, frame.cycle, frame.publish_ns, frame.clock_ns, frame.source_ns, frame.event, frame.incarnation,
@@ -170,7 +170,7 @@ def encode_frame(frame: Frame) -> bytes:
 
 
 def decode_frame(data: bytes) -> Frame:
-    """The frame of a message; ValueError."""
+    """Decode a frame. ValueError: it is malformed."""
     if len(data) < _FRAME.size:
         raise ValueError("a frame is shorter than its header")
     number, cycle, publish_ns, clock_ns, source_ns, event, incarnation, *rest = _FRAME.unpack_from(data)
@@ -217,7 +217,7 @@ def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
 
 
 def encode_event(event: Event) -> bytes:
-    """One event as it is in its ring."""
+    """Encode an event, with all fields that it has in its ring."""
     text = event.text.encode()
     head = _EVENT.pack(
         event.number, event.frame, event.cycle, event.publish_ns, event.clock_ns, event.utc_ns, event.command,
@@ -228,7 +228,7 @@ def encode_event(event: Event) -> bytes:
 
 
 def decode_event(data: bytes) -> Event:
-    """The event of a message; ValueError."""
+    """Decode an event. ValueError: it is malformed."""
     if len(data) < _EVENT.size:
         raise ValueError("an event is shorter than its header")
     number, frame, cycle, publish_ns, clock_ns, utc_ns, command, injection, incarnation, *rest = _EVENT.unpack_from(
@@ -247,7 +247,7 @@ def decode_event(data: bytes) -> Event:
 
 
 def encode_json(item: Gap | StepMark | ProcessChange) -> bytes:
-    """A gap, a step's end or a change of a process as JSON."""
+    """Encode a gap, the end of a step or a change of a process as JSON."""
     return msgspec.json.encode(item)
 
 
@@ -258,7 +258,7 @@ def _decode_json(data: bytes, kind: type[T], name: str) -> T:
 
 
 def decode_gap(data: bytes) -> Gap:
-    """The gap of a message; ValueError."""
+    """Decode a gap. ValueError: it is malformed."""
     gap = _decode_json(data, Gap, "a gap")
     if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
         raise ValueError("a gap contradicts itself")
@@ -268,7 +268,7 @@ def decode_gap(data: bytes) -> Gap:
 
 
 def decode_step(data: bytes) -> StepMark:
-    """The step's end of a message; ValueError."""
+    """Decode the end of a step. ValueError: it is malformed."""
     mark = _decode_json(data, StepMark, "a step")
     if min(mark.step, mark.time_ns, mark.dt_ns) < 0:
         raise ValueError("a step is negative")
@@ -276,17 +276,17 @@ def decode_step(data: bytes) -> StepMark:
 
 
 def decode_process(data: bytes) -> ProcessChange:
-    """The change of a process of a message; ValueError."""
+    """Decode a change of a process. ValueError: it is malformed."""
     return _decode_json(data, ProcessChange, "a change of a process")
 
 
 def encode_position(place: BlockPosition) -> str:
-    """A place as text."""
+    """Encode a position as text."""
     return " ".join(map(str, place))
 
 
 def decode_position(text: str) -> BlockPosition:
-    """The place that a text tells; ValueError."""
+    """Decode a position. ValueError: it is malformed."""
     frame, event, log_ns = (int(number) for number in text.split(" ") if len(number) <= 20)
     if min(frame, event, log_ns) < 0:
         raise ValueError("a place is negative")

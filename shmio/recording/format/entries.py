@@ -1,4 +1,4 @@
-"""What a dump gives out: something recorded, when, and of which block."""
+"""The entries of a dump, with their times and blocks."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[D
 
 
 def latest_of(part: Part, within: Contents, source: str, time_ns: int) -> Entry[Frame] | None:
-    """The last frame of a source in a file that is not after a time."""
+    """Return the last frame of a source in a file at or before a time."""
     for messages in part.messages_before(within.frames(source), time_ns):
         for message in reversed(messages):
             if isinstance(message.item, Frame):

@@ -73,19 +73,19 @@ class Batch:
 
     @property
     def head(self) -> npt.NDArray[Any]:
-        """(n,) of :data:`HEAD`."""
+        """The frames' headers: :data:`HEAD`, shape (n,)."""
         return self.records[:, : HEAD.itemsize].view(HEAD)[:, 0]
 
     @property
     def images(self) -> _Bytes:
-        """(n, image size)."""
+        """The frames' images: bytes, shape (n, image size)."""
         return self.records[:, HEAD.itemsize :]
 
     def __len__(self) -> int:
         return len(self.time_ns)
 
     def __getitem__(self, some: slice) -> Batch:
-        """A part of them."""
+        """Return a slice of the frames."""
         return Batch(self.time_ns[some], self.records[some], self.reasons and self.reasons[some])
 
 

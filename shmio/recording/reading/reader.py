@@ -42,7 +42,7 @@ from shmio.recording.format.records import BROKEN, LOOK_BYTES, MAGIC, ONLY_BEGUN
 from shmio.segment import Event, Frame
 
 MAX_LAYOUT_BYTES: Final = 64 << 20
-"""All layouts of one file together."""
+"""Maximum size of all layouts of a file together."""
 MAX_ATTACHMENTS: Final = 10_000
 
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -61,7 +61,7 @@ _DECODERS: Final[dict[str, Callable[[bytes], Item]]] = {
 
 
 class Message(NamedTuple):
-    """One message: a frame, an event, a gap or the end of a step."""
+    """A message: a frame, event, gap, end of a step or change of a process."""
 
     channel: Channel
     log_ns: int
@@ -69,7 +69,7 @@ class Message(NamedTuple):
 
 
 class AttachmentEntry(NamedTuple):
-    """An attachment: where its data are, and the record that holds them."""
+    """An attachment: where its data is, and the record that holds it."""
 
     at: int
     size: int
@@ -77,24 +77,24 @@ class AttachmentEntry(NamedTuple):
 
 
 class Reader:
-    """One recording. A context manager; what is read of it is known from where :meth:`messages` has come to.
+    """Reads one recording. A context manager. Channels become known as :meth:`messages` reads on.
 
-    OSError, RecordingError: it cannot be opened, or is no recording.
+    Raises OSError or RecordingError if the file cannot be opened, or is not a recording.
     """
 
     def __init__(self, file: Path, *, own: bool = False, beat: Callable[[], object] = lambda: None) -> None:
-        """``own``: refuse what is no regular file of this user. ``beat`` is called now and then while it is read."""
+        """``own``: accept only a regular file of this user. ``beat`` is called regularly while reading."""
         self.file = file
         self.records = Records(file, own=own, beat=beat)
         self.about: dict[str, str] = {}
-        """What the recorder said of the instance."""
+        """The recorder's metadata about the instance."""
         self.places: dict[int, BlockPosition] = {}
-        """By section where the recorder before had come to, as far as it was known."""
+        """Positions, by section, where the previous recorder stopped, as far as known."""
         self.complete = False
-        """Whether all channels are known, from a walk through the whole file."""
+        """Whether all channels are known, because the whole file was read."""
         self.channels: dict[int, Channel] = {}
         self.summary_damage = ""
-        """The first record of the summary that was needed and could not be read."""
+        """Description of the first needed record of the summary that could not be read; empty: none."""
         self.attachments: dict[str, AttachmentEntry] = {}
         self._layouts: dict[str, Layout] = {}
         self._layout_bytes = 0
@@ -109,12 +109,18 @@ class Reader:
         damaged: Callable[[Damage], object] | None = None,
         records: Iterable[Record] | None = None,
     ) -> Iterator[Message]:
-        """Messages of the wanted channels whose log times are in this range, as the file has them.
+        """Yield the messages of some channels in a range of log times, in file order.
 
-        ``records``: only of these; None: of the whole file. Ends where the file does; then :attr:`Records.closed` and
-        :attr:`Records.damage` say how. What is damaged before that, in this range, ``damaged`` is told of where it is,
-        and the next whole chunk follows; without it RecordingError is raised. Chunks outside of the range are not
-        looked into.
+        It ends at the end of the file; :attr:`Records.closed` and :attr:`Records.damage` then say how the file
+        ends. Once all channels are known, chunks outside the range are not read.
+
+        Args:
+            wanted: Selects the channels.
+            from_ns: Start of the range.
+            to_ns: End of the range.
+            damaged: Called for damage within the range, before reading continues with the next intact chunk.
+                None: damage raises RecordingError.
+            records: The records to read; None: the whole file.
         """
 
         def tell(damage: Damage) -> None:
@@ -146,7 +152,7 @@ class Reader:
         from_ns: int,
         to_ns: int,
     ) -> Iterator[Message]:
-        """A chunk's messages; what cannot be decoded is passed over, and RecordingError raised at the end."""
+        """Yield a chunk's messages. Malformed ones are skipped, and RecordingError is raised at the end."""
         problem: RecordingError | None = None
         for channel, log_ns, data in contents:
             if from_ns <= log_ns <= to_ns and wanted(channel):
@@ -160,10 +166,12 @@ class Reader:
             raise problem
 
     def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
-        """(channel, log time, data) of a chunk's messages, those of others passed over; its channels are noted.
+        """Yield channel, log time and data of a chunk's messages, and note its channels.
 
-        Frames are as FRAME has them, of whichever version they are.
-        RecordingError: at once if the chunk as a whole is damaged; at its end if messages had to be left out.
+        Messages of other programs are skipped. Frames of either version are converted to FRAME.
+
+        Raises:
+            RecordingError: At once if the chunk is damaged; at the end if messages were left out.
         """
         return self._raw(self.records.chunk(record))
 
@@ -189,9 +197,10 @@ class Reader:
             raise RecordingError(f"{self.file}: messages of channel {unknown}, which is not described")
 
     def channel(self, number: int) -> Channel | None:
-        """A channel by its number; if the chunk that describes it is damaged, from the summary of a closed file.
+        """Return a channel by its number; None if it is unknown.
 
-        What is damaged there costs no other channel: :attr:`summary_damage`.
+        If the chunk that describes it is damaged, the summary of a closed file is used. Damage there is noted in
+        :attr:`summary_damage`, and does not affect other channels.
         """
         if number not in self.channels and not self._summarized:
             self._summarized = True
@@ -204,7 +213,7 @@ class Reader:
         return self.channels.get(number)
 
     def decode(self, channel: Channel, data: memoryview) -> Item:
-        """What a message holds; RecordingError."""
+        """Decode a message. RecordingError: it is malformed."""
         try:
             if channel.encoding == FRAME:
                 frame = decode_frame(bytes(data))
@@ -216,7 +225,7 @@ class Reader:
             raise RecordingError(f"{self.file}: {channel.topic}: {error}") from None
 
     def layout(self, channel: Channel) -> Layout:
-        """The layout of a channel's block, from its attachment; RecordingError."""
+        """Return the layout of a channel's block. RecordingError: its attachment is missing or damaged."""
         digest = channel.layout
         if digest not in self._layouts:
             entry = self.attachments.get(f"{_LAYOUTS}{digest}.json")
@@ -233,13 +242,13 @@ class Reader:
         return self._layouts[digest]
 
     def attachment(self, name: str, limit: int = MAX_LAYOUT_BYTES) -> bytes:
-        """The bytes of an attachment, whole by their CRC; RecordingError: damaged, or more than the limit."""
+        """Read an attachment, and check its CRC. RecordingError: it is damaged, or larger than the limit."""
         entry = self.attachments[name]
         self.records.check_crc(entry.record)
         return self.records.read(entry.at, entry.size, limit)
 
     def note(self, record: Record) -> None:
-        """Take in a record that is not of a chunk: what it tells of the instance, or an attachment. RecordingError."""
+        """Process a record outside chunks: metadata, header or attachment. RecordingError: it is damaged."""
         if record.opcode == BROKEN:
             raise RecordingError(
                 f"{self.file}: bytes {record.at} to {record.at + record.size - 1} make no sense: they were changed"
@@ -292,7 +301,7 @@ class Reader:
             raise RecordingError(f"{self.file}: channel {channel.number} is described twice, and differently")
 
     def require_ours(self) -> None:
-        """RecordingError if nothing in what was read is of a recorder of shmio."""
+        """Raise RecordingError if nothing that was read was written by a recorder of shmio."""
         if not self.about and not any(channel.encoding for channel in self.channels.values()):
             if not self.records.closed and (self._ours or self._is_cut_short()):
                 raise RecordingError(f"{self.file} {ONLY_BEGUN}")
