@@ -74,9 +74,8 @@ class Bridge:
         self._relays: dict[int, Relay] = {}
         self._cleared: dict[str, ClearedTopic] = {}
         there = targets(settings, own_socket(segment))
-        clean = msgspec.structs.replace(
-            settings, session_expiry_s=0
-        )  # this connection receives nothing that the broker could keep
+        # This connection receives nothing that the broker could keep.
+        clean = msgspec.structs.replace(settings, session_expiry_s=0)
         self.connection = BrokerConnection(
             ReconnectPolicy(clean, client_id, there),
             self._selector,
@@ -97,12 +96,10 @@ class Bridge:
         self.command_connection.connection.on_message = self._on_command
         self.connection.on_message = self._on_message
         self.connection.on_lost = self.outbox.lose
-        self.connection.is_ready = lambda: (
-            self.command_connection.ready
-        )  # who sees that we are online may send commands at once
+        # Clients that see that we are online may send commands at once.
+        self.connection.is_ready = lambda: self.command_connection.ready
         self._recalled: frozenset[str] | None = None
-        """Our topics when we asked the broker for retained messages of an earlier bridge. None: not
-        yet asked."""
+        """Our topics when we asked for an earlier bridge's retained messages; None: not yet asked."""
         self._behind: set[Feed] = set()
         self._rest_s = 0.0
         """How long :meth:`turn` may wait for events."""

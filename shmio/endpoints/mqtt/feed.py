@@ -253,7 +253,7 @@ class Feed:
         return [self.status, *self.channels, *([self.frames] if self.frames else [])]
 
     def _is_due(self, channel: ValueChannel | FramesChannel, frame: Frame) -> bool:
-        """Return whether to publish a change now; a rate-limited one is published later."""
+        """Return whether to publish a change now; else it is rate-limited, or within the deadband."""
         if not channel.limited:
             return True
         if channel in self._limited or channel.due_ns > self.block.now_ns():

@@ -68,9 +68,8 @@ def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
     ``accounts``: there are accounts; else the user name that a client gives is ignored.
     """
     lines = []
-    for name, allowed in sorted(
-        given.items(), key=lambda one: one[0] or ""
-    ):  # clients without an account come before all names
+    # Clients without an account come before all names.
+    for name, allowed in sorted(given.items(), key=lambda one: one[0] or ""):
         kind = "topic" if accounts else "pattern"
         if name is not None:
             lines.append(f"user {name}")

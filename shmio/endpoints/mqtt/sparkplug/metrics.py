@@ -144,8 +144,8 @@ class Metric:
 def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = False) -> Iterator[Register]:
     """Yield the registers, and the elements of arrays, to publish as metrics.
 
-    An array of numbers or bits is one metric; others are split up into their elements. ``single``:
-    split up all arrays into their elements.
+    An array of numbers or bits is one metric; others are split up into their elements.
+    ``single``: split up all arrays.
     """
     for register in registers:
         if register.dims and (single or register.element.base not in _DATATYPES):

@@ -63,7 +63,7 @@ class EdgeNode:
         *,
         datatypes: bool = True,
     ) -> None:
-        """``datatypes``: data messages have types, too, for hosts that do not know the births'."""
+        """``datatypes``: data messages have types, too, for hosts that do not keep the births."""
         self._group, self._node, self._datatypes = group, node, datatypes
         self._now_ms = now_ms
         self._sequence = 0
