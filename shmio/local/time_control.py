@@ -95,8 +95,7 @@ class Coordinator:
         with self._turn:
             if self._owns:
                 return
-            if not self._segment.shared.writable:
-                raise TimeError("this attachment only reads: attach with writable=True")
+            self._check_writable()
             self._take_lock(time.monotonic_ns() + round(patience_s * 1e9))
             self._owns = True
             state = self.read()
@@ -108,8 +107,7 @@ class Coordinator:
                 self._write(self._frozen(state))
                 state = self._frozen(state._replace(note="" if steps else take_over_note(self._participants())))
             self._write(state)
-            for slot in self._segment.processes:
-                self._segment.clock.slot_bell(slot.index).ring()
+            self._ring_all()
 
     def release(self, patience_s: float = 0.0) -> None:
         """Return to real time, which goes on from the present virtual time. Nobody owns it then.
@@ -124,8 +122,7 @@ class Coordinator:
             self.check_release()
             if not self._owns:
                 self._take_lock(time.monotonic_ns() + round(patience_s * 1e9))
-            clock = self._segment.clock
-            state = clock.told()
+            state = self._segment.clock.told()
             if state.virtual:
                 # Each source reads the page before it publishes, so no frame is later than this.
                 offset_ns = state.time_ns - (time.monotonic_ns() - self._segment.header.started_ns)
@@ -135,16 +132,12 @@ class Coordinator:
                         resumed_ns=state.time_ns, offset_ns=offset_ns,
                     )
                 )  # fmt: skip
-            self._segment.shared.unlock(self._lock_byte)
-            self._owns = False
-            clock.bell.ring()  # again, for a process that waits for the lock
-            for slot in self._segment.processes:
-                clock.slot_bell(slot.index).ring()
+            self._unlock()
+            self._ring_all()
 
     def check_release(self) -> None:
         """Raise TimeError if time cannot be released here, whoever owns it."""
-        if not self._segment.shared.writable:
-            raise TimeError("this attachment only reads: attach with writable=True")
+        self._check_writable()
         if self._segment.clock.stepped:
             raise TimeError(
                 f'the time of instance {self._segment.instance!r} is virtual from its start (clock = "stepped" in its '
@@ -237,9 +230,16 @@ class Coordinator:
             if not self._owns or self._segment.closed:
                 return
             self._write(self.read()._replace(owner=0, playing=False))
-            self._segment.shared.unlock(self._lock_byte)
-            self._owns = False
-            self._segment.clock.bell.ring()  # again, for a process that waits for the lock
+            self._unlock()
+
+    def _check_writable(self) -> None:
+        if not self._segment.shared.writable:
+            raise TimeError("this attachment only reads: attach with writable=True")
+
+    def _unlock(self) -> None:
+        self._segment.shared.unlock(self._lock_byte)
+        self._owns = False
+        self._segment.clock.bell.ring()  # again, for a process that waits for the lock
 
     def _write(self, state: ClockState) -> None:
         self._segment.clock.write(state)
@@ -278,6 +278,10 @@ class Coordinator:
             return 0
         frame = block.latest()
         return max(now_ns // block.period_ns + state.lead(block.period_ns), 0 if frame is None else frame.cycle)
+
+    def _ring_all(self) -> None:
+        for slot in self._segment.processes:
+            self._segment.clock.slot_bell(slot.index).ring()
 
     def _ring(self, sources: Sequence[str]) -> None:
         for slot in self._segment.processes:
