@@ -1,1 +1,1 @@
-"""From declarations to registers with offsets, by Siemens' placement rules."""
+"""Place declarations: give each register its offset, by Siemens' placement rules."""

@@ -1,4 +1,4 @@
-"""Placed structures to registers: structures are flattened, arrays of structures expanded."""
+"""Turn placed structures into registers: flatten structures and expand arrays of structures."""
 
 from __future__ import annotations
 
@@ -26,9 +26,14 @@ _BRACKETS = {"(": ")", "[": "]"}
 
 
 def member_values(text: str, group: Group) -> dict[str, str]:
-    """Return the text for each member that is given one, by name in lower case.
+    """Split a structure's initial value into the texts of its members.
 
-    Raises ValueRangeError: not such a list, an unknown member, or too many values.
+    Returns:
+        The text of each member that has one, by the member's name in lower case.
+
+    Raises:
+        ValueRangeError: The text is not such a list, names an unknown member, or has too many
+            values.
     """
     inner = _inside_structure(text)
     if inner is None:
@@ -48,7 +53,7 @@ def member_values(text: str, group: Group) -> dict[str, str]:
 
 
 def element_values(text: str, dims: Dims) -> list[str | None]:
-    """Return the text for each element of an array of structures, None where none is given."""
+    """Return the text for each element of an array of structures; None for an element without one."""
     shape = tuple(high - low + 1 for low, high in dims)
     values: list[str | None] = [None] * math.prod(shape)
     if text.strip().startswith("("):
@@ -79,7 +84,7 @@ def _repeated(items: list[str], most: int) -> Iterator[str]:
 
 
 def _inside_structure(text: str) -> str | None:
-    """Return what is between the brackets around a text, None if it has none."""
+    """Return the text inside the enclosing brackets, or None if there are none."""
     text = text.strip()
     return text[1:-1] if len(text) >= 2 and _BRACKETS.get(text[0]) == text[-1] else None
 
@@ -89,19 +94,20 @@ _DTL = "DTL#{YEAR:04}-{MONTH:02}-{DAY:02}-{HOUR:02}:{MINUTE:02}:{SECOND:02}.{NAN
 
 
 class InitialTexts:
-    """The initial value of one register as source text; of an array, element by element.
+    """Initial value of one register as source text, to which assignments are applied.
 
-    An array's text is kept sparse: an array may be large and its assignments few.
+    Only the assigned elements of an array are stored: an array may be large and its assignments
+    few.
     """
 
     def __init__(self, register: Register) -> None:
         self._register = register
         self._whole = register.initial
         self._elements: dict[int, str] = {}
-        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # of the DTLs assigned member by member
+        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # DTLs that are assigned by member
 
     def set(self, index: tuple[int, ...], text: str) -> None:
-        """Assign one element, or the whole with ``()``."""
+        """Assign one element, or the whole register if ``index`` is empty."""
         self._parts.pop(index, None)
         if not index:
             self._whole = text
@@ -111,7 +117,7 @@ class InitialTexts:
         self._elements[self._flat(index)] = text
 
     def set_part(self, index: tuple[int, ...], part: str, text: str) -> bool:
-        """Assign one member of a DTL; return whether the text is a whole number, as all its members are."""
+        """Assign one member of a DTL; return False if the text is not a whole number."""
         digits = text.replace("_", "")
         if not digits.isdecimal() or not digits.isascii() or len(digits) > 9:
             return False
@@ -148,7 +154,7 @@ class InitialTexts:
         return f"[{', '.join(text if n == 1 else f'{n}({text})' for text, n in merged)}]"
 
     def _fill(self, runs: list[tuple[str, int]], assigned: list[int], start: int, stop: int, text: str) -> None:
-        """Append the elements from ``start`` to ``stop``: ``text`` where nothing is assigned."""
+        """Append the elements from ``start`` to ``stop``; unassigned ones get ``text``."""
         for flat in assigned[bisect_left(assigned, start) : bisect_left(assigned, stop)]:
             if flat > start:
                 runs.append((text, flat - start))
@@ -167,11 +173,15 @@ def registers(group: Group, report: Report) -> Iterator[Register]:
 
 
 class _Expansion:
-    """Flattens structures. Values given to a structure as a whole come down in layers, the outermost first."""
+    """Flattens structures.
+
+    A structure's initial value is split and passed to its members as a layer; the outermost layer
+    that names a member wins.
+    """
 
     def __init__(self, report: Report) -> None:
         self._report = report
-        # Each text is read once, however often its structure is expanded.
+        # Caches: each text is parsed once, however often its structure is expanded.
         self._split: dict[tuple[int, str], dict[str, str]] = {}
         self._listed: dict[tuple[int, str], list[str | None]] = {}
         self._told: set[Position] = set()
@@ -244,9 +254,9 @@ def assign(
     constants: Constants,
     report: Report,
 ) -> tuple[Register, ...]:
-    """Return the registers with the values assigned after BEGIN as their initial ones.
+    """Return the registers with the values assigned after BEGIN as their initial values.
 
-    Elements of one array are gathered into one array literal.
+    Assignments to elements of one array are joined into one array literal.
     """
     if not assignments:
         return tuple(found)
@@ -277,12 +287,15 @@ def assign(
 @dataclass(frozen=True, slots=True)
 class _Target:
     path: str
-    index: tuple[int, ...] = ()  # of an array's element
-    part: str = ""  # of a DTL, which TIA Portal also assigns member by member
+    index: tuple[int, ...] = ()  # of an array element
+    part: str = ""  # member of a DTL: TIA Portal may assign a DTL member by member
 
 
 def _target(group: Group, assignment: Assignment) -> _Target | str | None:
-    """Return the register that is assigned, or what is wrong; None: the members of its type are not known."""
+    """Return the register that is assigned, or the text of an error.
+
+    Returns None for a register inside a structure whose members are unknown.
+    """
     path = ""
     element: tuple[int, ...] = ()
     place: Leaf | Group | Repeat = group

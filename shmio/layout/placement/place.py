@@ -1,13 +1,14 @@
-"""Placement: declarations to offsets, by Siemens' rules for blocks with standard access.
+"""Compute the offsets of declarations, by Siemens' rules for blocks with standard access.
 
 - BOOL takes the next bit; anything else begins at the next whole byte.
 - One-byte types take the next byte; all wider types, strings included, begin at an even byte.
 - Arrays and structures begin at an even byte and are padded to an even length.
-- In an instance of a function block, so does each section: inputs, outputs, in-outs, static members. An in-out
-  of a structured type is a POINTER to what the caller gave.
+- In an instance of a function block, so does each section: inputs, outputs, in-outs, static
+  members. An in-out of a structured type is a POINTER to the caller's argument.
 
-A type is placed once, however often it is used; how much its expansion would need is known, and bounded, before
-anything is expanded. ``docs/reference/layout-rules.md`` gives the rules with their evidence.
+Each type is placed once, however often it is used. The size of the expansion is computed, and
+limited, before anything is expanded. ``docs/reference/layout-rules.md`` gives the rules with their
+evidence.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, --type-bytes "{
 
 
 class Placer:
-    """Places structures; types of users are looked up by name and placed at first use."""
+    """Places structures; looks up user types by name and places each at its first use."""
 
     def __init__(
         self,
@@ -50,18 +51,19 @@ class Placer:
         self._global = self._constants = constants
         self._report = report
         self.placed: dict[str, Group | None] = {}
-        """What became of each type, by its name in lower case."""
-        self._open: dict[str, str] = {}  # the types that are being placed, by key: their names
+        """Placed types by name in lower case; None for a type with errors."""
+        self._open: dict[str, str] = {}  # names of the types that are being placed, by key
 
     def block(self, struct: Struct, constants: Constants) -> Group | None:
-        """Place the body of a block that has constants of its own."""
+        """Place the body of a block, with the constants that are visible in it."""
         self._constants = constants
         return self.struct(struct)
 
     def struct(self, struct: Struct, depth: int = 0) -> Group | None:
-        """Place a structure; None if anything in it is wrong, which then has been reported.
+        """Place a structure; report errors, and return None if there are any.
 
-        Only the body of a block may have no members: the parser has refused any other.
+        Only the body of a block may have no members. For any other structure the parser has
+        already reported that.
         """
         if depth and not struct.members:
             return None
@@ -100,7 +102,7 @@ class Placer:
         return Group(fields, round_up(round_up(bits, 8) // 8, 2), cost, height) if good else None
 
     def named(self, name: Named) -> ElementType | Group | None:
-        """Look a type up: an elementary one, else a user's; None if it cannot be had, which is reported."""
+        """Look up a type, elementary or defined by the user; report an error and return None."""
         try:
             return self._named(name, 0)
         except BoundFault as fault:
@@ -135,7 +137,7 @@ class Placer:
             self._report.add(fault)
         if declaration.faults and declaration.is_function_block:
             return None
-        if not declaration.body.members:  # a function block that keeps nothing
+        if not declaration.body.members:  # a function block without stored members
             return Group({}, 0, Cost(), 0)
         outside, self._constants = self._constants, Constants(declaration.constants, self._global)
         self._open[key] = declaration.name
@@ -224,7 +226,7 @@ class Placer:
 
 
 def opaque(name: Named, size: int) -> Group:
-    """A structure of which the size alone is known."""
+    """Return a structure of which only the size is known."""
     at = name.position
     member = Member("bytes", Array(((0, size - 1),), Named("BYTE", False, at), at), "", None, at)
     leaf = Leaf(BYTE, ((0, size - 1),), size)
@@ -233,7 +235,7 @@ def opaque(name: Named, size: int) -> Group:
 
 
 def _is_structured(type_: Type) -> bool:
-    """Whether an in-out of this type is handed over as a pointer."""
+    """Return whether an in-out of this type is passed as a pointer."""
     if not isinstance(type_, Named) or type_.quoted or type_.length is not None:
         return True
     element = element_type(type_.name)
@@ -241,7 +243,7 @@ def _is_structured(type_: Type) -> bool:
 
 
 def _takes_no_room(member: Member) -> bool:
-    """Whether it is a VARIANT parameter: a reference that an instance does not hold."""
+    """Return whether the member is a VARIANT parameter, which an instance does not store."""
     type_ = member.type
     return (
         member.section in (Section.INPUT, Section.IN_OUT)

@@ -1,4 +1,4 @@
-"""What placement makes of declarations: structures with the offset of each member, not yet expanded."""
+"""Placed declarations: structures with the offset of each member, before expansion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shmio.layout.types import ElementType
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """A register: an elementary type or an array of one. ``size`` is unpadded, in bytes."""
+    """A register: an elementary type or an array of one; ``size`` in bytes, without padding."""
 
     element: ElementType
     dims: Dims
@@ -26,7 +26,7 @@ class Leaf:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What an expansion needs: registers, their elements, the characters of their texts, and structures."""
+    """Size of an expansion: registers, their elements, characters of their texts, structures."""
 
     registers: int = 0
     elements: int = 0
@@ -34,7 +34,10 @@ class Cost:
     structures: int = 0
 
     def plus(self, inner: Cost, times: int, text_each: int) -> Cost:
-        """Return the cost with ``times`` the inner one added, each register with so many characters more."""
+        """Return this cost plus ``times`` the inner one.
+
+        ``text_each`` is the number of characters by which each inner register's path gets longer.
+        """
         return Cost(
             self.registers + times * inner.registers,
             self.elements + times * inner.elements,
@@ -45,9 +48,9 @@ class Cost:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A placed structure. ``size`` is in bytes, even. ``opaque``: what its members are is not known."""
+    """A placed structure; ``size`` in bytes, always even. ``opaque``: its members are unknown."""
 
-    fields: dict[str, Field]  # by name in lower case: Siemens' names differ by more than case
+    fields: dict[str, Field]  # by name in lower case: S7 names are case-insensitive
     size: int
     cost: Cost
     height: int
@@ -75,7 +78,11 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """What a member takes: bytes with padding, alignment in bytes, what its expansion needs, levels below it."""
+    """Space that a member takes.
+
+    ``size`` (with padding) and ``align`` are in bytes, ``cost`` is the size of its expansion, and
+    ``height`` the number of structure levels below it.
+    """
 
     size: int
     align: int
@@ -84,7 +91,7 @@ class Extent:
 
 
 def extent_of(placed: Leaf | Group | Repeat) -> Extent:
-    """Return what a placed type takes as a member."""
+    """Return the space that a placed type takes as a member."""
     if isinstance(placed, Leaf):
         cost = Cost(1, math.prod(placed.shape))
         if placed.dims:
@@ -99,5 +106,5 @@ def extent_of(placed: Leaf | Group | Repeat) -> Extent:
 
 
 def round_up(value: int, step: int) -> int:
-    """Return the next multiple of ``step``."""
+    """Return the value rounded up to a multiple of ``step``."""
     return -(-value // step) * step

@@ -1,15 +1,17 @@
-"""The system's own types, as far as their placement has a public source.
+"""System data types whose layout has a public source.
 
-They are declared here as a user would declare them, so the rules of placement give their addresses; for each,
-these agree with the length or the addresses that its source states. ``docs/reference/layout-rules.md`` lists them.
+They are declared here as a user would declare them, and the placement rules give their addresses.
+For each type these agree with the length or the addresses that its source states.
+``docs/reference/layout-rules.md`` lists them.
 
 - ErrorStruct, CREF, NREF: Siemens' help on GET_ERROR has the members, the one on system data types the lengths.
 - TCON_Param, TADDR_Param: Siemens' help on open user communication has every byte.
 - SSL_HEADER: Siemens' help on RDSYSST, length in the one on system data types.
-- SFB 0 to 5: the interfaces as the simulator awlsim has them; its tests state the addresses of SFB 0.
+- SFB 0 to 5: the simulator awlsim has the interfaces; its tests state the addresses of SFB 0.
 
-Of IEC_TIMER and its like the lengths are public, but not where in them the members are: they are bytes without meaning.
-The rest is refused, unless the configuration has its size.
+For IEC_TIMER and similar types only the length is public, not the places of the members: they
+become bytes without meaning. Any other system type is an error unless the configuration gives its
+size.
 """
 
 from __future__ import annotations
@@ -97,10 +99,10 @@ def declarations() -> Mapping[str, TypeDeclaration]:
 
 
 def length(name: str) -> int:
-    """Return the bytes of a type whose members are not public; 0 if it is none of these."""
+    """Return the size in bytes of a type whose members are not public; 0 for any other type."""
     return _LENGTHS.get(name.upper(), 0)
 
 
 def refusal(name: str) -> str:
-    """Return why a type of this name cannot be placed; empty if it is none of the system's."""
+    """Return why a system type cannot be placed; empty if the name is not a system type."""
     return _REFUSED.get(name.upper(), "")

@@ -1,4 +1,4 @@
-"""The registers of a tag table: from entries to places in a block, one after the other."""
+"""Place the registers of a tag table in a block, one after the other."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class _Tag(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Table(msgspec.Struct, forbid_unknown_fields=True):
-    """A tag table as its file has it."""
+    """Content of a tag table's file."""
 
     registers: Annotated[dict[str, object], msgspec.Meta(min_length=1, max_length=MAX_REGISTERS)]
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)] = ""
@@ -57,16 +57,32 @@ class Table(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder = "little") -> Layout:
-    """Place registers that a program declares, each as a table has it: its type, or a dict of the keys of one.
+    """Place registers that a program declares.
 
-    LayoutError: ``diagnostics`` has everything found, each beginning with the path.
+    Args:
+        name: Name of the block.
+        registers: For each path what a tag table would have: the type, or a dict with the keys of
+            a table entry.
+        byte_order: Byte order of the values.
+
+    Returns:
+        The layout.
+
+    Raises:
+        LayoutError: A register is wrong; each of the ``diagnostics`` begins with the path.
     """
     places = {path: place for place, path in enumerate(registers, 1)}
     return place_table(name, Table(dict(registers), name, byte_order), Report([name]), places.__getitem__)
 
 
 def place_table(file: str, table: Table, report: Report, line_of: Callable[[str], int]) -> Layout:
-    """Place a table's registers; ``line_of`` a key, for diagnostics. LayoutError."""
+    """Place a table's registers.
+
+    ``line_of`` returns the line of a key, for diagnostics.
+
+    Raises:
+        LayoutError: A register is wrong; ``diagnostics`` has everything found.
+    """
     placer = _Placer(file, report, line_of)
     with suppress(TooManyErrors):
         placer.place(table)
@@ -82,12 +98,16 @@ class _Placer:
         self._report = report
         self._line_of = line_of
         self._registers: dict[str, Register] = {}
-        self._keys: dict[str, str] = {}  # of the paths, as the file has them
+        self._keys: dict[str, str] = {}  # keys as the file has them, by path
         self._end = 0
         self._elements = 0
 
     def place(self, table: Table) -> None:
-        """Place all registers; TooManyErrors."""
+        """Place all registers and report errors.
+
+        Raises:
+            TooManyErrors: The report is full.
+        """
         for key, given in table.registers.items():
             try:
                 self._place_all(key, _tag(key, given))
@@ -109,7 +129,7 @@ class _Placer:
             self._report.add(Diagnostic(self._file, 1, 1, f"expected at most {most}, found more"))
 
     def layout(self, table: Table) -> Layout:
-        """What came of it."""
+        """Return the layout of the placed registers."""
         name = table.name or PurePath(self._file).stem
         return Layout(name, None, self._end, False, tuple(self._registers.values()), table.byte_order)
 
@@ -156,7 +176,7 @@ class _Placer:
 
 
 def _tag(key: str, given: object) -> _Tag:
-    """One register's entry; ValueError."""
+    """Return the entry of one register; ValueError if it is wrong."""
     if isinstance(given, str):
         return _Tag(given)
     if isinstance(given, dict) and (others := given.keys() - set(_Tag.__struct_fields__)):
@@ -181,7 +201,7 @@ def _is_nested(initial: object) -> bool:
 
 
 def _check_length(initial: str, shape: tuple[int, ...]) -> None:
-    """Refuse more values than the array has elements; ValueError."""
+    """Raise ValueError if there are more values than the array has elements."""
     if shape:
         runs = split_array(initial, (shape[0] + 1, *shape[1:]))
         if runs and runs[-1][0] + runs[-1][1] > math.prod(shape):
@@ -189,7 +209,7 @@ def _check_length(initial: str, shape: tuple[int, ...]) -> None:
 
 
 def _type(text: str) -> tuple[ElementType, Dims]:
-    """Type of the elements and bounds; ValueError."""
+    """Return the element type and the array bounds; ValueError if the text is no type."""
     dims: list[tuple[int, int]] = []
     if array := _ARRAY.fullmatch(text.strip()):
         for part in array[1].split(","):
@@ -216,7 +236,7 @@ def _align(element: ElementType) -> int:
 
 
 def _literal(value: _Scalar | list[_Scalar], element: ElementType) -> str:
-    """An initial value as S7 has it. Text for a number or a time is such a literal already."""
+    """Return an initial value as an S7 literal; text for a number or a time already is one."""
     if isinstance(value, list):
         return f"[{', '.join(_literal(item, element) for item in value)}]"
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""Tag tables to layouts: the registers of a source that has no data block, as a TOML file names them.
+"""Compile tag tables: TOML files that name the registers of a source without a data block.
 
 ::
 
@@ -9,9 +9,10 @@
     "lamps" = { type = "ARRAY[1..8] OF BOOL", initial = [true] }
     "safetyzones/Z1" = "SafetyZone"
 
-Keys are paths as in topics, types those of S7, or structures of known shape, whose members become registers. Values lie
-in the order of the file, each at a multiple of its size, in the byte order ``byte_order`` (default: little, as this
-machine's); a single BOOL has a byte of its own. Initial values of an array are one list, in the order of its elements.
+Keys are paths as in topics. Types are those of S7, or structures of known shape, whose members
+become registers. Values lie in the order of the file, each at a multiple of its size, in the byte
+order ``byte_order`` (default: little, as on this machine); a single BOOL takes a byte of its own.
+The initial values of an array are one list, in the order of its elements.
 """
 
 from __future__ import annotations
@@ -42,7 +43,11 @@ _KEY = re.compile(rf"^[ \t]*(?:(?:{_TABLE})?{_NAME}[.=]|\[[ \t]*{_TABLE}{_NAME}[
 
 
 def compile_tags(file: str, data: bytes, report: Report) -> Layout:
-    """Compile one tag table; warnings are left in the report. LayoutError: ``diagnostics`` has everything found."""
+    """Compile one tag table; warnings stay in the report.
+
+    Raises:
+        LayoutError: The table is wrong; ``diagnostics`` has everything found.
+    """
     table = _read(file, data, report)
     report.raise_errors()
     lines = _Lines(data.decode())
@@ -50,7 +55,7 @@ def compile_tags(file: str, data: bytes, report: Report) -> Layout:
 
 
 def _read(file: str, data: bytes, report: Report) -> Table:
-    """The file as it stands; an empty table after an error."""
+    """Return the file's content; after an error report it and return an empty table."""
     if len(data) > MAX_SOURCE_BYTES:
         report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
         return Table({})
@@ -73,7 +78,7 @@ def _read(file: str, data: bytes, report: Report) -> Table:
 
 
 def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
-    """What tomllib refuses, at its place."""
+    """Return tomllib's error as a diagnostic with its place."""
     where = _PLACE.search(str(error))
     if where is None:
         number = _LONG_NUMBER.search(text)
@@ -84,19 +89,19 @@ def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
         hint = "; a path is written in quotes" if str(error).startswith("Expected '='") else ""
         return Diagnostic(file, line, column, f"{_PLACE.sub('', explain_toml(error, text))}{hint}")
     while line > 1 and not _KEY.match(lines[line - 1]):
-        line -= 1  # found at the value's end
+        line -= 1  # tomllib gives the end of the value
     key = shorten(lines[line - 1].partition("=")[0].strip())
     return Diagnostic(file, line, 1, f"{key}: it is there twice; a path with a dot is written in quotes")
 
 
 class _Lines:
-    """Where each key of a table stands; looked for when it is asked."""
+    """Finds the line of a key of a table on demand."""
 
     def __init__(self, text: str) -> None:
         self._text = text
 
     def line_of(self, key: str) -> int:
-        """The line of a key, as far as a search finds it, else 1; of several places the last one."""
+        """Return the last line on which a search finds the key, or 1."""
         return self._found.get(key, 1)
 
     @cached_property
@@ -108,7 +113,7 @@ class _Lines:
             counted = match.start()
             key = match[1] or match[2]
             if key.startswith('"') and "\\" in key:
-                with suppress(ValueError):  # in a text of several lines it may be no key at all
+                with suppress(ValueError):  # the line may be part of a multi-line string
                     lines |= dict.fromkeys(tomllib.loads(f"{key} = 0"), line)
             else:
                 lines[key[1:-1] if key[0] in "\"'" else key] = line

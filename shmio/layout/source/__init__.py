@@ -1,1 +1,1 @@
-"""From source text to declarations: lexer, parser, constants."""
+"""Read source text into declarations: lexer, parser, constants."""

@@ -1,4 +1,4 @@
-"""Constants that the sources give, and what bounds and initial values come to with them."""
+"""Constants of the sources, and the bounds and initial values that use them."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from shmio.layout.model import Diagnostic
 from shmio.layout.source.expression import HIGHEST, LOWEST
 from shmio.layout.source.syntax import Bound, Constant, ConstantDeclaration, Sum
 
-MAX_DEFINITIONS = 32  # of constants by constants, one after the other
+MAX_DEFINITIONS = 32  # length of a chain of constants that are defined by constants
 _HUGE = 1 << 64
-# Text in single quotes stays; then "NAME", #NAME and a value that is a name altogether.
+# Text in single quotes is kept; then "NAME", #NAME, and a value that is nothing but a name.
 _NAME = re.compile(r"""'(?:[^'$]|\$.)*'|"([^"]*)"|(?<![\w"])\#(\w+)|^\s*([^\W\d]\w*)\s*$""", re.DOTALL)
 _MAX_VALUE = 4096  # characters; longer initial values are data, not names
-_MAX_CONSTANT = 260  # characters of a constant's value, a STRING's
+_MAX_CONSTANT = 260  # characters of a constant's value: a STRING of full length
 
 
 class BoundFault(ShmioError):  # noqa: N818  (the placer reports it; it never leaves the compiler)
-    """A bound cannot be told."""
+    """A bound cannot be computed."""
 
     def __init__(self, diagnostic: Diagnostic) -> None:
         super().__init__(diagnostic.message)
@@ -27,15 +27,15 @@ class BoundFault(ShmioError):  # noqa: N818  (the placer reports it; it never le
 
 
 class Constants:
-    """The constants that are known in one place: a block's own, then those of all sources."""
+    """Constants visible in one place: the block's own, then those of all sources."""
 
     def __init__(self, declared: Iterable[ConstantDeclaration] = (), outer: Constants | None = None) -> None:
         self._declared = {declaration.name.lower(): declaration for declaration in declared}
         self._outer = outer
-        self._numbers: dict[str, int] = {}  # each is computed once: a few may refer to each other many times
+        self._numbers: dict[str, int] = {}  # cache: constants may refer to each other often
 
     def find(self, name: str) -> ConstantDeclaration | None:
-        """Return a constant; its name may be in any case."""
+        """Return the constant with this name, in any case, or None."""
         scope = self._scope(name.lower())
         return scope._declared[name.lower()] if scope else None
 
@@ -45,7 +45,11 @@ class Constants:
         return self._outer._scope(key) if self._outer else None
 
     def number(self, bound: Bound) -> int:
-        """Return what a bound comes to, within 32 bits. Raises BoundFault."""
+        """Return the value of a bound.
+
+        Raises:
+            BoundFault: A constant is unknown or unsuitable, or the value exceeds 32 bits.
+        """
         if isinstance(bound, int):
             return bound
         value = self._sum(bound, 0)

@@ -1,6 +1,6 @@
-"""Whole numbers where a declaration needs them: bounds of arrays, lengths of strings, indices.
+"""Read the whole numbers of declarations: bounds of arrays, lengths of strings, indices.
 
-Constants may stand for them, and sums and products of constants, as classic SCL allows.
+Constants may take their place, and so may sums and products of constants, as in classic SCL.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def bound(at: Cursor, what: str) -> Bound:
 
 
 def integer(at: Cursor, what: str) -> int:
-    """Read a whole number that is written as such."""
+    """Read a literal whole number: no constant, no expression."""
     token = at.token
     value = bound(at, what)
     if not isinstance(value, int):

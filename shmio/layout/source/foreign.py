@@ -1,4 +1,4 @@
-"""Files that are not sources, though they hold blocks or tags: what they are, and what to do instead."""
+"""Recognise files that hold blocks or tags but are not sources, and say what to do instead."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SEPARATORS: Final = re.compile(r"[;,\t]")
 
 
 def foreign(file: str, data: bytes) -> str:
-    """What a file is, and what to do, if it is one of these; empty if not."""
+    """Return what a file is and what to do instead; empty if it may be a source."""
     name = file.lower()
     head = data[:HEAD_BYTES]
     if head.startswith((_ZIP, _OLD_OFFICE)) or name.endswith((".xlsx", ".xls", ".ods")):
@@ -39,7 +39,7 @@ def foreign(file: str, data: bytes) -> str:
 
 
 def _is_table(text: str, data: bytes) -> bool:
-    """Whether its first lines have the same separator equally often, and nothing declares a block."""
+    """Return whether the text looks like a table of separated values and declares no block."""
     lines = [line for line in text.splitlines() if line.strip()][:3]
     if len(lines) < 2 or ":" in lines[0] or _SOURCE.search(decode(data).text):
         return False

@@ -1,8 +1,9 @@
-"""Source text to tokens.
+"""Split source text into tokens.
 
-The lexer knows nothing of grammar except one thing: the text after ``TITLE =`` is free and ends with the line.
-Comments are not tokens; each hangs on the token it follows on the same line. What is no token is one of kind
-``FAULT``, so that it matters only where somebody reads: the code of a function block may hold anything.
+The lexer knows one rule of the grammar: the text after ``TITLE =`` is free and ends with the line.
+Comments are not tokens: each is stored in the token before it on the same line. Invalid characters
+become a token of kind ``FAULT``, which matters only where the parser reads: the code of a function
+block may contain anything.
 """
 
 from __future__ import annotations
@@ -18,20 +19,20 @@ MAX_COMMENT = 1000  # characters that are kept
 
 
 class Kind(Enum):
-    """What a token is."""
+    """Kind of a token."""
 
     WORD = "word"
     QUOTED = "quoted name"
     NUMBER = "number"
     STRING = "string"
     PUNCT = "punctuation"
-    FAULT = "fault"  # its text is what to report
+    FAULT = "fault"  # its text is the error message
     END = "end of file"
 
 
 @dataclass(slots=True)
 class Token:
-    """A piece of source. ``text`` is as written, but a quoted name comes without its quotes.
+    """A piece of source; ``text`` is as written, but a quoted name has no quotes.
 
     ``start`` and ``stop`` are character positions in the source, ``line`` and ``column`` count from 1.
     ``comment`` is the text of the comments that follow on the token's line.
@@ -51,11 +52,11 @@ class Token:
         return repr(self.text if len(self.text) <= 40 else f"{self.text[:39]}…")
 
     def is_word(self, *words: str) -> bool:
-        """Whether this is one of the given keywords (upper case), in any case."""
+        """Return whether this is one of the keywords (given in upper case), in any case."""
         return self.kind is Kind.WORD and self.text.upper() in words
 
     def is_punct(self, text: str) -> bool:
-        """Whether this is the given punctuation."""
+        """Return whether this is the given punctuation."""
         return self.kind is Kind.PUNCT and self.text == text
 
 
@@ -86,9 +87,9 @@ _NEWLINE = re.compile(r"\r\n|\r|\n")
 
 
 def tokenize(text: str) -> list[Token]:
-    """Split a whole source; the last token is ``Kind.END``.
+    """Split a whole source into tokens; the last one is ``Kind.END``.
 
-    A source with more than ``MAX_TOKENS`` is cut there, with a fault.
+    A source with more than ``MAX_TOKENS`` is cut there, with a ``FAULT`` token.
     """
     tokens: list[Token] = []
     position, line, line_start = 0, 1, 0
@@ -142,7 +143,7 @@ def _attach(tokens: list[Token], line: int, comment: str) -> None:
 
 
 def _problem(kind: Kind, content: str) -> str:
-    """Say what is wrong with a token, or nothing."""
+    """Return what is wrong with a token, or an empty string."""
     if kind is Kind.PUNCT and content == "'":
         return "the string that begins here has no closing quote on its line"
     if kind is Kind.PUNCT and content == '"':

@@ -1,4 +1,4 @@
-"""Lists of values in a source: arrays, structures and repetitions, split but not read."""
+"""Split lists of values in a source: arrays, structures and repetitions."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ REPEAT = re.compile(r"([0-9]{1,10})\s*\((.*)\)", re.DOTALL)  # 3(0)
 def split_array(text: str, shape: tuple[int, ...]) -> list[tuple[int, int, str]]:
     """Return (first element, number, text) of each value in an array literal, in order.
 
-    ``[1, 2, 3(0)]``, the same without brackets, and rows in brackets of their own. What is beyond the array's
-    end is left out.
+    The literal is ``[1, 2, 3(0)]``, the same without brackets, or has each row in brackets. Values
+    beyond the end of the array are left out.
     """
     runs: list[tuple[int, int, str]] = []
     _fill(text, shape, 0, runs)

@@ -1,6 +1,7 @@
-"""Tokens to declarations, by recursive descent: files, blocks and what is assigned after BEGIN.
+"""Parse tokens into declarations by recursive descent: files, blocks, assignments after BEGIN.
 
-A syntax error is reported and the parser goes on at the next ``;`` or ``END_…``, so that one run finds them all.
+After a syntax error the parser continues at the next ``;`` or ``END_…``, so that one run finds all
+errors.
 """
 
 from __future__ import annotations
@@ -42,16 +43,19 @@ _PLAIN = re.compile(r"\w+")
 
 
 class Declarations:
-    """Reads declarations at a cursor. ``interface``: those of a function block, whose names have no spaces."""
+    """Reads declarations at a cursor.
+
+    ``interface`` is True for declarations of a function block, whose names have no spaces.
+    """
 
     def __init__(self, cursor: Cursor) -> None:
         self.at = cursor
         self.interface = False
 
     def sections(self) -> tuple[Struct, tuple[ConstantDeclaration, ...]]:
-        """Read a body: one STRUCT, or sections one after the other; return its members and its constants.
+        """Read a body, which is one STRUCT or several sections; return its members and constants.
 
-        The members of a function block come in the order of its instances.
+        The members of a function block are in the order in which its instances store them.
         """
         position = self.at.position
         if self.at.accept_word("STRUCT"):
@@ -60,7 +64,7 @@ class Declarations:
         constants: list[ConstantDeclaration] = []
         while self.at.token.is_word(*(SECTIONS if self.interface else BLOCK_SECTIONS)):
             keyword = self.at.advance().text.upper()
-            if keyword in ("VAR_TEMP", "LABEL"):  # they take no room in an instance
+            if keyword in ("VAR_TEMP", "LABEL"):  # an instance does not store them
                 end = "END_VAR" if keyword == "VAR_TEMP" else "END_LABEL"
                 if not self.at.skip_to(end):
                     raise self.at.expected(end)
@@ -80,7 +84,7 @@ class Declarations:
         return Struct(tuple(members), position), tuple(constants)
 
     def constants(self, end: str) -> list[ConstantDeclaration]:
-        """Read constants up to the END of their section."""
+        """Read constants up to the end keyword of their section."""
         constants: list[ConstantDeclaration] = []
         while not self.at.accept_word(end):
             if self.stops():
@@ -98,7 +102,7 @@ class Declarations:
             self._type(0)
         self.at.expect(":=", "':=' and the constant's value")
         start, number = self.at.index, None
-        with suppress(SyntaxFault):  # a constant of another kind
+        with suppress(SyntaxFault):  # the constant is not a number
             number = bound(self.at, "a number")
         if not self.at.token.is_punct(";"):
             number = None
@@ -108,7 +112,7 @@ class Declarations:
         constants.append(ConstantDeclaration(name, value, number, position))
 
     def members(self, end: str, depth: int) -> tuple[Member, ...]:
-        """Read members up to the END of their structure or section."""
+        """Read members up to the end keyword of their structure or section."""
         members: list[Member] = []
         while self.at.names_member() or not self.at.accept_word(end):
             if self.stops():
@@ -117,12 +121,12 @@ class Declarations:
         return tuple(members)
 
     def stops(self) -> bool:
-        """Whether a list of members ends here for want of its END."""
+        """Return whether a list of members stops here although its end keyword is missing."""
         token = self.at.token
         return token.kind is Kind.END or (token.is_word(*STOPS) and not self.at.names_member())
 
     def recovering(self, read: Callable[[], None]) -> None:
-        """Run one production; on a fault report it and skip to the end of the statement."""
+        """Run one production; after a syntax error report it and skip to the end of the statement."""
         start = self.at.index
         try:
             read()
@@ -138,7 +142,7 @@ class Declarations:
                     return
 
     def attributes(self) -> dict[str, str]:
-        """Read ``{ name := 'value'; … }``; names in upper case, values without quotes."""
+        """Read ``{ name := 'value'; … }`` into names in upper case and values without quotes."""
         opening = self.at.advance()
         values: dict[str, str] = {}
         while not self.at.accept("}"):
@@ -158,7 +162,7 @@ class Declarations:
             names.append(self._name())
         if self.at.token.is_punct("{"):
             self.attributes()
-        is_view = self.interface and self.at.accept_word("AT")  # another view of a member: it takes no room
+        is_view = self.interface and self.at.accept_word("AT")  # a view of another member: not stored
         if is_view:
             self._name()
         self.at.expect(":", "':' and the type")
@@ -179,7 +183,7 @@ class Declarations:
             members += [Member(name, type_, comment, initial, position) for name, position, _ in names]
 
     def _name(self) -> tuple[str, Position, bool]:
-        """Read a name; return it, its place, and whether it was in quotes."""
+        """Read a name; return the name, its place, and whether it was in quotes."""
         position, token = self.at.position, self.at.token
         if token.kind is Kind.QUOTED:
             return self.at.advance().text, position, True
@@ -188,7 +192,7 @@ class Declarations:
         return self.at.advance().text if self.interface else self.at.words(), position, False
 
     def body_type(self) -> Type:
-        """Read what stands for the body of a data block: the name of a type."""
+        """Read the type name that takes the place of a data block's body."""
         return self._type(0)
 
     def _type(self, depth: int) -> Type:
@@ -237,13 +241,13 @@ _PROTECTED = (
 
 
 def parse(file: str, text: str, tokens: list[Token], report: Report) -> Unit:
-    """Parse one file; what could not be understood is in the report and left out of the result."""
+    """Parse one file; report errors and leave the wrong declarations out of the result."""
     return _Parser(Cursor(file, text, tokens, report)).unit()
 
 
 @dataclass(slots=True)
 class _Header:
-    """What stands between a block's name and its body."""
+    """Properties that are declared between a block's name and its body."""
 
     optimized: bool = False
     protected: bool = False
@@ -277,13 +281,16 @@ class _Parser:
         return unit
 
     def resume(self) -> None:
-        """Go to where the next declaration begins."""
+        """Skip to the beginning of the next declaration."""
         while not self.at.at_end() and not self.at.token.is_word(*TOP):
             self.at.advance()
 
     @contextmanager
     def collecting(self, *, resume: bool = True) -> Iterator[Report]:
-        """Collect what is wrong with one declaration: not every one is used. ``resume`` after it, if it is broken."""
+        """Collect the errors of one declaration separately, because it may remain unused.
+
+        With ``resume``, skip to the next declaration after a syntax error.
+        """
         outer, inner = self.at.report, Report([self.at.file])
         self.at.report = inner
         with suppress(TooManyErrors):
@@ -314,7 +321,7 @@ class _Parser:
                 body, constants = self.declare.sections()
             else:
                 body = self.declare.body_type()
-                header = self.header(header)  # STEP 7 takes it on either side of the type's name
+                header = self.header(header)  # STEP 7 allows it before and after the type's name
             self.at.accept(";")
             if self.at.accept_word("BEGIN"):
                 while not self.at.token.is_word("END_DATA_BLOCK", *TOP) and self.at.token.kind is not Kind.END:
@@ -341,7 +348,7 @@ class _Parser:
         return TypeDeclaration(name, body, position, faults=(*found.errors, *found.warnings))
 
     def function_block(self) -> TypeDeclaration:
-        """Read the interface; the code is passed over."""
+        """Read the interface of a function block; skip its code."""
         position = self.at.position
         name, _ = self.block_name("the function block's name")
         body, header = Struct((), position), _Header()
@@ -352,7 +359,7 @@ class _Parser:
             if header.protected and self.at.token.is_word("BEGIN", "END_FUNCTION_BLOCK"):
                 raise SyntaxFault(position.error(_PROTECTED.format(name)))
             body, constants = self.declare.sections()
-            if self.at.token.kind is Kind.PUNCT and self.at.token.text not in "#;":  # no statement begins so
+            if self.at.token.kind is Kind.PUNCT and self.at.token.text not in "#;":  # no statement begins like this
                 raise self.at.expected("a section of variables or BEGIN")
         self.declare.interface = False
         if not self.at.skip_to("END_FUNCTION_BLOCK"):
@@ -379,7 +386,7 @@ class _Parser:
         return name, token.kind is Kind.QUOTED
 
     def header(self, header: _Header | None = None) -> _Header:
-        """Skip what stands between a block's name and its body; add to what was found before."""
+        """Read the lines between a block's name and its body; add to the properties in ``header``."""
         header = header or _Header()
         while True:
             if self.at.token.is_punct("{"):

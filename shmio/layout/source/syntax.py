@@ -1,4 +1,4 @@
-"""What the parser makes of a source: declarations as they are written, nothing resolved or placed."""
+"""Syntax tree of a source: declarations as written, before names are resolved or placed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shmio.layout.model import Diagnostic
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where something stands, for diagnostics."""
+    """Place in a source, for diagnostics."""
 
     file: str
     line: int
@@ -27,7 +27,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A constant by name."""
+    """Reference to a constant by name."""
 
     name: str
     position: Position
@@ -35,7 +35,10 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Sum:
-    """A constant expression: terms with their signs, each a product. Flat, so that its depth has no bound to check."""
+    """A constant expression: signed terms, each a product of factors.
+
+    It is flat, without nesting, so that no depth must be limited.
+    """
 
     terms: tuple[tuple[int, tuple[int | Constant, ...]], ...]
     position: Position
@@ -47,7 +50,10 @@ Bounds = tuple[tuple[Bound, Bound], ...]
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """A type by name: elementary or of a user; quoted names are the user's. ``length`` is that of a string."""
+    """Reference to a type by name: elementary, or a user type, whose name may be quoted.
+
+    ``length`` is the length of a string type.
+    """
 
     name: str
     quoted: bool
@@ -65,7 +71,7 @@ class Struct:
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """An array; ``element`` is never an array itself. No bounds: ``ARRAY[*]``, which the caller decides."""
+    """An array; ``element`` is never an array. ``ARRAY[*]``, sized by the caller, has no bounds."""
 
     bounds: Bounds
     element: Named | Struct
@@ -76,7 +82,7 @@ Type = Named | Struct | Array
 
 
 class Section(Enum):
-    """Where a member is declared, in the order in which a function block's instance holds them."""
+    """Section in which a member is declared, in the order of a function block's instance."""
 
     INPUT = "VAR_INPUT"
     OUTPUT = "VAR_OUTPUT"
@@ -86,7 +92,7 @@ class Section(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One member; ``initial`` is the source's text. ``section`` is set in function blocks."""
+    """A member of a structure; ``initial`` is source text; only function blocks set ``section``."""
 
     name: str
     type: Type
@@ -98,7 +104,10 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class ConstantDeclaration:
-    """``name : type := value;`` in a section of constants. ``number`` is the value as a bound, if it can be one."""
+    """``name : type := value;`` in a section of constants.
+
+    ``number`` is the value as a bound, or None if it cannot be one.
+    """
 
     name: str
     value: str
@@ -108,7 +117,7 @@ class ConstantDeclaration:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """``target := value;`` after BEGIN. The target is names and index lists in the order written."""
+    """``target := value;`` after BEGIN; ``target`` has names and index lists as written."""
 
     target: tuple[str | tuple[int, ...], ...]
     value: str
@@ -119,7 +128,7 @@ class Assignment:
 class TypeDeclaration:
     """TYPE … END_TYPE, or the interface of a FUNCTION_BLOCK.
 
-    ``faults`` is what is wrong with it: that matters only where the type is used.
+    ``faults`` has its errors, which matter only where the type is used.
     """
 
     name: str
@@ -133,9 +142,9 @@ class TypeDeclaration:
 
 @dataclass(frozen=True, slots=True)
 class BlockDeclaration:
-    """DATA_BLOCK … END_DATA_BLOCK; the body of an instance or of a block of a UDT is that type's name.
+    """DATA_BLOCK … END_DATA_BLOCK; ``body`` may be the name of a function block or a user type.
 
-    ``faults`` is what is wrong with it, and what is odd: that matters only if the block is asked for.
+    ``faults`` has its errors and warnings, which matter only if the block is compiled.
     """
 
     name: str

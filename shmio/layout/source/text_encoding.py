@@ -1,7 +1,8 @@
-"""A source's bytes to text.
+"""Decode the bytes of a source.
 
-TIA Portal writes UTF-8 with a byte order mark, STEP 7 classic the Windows code page of its PC, and editors
-UTF-16 with a mark. Without any sign, what is not UTF-8 is taken as Windows-1252.
+TIA Portal writes UTF-8 with a byte order mark, STEP 7 classic writes the Windows code page of its
+PC, and some editors write UTF-16 with a mark. Without a mark, bytes that are not UTF-8 are read as
+Windows-1252.
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ _AS_WINDOWS = (
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """The text of a source; ``problem`` says what is doubtful (``fatal``: wrong) about it, at line and column."""
+    """Text of a source.
+
+    ``problem`` is a warning, or an error if ``fatal``, about the bytes at ``line`` and ``column``.
+    """
 
     text: str
     problem: str = ""
@@ -34,7 +38,7 @@ class Decoded:
 
 
 def decode(data: bytes) -> Decoded:
-    """Return the text of a source."""
+    """Decode a source by its byte order mark, as UTF-8, or as Windows-1252."""
     mark, encoding = next(((mark, name) for mark, name in _MARKS if data.startswith(mark)), (b"", "utf-8"))
     data = data[len(mark) :]
     try:

@@ -1,4 +1,4 @@
-"""A place in a list of tokens, and the few ways in which the parser moves it."""
+"""Cursor with which the parser walks over a list of tokens."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_INITIAL = 65_536
 
 
 class SyntaxFault(ShmioError):  # noqa: N818  (the parser reports and goes on; it never leaves the compiler)
-    """The source is not what the grammar expects here."""
+    """The source violates the grammar at this place."""
 
     def __init__(self, diagnostic: Diagnostic) -> None:
         super().__init__(diagnostic.message)
@@ -24,9 +24,9 @@ class SyntaxFault(ShmioError):  # noqa: N818  (the parser reports and goes on; i
 
 
 class Cursor:
-    """Walks over the tokens of one file; the last is ``Kind.END`` and is never passed.
+    """Walks over the tokens of one file; it never passes the last one, ``Kind.END``.
 
-    Faults are reported when they are come to, and are never the current token.
+    A ``FAULT`` token is reported when the cursor reaches it, and never becomes the current token.
     """
 
     def __init__(self, file: str, text: str, tokens: list[Token], report: Report) -> None:
@@ -34,30 +34,30 @@ class Cursor:
         self.report = report
         self._text = text
         self._tokens = tokens
-        self._absent: set[str] = set()  # keywords that do not come any more: they are not looked for twice
+        self._absent: set[str] = set()  # keywords that do not follow any more: no second search
         self.index = 0
         self.token = tokens[0]
         self._pass_faults()
 
     @property
     def position(self) -> Position:
-        """Where the current token stands."""
+        """Position of the current token."""
         return self.at(self.token)
 
     def at(self, token: Token) -> Position:
-        """Return where a token stands."""
+        """Return the position of a token."""
         return Position(self.file, token.line, token.column)
 
     def at_end(self) -> bool:
-        """Whether all tokens have been passed."""
+        """Return whether all tokens have been passed."""
         return self.token.kind is Kind.END
 
     def fault(self, token: Token, message: str) -> SyntaxFault:
-        """Return the error to raise about a token."""
+        """Return an error about a token, for the caller to raise."""
         return SyntaxFault(self.at(token).error(message))
 
     def expected(self, what: str) -> SyntaxFault:
-        """Return the error to raise when the current token is not what was expected."""
+        """Return an error for the caller to raise: the current token is not what was expected."""
         return self.fault(self.token, f"expected {what}, found {self.token}")
 
     def advance(self) -> Token:
@@ -69,12 +69,15 @@ class Cursor:
         return token
 
     def rewind(self, index: int) -> None:
-        """Go back to a token that was the current one."""
+        """Go to the token with this index."""
         self.index = index
         self.token = self._tokens[index]
 
     def skip_to(self, word: str) -> bool:
-        """Go to this keyword, without a word about faults on the way; stay, and return False, if there is none."""
+        """Go to this keyword without reporting faults on the way.
+
+        If the keyword does not follow, stay and return False.
+        """
         if word not in self._absent:
             for index in range(self.index, len(self._tokens)):
                 if self._tokens[index].is_word(word):
@@ -84,7 +87,7 @@ class Cursor:
         return False
 
     def skip_to_any(self, *words: str) -> None:
-        """Go to the next of these keywords, or to the end, without a word about faults on the way."""
+        """Go to the next of these keywords, or to the end, without reporting faults on the way."""
         while self._tokens[self.index].kind is not Kind.END and not self._tokens[self.index].is_word(*words):
             self.index += 1
         self.rewind(self.index)
@@ -96,38 +99,38 @@ class Cursor:
         self.token = token
 
     def accept(self, punct: str) -> bool:
-        """Step over this punctuation if it is there."""
+        """Step over this punctuation if it is the current token; return whether it was."""
         found = self.token.is_punct(punct)
         if found:
             self.advance()
         return found
 
     def accept_word(self, *words: str) -> bool:
-        """Step over one of these keywords if it is there."""
+        """Step over the current token if it is one of these keywords; return whether it was."""
         found = self.token.is_word(*words)
         if found:
             self.advance()
         return found
 
     def expect(self, punct: str, what: str) -> None:
-        """Step over this punctuation or raise."""
+        """Step over this punctuation, or raise SyntaxFault."""
         if not self.accept(punct):
             raise self.expected(what)
 
     def expect_word(self, word: str) -> None:
-        """Step over this keyword or raise."""
+        """Step over this keyword, or raise SyntaxFault."""
         if not self.accept_word(word):
             raise self.expected(word)
 
     def names_member(self) -> bool:
-        """Whether the current word is a name rather than a keyword, going by what follows."""
+        """Return whether the token after the current word shows it to be a name, not a keyword."""
         following = self._tokens[min(self.index + 1, len(self._tokens) - 1)]
         return self.token.kind is Kind.WORD and following.kind is Kind.PUNCT and following.text in (":", "{", ",")
 
     def words(self) -> str:
-        """Step over the words and numbers on this line and return them as written, spaces included.
+        """Step over the words and numbers on this line and return them as written, with spaces.
 
-        What stands between two of them becomes spaces: a tab or a comment is no part of a name.
+        Tabs and comments between them become spaces, because they are not part of a name.
         """
         first = last = self.advance()
         name = first.text
@@ -145,8 +148,8 @@ class Cursor:
     def value(self) -> str:
         """Step over a value, up to the ``;`` that ends it, and return it as written.
 
-        Within brackets it may run over lines; outside, a new line without a comma before it means that the
-        ``;`` is missing.
+        Within brackets, a value may span lines. Outside brackets, a new line without a comma before
+        it means that the ``;`` is missing.
         """
         first = last = self.token
         start, depth = self.index, 0

@@ -1,1 +1,1 @@
-"""Between a register's bytes and Python values, text and S7 literals."""
+"""Convert between a register's bytes and Python values, text and S7 literals."""

@@ -1,7 +1,7 @@
-"""Calendar values: between ISO 8601 text and nanoseconds since 1970-01-01, exactly.
+"""Convert exactly between ISO 8601 text and nanoseconds since 1970-01-01.
 
-``datetime`` stops at microseconds and S7's LDT and DTL do not, hence whole numbers and text. S7 has no time
-zones; neither has anything here.
+Python's ``datetime`` ends at microseconds, but LDT and DTL have nanoseconds; therefore this module
+uses whole numbers and text. S7 has no time zones, and neither has this module.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MOMENT = re.compile(
 
 
 def days(year: int, month: int, day: int) -> int | None:
-    """Return the days since 1970-01-01, None if there is no such day."""
+    """Return the days from 1970-01-01 to a date, or None if there is no such day."""
     try:
         return date(year, month, day).toordinal() - EPOCH
     except ValueError:
@@ -36,9 +36,9 @@ def days(year: int, month: int, day: int) -> int | None:
 
 
 def parse_moment(text: str) -> int | None:
-    """Return nanoseconds since 1970 of ``2024-02-29``, ``2024-02-29T12:00:00.5`` or S7's ``2024-2-29-12:00:00.5``.
+    """Parse a date, with or without a time, into nanoseconds since 1970; None for any other text.
 
-    None if the text is no moment.
+    Accepts ``2024-02-29``, ``2024-02-29T12:00:00.5`` and S7's ``2024-2-29-12:00:00.5``.
     """
     match = _MOMENT.fullmatch(text)
     day = days(int(match[1]), int(match[2]), int(match[3])) if match else None
@@ -52,12 +52,12 @@ def parse_moment(text: str) -> int | None:
 
 
 def format_day(day: int) -> str:
-    """Return ISO text of a number of days since 1970."""
+    """Return the ISO text of a day, given in days since 1970."""
     return date.fromordinal(EPOCH + day).isoformat()
 
 
 def format_moment(ns: int, digits: int) -> str:
-    """Return ISO text of nanoseconds since 1970 with this many digits behind the second."""
+    """Return the ISO text of nanoseconds since 1970, with this many decimals of the second."""
     day, rest = divmod(ns, NS_PER_DAY)
     second, fraction = divmod(rest, NS_PER_SECOND)
     clock = f"{second // 3600:02}:{second // 60 % 60:02}:{second % 60:02}"
@@ -65,5 +65,5 @@ def format_moment(ns: int, digits: int) -> str:
 
 
 def weekday(ns: int) -> int:
-    """Return S7's day of the week: 1 is Sunday."""
+    """Return the day of the week as S7 counts it: 1 is Sunday."""
     return (ns // NS_PER_DAY + 4) % 7 + 1  # 1970-01-01 was a Thursday

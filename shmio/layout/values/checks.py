@@ -1,4 +1,4 @@
-"""Checks that the codecs of several types share; each raises ValueRangeError with the type's name."""
+"""Checks shared by the codecs; each raises ValueRangeError with the name of the type."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from shmio.errors import ValueRangeError
 
 
 def to_int(value: object, name: str) -> int:
-    """Return a whole number; a float without fraction is one, a bool is none.
+    """Return the value as an int; accept floats without a fraction, but not bools.
 
-    Raises ValueRangeError: it is not.
+    Raises:
+        ValueRangeError: The value is not a whole number.
     """
     if not isinstance(value, bool):
         if isinstance(value, float) and value.is_integer():
@@ -25,9 +26,11 @@ def to_int(value: object, name: str) -> int:
 
 
 def to_float(value: object, name: str) -> float:
-    """Return a float; whole numbers are taken, bools are not.
+    """Return the value as a float; accept whole numbers, but not bools.
 
-    Raises ValueRangeError: not a number; OverflowError: too large for any float.
+    Raises:
+        ValueRangeError: The value is not a number.
+        OverflowError: The value is too large for any float.
     """
     number: Any = value
     if isinstance(value, bool | str | bytes) or not hasattr(value, "__float__"):
@@ -36,9 +39,10 @@ def to_float(value: object, name: str) -> float:
 
 
 def to_bool(value: object, name: str) -> bool:
-    """Return a bool; 0 and 1 are taken.
+    """Return the value as a bool; accept 0 and 1.
 
-    Raises ValueRangeError: it is neither.
+    Raises:
+        ValueRangeError: The value is anything else.
     """
     if isinstance(value, bool) or (not isinstance(value, str) and value in (0, 1)):
         return bool(value)
@@ -48,7 +52,8 @@ def to_bool(value: object, name: str) -> bool:
 def encode_text(value: object, encoding: str, name: str) -> bytes:
     """Return text in the type's encoding.
 
-    Raises ValueRangeError: not text, or with a character the encoding has not.
+    Raises:
+        ValueRangeError: The value is not text, or has a character that the encoding lacks.
     """
     if not isinstance(value, str):
         raise ValueRangeError(f"{name}: expected text, found {brief(value)}")

@@ -1,6 +1,7 @@
-"""Registers: from a frame's bytes to Python values and back.
+"""Convert registers between a frame's bytes and Python values.
 
-``scalar.py`` says which Python value each type has; an array is a list, of lists for several dimensions.
+``scalar.py`` lists the Python value of each type. An array is a list; with several dimensions, a
+list of lists.
 """
 
 from __future__ import annotations
@@ -21,28 +22,29 @@ Value = Scalar | list["Value"]
 
 
 class RegisterCodec(Protocol):
-    """One register of a frame; made by ``codec``."""
+    """Decodes and encodes one register of a frame; ``codec`` returns it."""
 
     def decode(self, data: Buffer) -> Value:
-        """Return the value in a whole frame; None, also as an element, for bytes that are no value."""
+        """Return the register's value in a frame; None (or None elements) for invalid bytes."""
 
     def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
-        """Write the value into a whole frame, or nothing at all.
+        """Write the value into a frame; after an error the frame is unchanged.
 
-        Raises ValueRangeError: the value does not fit the type, or an array has another shape.
+        Raises:
+            ValueRangeError: The value does not fit the type, or an array has the wrong shape.
         """
 
 
 @lru_cache(maxsize=65_536)
 def codec(register: Register, byte_order: ByteOrder = "big") -> RegisterCodec:
-    """Return the register's codec; the same object for the same register."""
+    """Return the register's codec; it is cached."""
     if register.type == "BOOL":
         return _BoolArray(register) if register.dims else _Bool(register)
     return _Array(register, byte_order) if register.dims else _Single(register, byte_order)
 
 
 class _Bool:
-    """One bit."""
+    """Codec of a single BOOL."""
 
     def __init__(self, register: Register) -> None:
         self._offset, self._mask = register.offset, 1 << (register.bit or 0)
@@ -58,7 +60,7 @@ class _Bool:
 
 
 class _Single:
-    """Any other elementary value."""
+    """Codec of any other elementary value."""
 
     def __init__(self, register: Register, byte_order: ByteOrder) -> None:
         self._scalar = scalar_codec(register.element, byte_order)
@@ -72,7 +74,7 @@ class _Single:
 
 
 class _Array:
-    """Elements at a fixed stride; numbers are unpacked all at once."""
+    """Codec of an array of anything but BOOL; it unpacks numbers all at once."""
 
     def __init__(self, register: Register, byte_order: ByteOrder) -> None:
         element = register.element
@@ -95,7 +97,7 @@ class _Array:
 
     def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
         if self._row is not None and isinstance(value, list | tuple) and {float, int}.issuperset(map(type, value)):
-            with suppress(struct.error, OverflowError):  # what is wrong is said below
+            with suppress(struct.error, OverflowError):  # the loop below finds the wrong element
                 frame[self._offset : self._stop] = self._row.pack(*value)
                 return
         image = bytearray(frame[self._offset : self._stop])
@@ -105,7 +107,7 @@ class _Array:
 
 
 class _BoolArray:
-    """Bits, eight to the byte, each row beginning at a byte."""
+    """Codec of an array of BOOL: eight bits to a byte, and each row begins at a new byte."""
 
     def __init__(self, register: Register) -> None:
         self._name, self._shape = register.path, register.shape
@@ -127,16 +129,17 @@ class _BoolArray:
 
 
 def nest(flat: list[Value], shape: tuple[int, ...]) -> list[Value]:
-    """Return a flat list as lists of lists, the last index running fastest."""
+    """Return a flat list as nested lists of this shape; the last index runs fastest."""
     for length in reversed(shape[1:]):
         flat = [flat[start : start + length] for start in range(0, len(flat), length)]
     return flat
 
 
 def flatten(value: object, shape: tuple[int, ...], name: str) -> Iterator[object]:
-    """Yield the elements of nested lists.
+    """Yield the elements of nested lists; the last index runs fastest.
 
-    Raises ValueRangeError: the lists do not have this shape.
+    Raises:
+        ValueRangeError: The lists do not have this shape.
     """
     if not shape:
         yield value

@@ -1,4 +1,4 @@
-"""DATE, DATE_AND_TIME, LDT and DTL: between the bytes and ISO 8601 text.
+"""Convert DATE, DATE_AND_TIME, LDT and DTL between bytes and ISO 8601 text.
 
 Formats: Siemens, "STEP 7 Professional", chapter "Data types".
 """
@@ -16,7 +16,7 @@ Buffer = bytes | bytearray | memoryview
 
 
 class Moment:
-    """ISO text outside, one of four formats inside; a ``ScalarCodec``."""
+    """Codec between ISO text and one of the four formats; a ``ScalarCodec``."""
 
     plain = ""
 
@@ -33,7 +33,7 @@ class Moment:
         self._digits = {calendar.NS_PER_MS: 3, 1: 9}.get(step_ns)
 
     def decode(self, data: Buffer, offset: int) -> str | None:
-        """Return the text, None for bytes that are no moment of the type."""
+        """Return the text, or None for bytes that are not a valid date or time."""
         ns = self._to_ns(data, offset)
         if ns is None or not self._bounds[0] <= ns <= self._bounds[1]:
             return None
@@ -45,7 +45,7 @@ class Moment:
         return calendar.format_moment(ns, self._digits)
 
     def encode(self, value: object) -> bytes:
-        """Return the element's bytes; raises ValueRangeError."""
+        """Return the bytes of an ISO text; ValueRangeError if the type cannot hold it."""
         ns = calendar.parse_moment(value) if isinstance(value, str) else None
         if ns is None:
             example = "2024-02-29" + ("" if self._digits is None else "T12:34:56.789")
@@ -61,17 +61,20 @@ class Moment:
 
 
 def date_to_ns(unpack: struct.Struct) -> Callable[[Buffer, int], int]:
-    """DATE: 16 bits, days since 1990-01-01."""
+    """Return the decoder of DATE: 16 bits, days since 1990-01-01."""
     return lambda data, at: (unpack.unpack_from(data, at)[0] + calendar.DATE_EPOCH_DAYS) * calendar.NS_PER_DAY
 
 
 def date_from_ns(pack: struct.Struct) -> Callable[[int], bytes]:
-    """DATE, the other way."""
+    """Return the encoder of DATE."""
     return lambda ns: pack.pack(ns // calendar.NS_PER_DAY - calendar.DATE_EPOCH_DAYS)
 
 
 def dt_to_ns(data: Buffer, offset: int) -> int | None:
-    """DATE_AND_TIME: BCD bytes year, month, day, hour, minute, second, ms; the last half-byte is the weekday."""
+    """Decode DATE_AND_TIME: BCD bytes year, month, day, hour, minute, second, milliseconds.
+
+    The last half-byte is the day of the week.
+    """
     digits = [from_bcd(0, byte) for byte in data[offset : offset + 7]]
     last = data[offset + 7] >> 4
     if None in digits or last > 9:
@@ -85,14 +88,17 @@ def dt_to_ns(data: Buffer, offset: int) -> int | None:
 
 
 def dt_from_ns(ns: int) -> bytes:
-    """DATE_AND_TIME, the other way."""
+    """Encode DATE_AND_TIME."""
     text = calendar.format_moment(ns, 3)  # 2024-02-29T12:34:56.789
     digits = text[2:].translate(str.maketrans("", "", "-T:."))
     return bytes.fromhex(f"{digits}{calendar.weekday(ns)}")
 
 
 def dtl_to_ns(layout: struct.Struct) -> Callable[[Buffer, int], int | None]:
-    """DTL: UINT year; USINT month, day, weekday, hour, minute, second; UDINT nanosecond."""
+    """Return the decoder of DTL.
+
+    Its fields are UINT year; USINT month, day, weekday, hour, minute, second; UDINT nanosecond.
+    """
 
     def decode(data: Buffer, offset: int) -> int | None:
         year, month, day, _, hour, minute, second, ns = layout.unpack_from(data, offset)
@@ -106,7 +112,7 @@ def dtl_to_ns(layout: struct.Struct) -> Callable[[Buffer, int], int | None]:
 
 
 def dtl_from_ns(layout: struct.Struct) -> Callable[[int], bytes]:
-    """DTL, the other way."""
+    """Return the encoder of DTL."""
 
     def encode(ns: int) -> bytes:
         text = calendar.format_moment(ns, 0)
@@ -120,7 +126,7 @@ def dtl_from_ns(layout: struct.Struct) -> Callable[[int], bytes]:
 
 
 def from_bcd(hundreds: int, byte: int) -> int | None:
-    """Return the number of two BCD digits and a third before them, None if one is above 9."""
+    """Return ``hundreds`` plus the number of two BCD digits, or None if a digit is above 9."""
     tens, ones = byte >> 4, byte & 0xF
     return None if max(hundreds, tens, ones) > 9 else int(hundreds * 100 + tens * 10 + ones)
 

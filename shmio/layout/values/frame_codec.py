@@ -1,4 +1,4 @@
-"""Whole frames, many at once, to numpy arrays.
+"""Decode many whole frames at once into numpy arrays.
 
 ============================  ==========================================================================
 BOOL                          ``?``
@@ -13,8 +13,8 @@ LDT, DTL                      ``M8[ns]``
 POINTER, ANY                  ``V6``, ``V10``
 ============================  ==========================================================================
 
-Native byte order; an array register is a field with a shape. Bytes that are no value of their type become NaT or
-the empty text.
+Values have native byte order; an array register is a field with a shape. Bytes that are not a
+valid value of their type become NaT or empty text.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _NAT = np.iinfo(np.int64).min
 
 
 class FrameCodec:
-    """Decodes frames of one layout; built once, then fast."""
+    """Decodes frames of one layout; building it takes time, decoding is fast."""
 
     def __init__(self, layout: Layout) -> None:
         registers = layout.registers
@@ -61,7 +61,8 @@ class FrameCodec:
         self.dtype = np.dtype([(register.path, *_field(register)) for register in registers])
         order = ">" if layout.byte_order == "big" else "<"
         plain = [register for register in registers if register.type in _PLAIN]
-        # The frame seen as a record, and the result seen as one with the same fields: one assignment converts all.
+        # Both the frame and the result are viewed as records with the same fields, so that one
+        # assignment converts all of them.
         runs = _runs(plain, self.dtype)
         self._plain_in = _record([(order + kind, count, start) for kind, count, start, _ in runs], layout.size)
         self._plain_out = _record([(kind, count, start) for kind, count, _, start in runs], self.dtype.itemsize)
@@ -73,9 +74,16 @@ class FrameCodec:
         self._others = [(r, _decoder(r, order)) for r in registers if r.path not in done]
 
     def decode(self, frames: bytes | bytearray | memoryview | Bytes) -> Array:
-        """Return a structured array (n,), a field for each register, named by its path.
+        """Decode n frames.
 
-        ``frames``: the bytes of n frames, or an array (n, size) of uint8. Raises ValueError for another size.
+        Args:
+            frames: The bytes of n frames, or an array of uint8 with the shape (n, size).
+
+        Returns:
+            A structured array of shape (n,) with a field for each register, named by its path.
+
+        Raises:
+            ValueError: The size is not that of whole frames of the layout.
         """
         raw = np.asarray(frames, np.uint8) if isinstance(frames, np.ndarray) else np.frombuffer(frames, np.uint8)
         if raw.ndim == 1 and self.size and raw.size % self.size == 0:
@@ -99,7 +107,7 @@ class FrameCodec:
 
 
 def _runs(plain: list[Register], dtype: np.dtype[Any]) -> list[tuple[str, int, int, int]]:
-    """Return (type, elements, offset in the frame, offset in the result): neighbours of one type are one run."""
+    """Join neighbours of one type into runs (type, elements, offset in frame, offset in result)."""
     fields: Mapping[str, Any] = dtype.fields or {}
     runs: list[tuple[str, int, int, int]] = []
     ends = kind_before = None
@@ -115,7 +123,7 @@ def _runs(plain: list[Register], dtype: np.dtype[Any]) -> list[tuple[str, int, i
 
 
 def _record(fields: list[tuple[str, int, int]], size: int) -> np.dtype[Any]:
-    """Return a record of (type, elements, offset) fields in so many bytes."""
+    """Return a record type of ``size`` bytes with fields (type, elements, offset)."""
     return np.dtype(
         {
             "names": [f"f{position}" for position in range(len(fields))],
@@ -133,7 +141,7 @@ def _field(register: Register) -> tuple[str, tuple[int, ...]]:
 
 
 def _decoder(register: Register, order: str) -> Callable[[Bytes], Array]:
-    """Return what takes (n, size) frames to (n, *shape) values of one register."""
+    """Return a function that decodes frames (n, size) into one register's values (n, *shape)."""
     element, shape = register.element, register.shape
     if element.base == "BOOL":
         places = bit_positions(register)
@@ -171,7 +179,7 @@ def _element_decoder(element: ElementType, order: str) -> _Decode:
 
 
 def _view(raw: Array, dtype: str) -> Array:
-    """Return (…, size) bytes as (…) values."""
+    """View bytes of shape (…, size) as values of shape (…)."""
     return np.ascontiguousarray(raw).view(dtype)[..., 0]
 
 
@@ -184,7 +192,7 @@ def _not_negative(values: Array) -> Array:
 
 
 def _bcd(values: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return the numbers of two BCD digits, and whether they are digits."""
+    """Return the numbers of two BCD digits, and whether both are valid digits."""
     tens, ones = values.astype(np.int64) >> 4, values.astype(np.int64) & 0xF
     return tens * 10 + ones, (tens <= 9) & (ones <= 9)
 
@@ -197,7 +205,7 @@ def _s5time(words: Array) -> Array:
 
 
 def _days(year: Array, month: Array, day: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return days since 1970, and whether there are such days."""
+    """Return the days since 1970, and whether the dates exist."""
     inside = (month >= 1) & (month <= 12) & (day >= 1) & (year >= 1970) & (year <= 2262)
     months = np.where(inside, (year - 1970) * 12 + month - 1, 0)
     first = months.view("M8[M]").astype("M8[D]").astype(np.int64)
@@ -222,14 +230,14 @@ def _dtl(raw: Bytes, order: str) -> Array:
     rest = _view(raw[..., 8:12], f"{order}u4").astype(np.int64)
     days, valid = _days(year, month, day)
     valid &= (hour < 24) & (minute < 60) & (second < 60) & (rest < NS_PER_SECOND)
-    # The year 2262 ends after the last nanosecond that 63 bits can count; what wraps there is negative.
+    # The last nanosecond that 63 bits can count is in the year 2262; later ones wrap to negative.
     ns = days * NS_PER_DAY + ((hour * 60 + minute) * 60 + second) * NS_PER_SECOND + rest
     valid &= ns >= 0
     return np.where(valid, ns, _NAT).view("M8[ns]")
 
 
 def _text(units: Array, actual: Array) -> Array:
-    """Return (…, length) code points, NUL behind the actual length; all NUL when that is too long."""
+    """Replace the code points (…, length) after the actual length by NUL; all if it is invalid."""
     length = units.shape[-1]
     inside = (np.arange(length) < actual[..., None]) & (actual <= length)[..., None]
     return np.ascontiguousarray(np.where(inside, units, 0).astype(np.uint32))
@@ -245,7 +253,7 @@ def _wide_text(words: Array, length: int) -> Array:
     points = _text(words[..., 2:], words[..., 1])
     if not ((points >= 0xD800) & (points <= 0xDFFF)).any():
         return points.view(f"U{length}")[..., 0]
-    # Surrogate pairs shorten the text: rare enough to be done one by one.
+    # Surrogate pairs are rare and shorten the text: each text is converted by itself.
     flat = points.reshape(-1, length).astype("<u2")
     actual = np.where(words[..., 1] <= length, words[..., 1], 0).reshape(-1)
     texts = [bytes(row[:n]).decode("utf-16-le", "replace") for row, n in zip(flat, actual, strict=True)]

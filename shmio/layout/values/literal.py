@@ -1,8 +1,8 @@
-"""S7 literals to values: initial values in a source, and what a user types; times back to what a user reads.
+"""Read S7 literals, from sources and from users, into values, and write values as literals.
 
 ``16#FF``, ``INT#-5``, ``1.5e3``, ``TRUE``, ``T#1h30m``, ``S5T#10s``, ``D#2024-02-29``, ``TOD#12:00:00``,
 ``DT#2024-02-29-12:00:00``, ``'text$N'``, ``WSTRING#'…'``, and arrays ``[1, 2, 5(0)]`` of any of these.
-Values come in the Python form that ``scalar.py`` tabulates.
+``scalar.py`` lists the Python type of each value.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from shmio.layout.values.codec import Value, nest
 from shmio.layout.values.scalar import Scalar, scalar_codec
 from shmio.layout.values.text import to_text
 
-MAX_LITERAL = 100  # characters of anything but text
+MAX_LITERAL = 100  # characters, except of text
 
 _INTEGER = re.compile(r"([+-]?)(?:(2|8|16)#)?([0-9A-Fa-f]+(?:_[0-9A-Fa-f]+)*)")
 _REAL = re.compile(r"[+-]?[0-9]+(?:_[0-9]+)*(?:\.[0-9]+(?:_[0-9]+)*)?(?:[eE][+-]?[0-9]+)?")
@@ -96,14 +96,17 @@ _WRITTEN = {
 
 
 def default_text(element: ElementType) -> str:
-    """Return the literal of a type's value when a source gives none."""
+    """Return the literal of a type's default value."""
     return _DEFAULTS.get(element.base, "0")
 
 
 def parse_literal(text: str, register: Register, byte_order: ByteOrder = "big") -> Value:
-    """Return the value of a literal for this register; array elements it leaves out have the default.
+    """Return the value of a literal for this register.
 
-    Raises ValueRangeError: no literal of the register's type, or out of its range.
+    Array elements that the literal leaves out have their type's default.
+
+    Raises:
+        ValueRangeError: The text is not a literal of the register's type, or is out of range.
     """
     if not register.dims:
         return scalar_literal(text, register.element, byte_order)
@@ -117,7 +120,8 @@ def parse_literal(text: str, register: Register, byte_order: ByteOrder = "big") 
 def scalar_literal(text: str, element: ElementType, byte_order: ByteOrder = "big") -> Scalar:
     """Return the value of one literal.
 
-    Raises ValueRangeError: no literal of the type, or out of its range.
+    Raises:
+        ValueRangeError: The text is not a literal of the type, or is out of range.
     """
     text = text.strip()
     value = _read(text, element)
@@ -125,7 +129,7 @@ def scalar_literal(text: str, element: ElementType, byte_order: ByteOrder = "big
         wanted = "TRUE, FALSE, 1 or 0" if element.base == "BOOL" else f"a literal such as {default_text(element)}"
         raise ValueRangeError(f"{element.name}: expected {wanted}, found {brief(text)}")
     if element.base != "BOOL":
-        scalar_codec(element, byte_order).encode(value)  # the range
+        scalar_codec(element, byte_order).encode(value)  # checks the range
     return value
 
 
@@ -156,7 +160,7 @@ def _read(text: str, element: ElementType) -> Scalar:
         return None if ns is None else _moment(ns, base)
     if base in _UNIT_NS:
         if not separator:
-            plain = _integer(text, None)  # what a user types, in the type's own unit
+            plain = _integer(text, None)  # a plain number, in the type's own unit
             if plain is not None:
                 return plain
         ns = _duration(text) if base in _DURATIONS else _clock(text)
@@ -178,7 +182,7 @@ def _integer(text: str, signed_bits: int | None) -> int | None:
 
 
 def _classic(text: str, base: str) -> int | None:
-    """Read what STEP 7 writes for words: ``B#(1, 2)``, ``C#100``; and for parameter types: ``T 5``, ``FB 7``."""
+    """Read STEP 7's notations for words (``B#(1, 2)``, ``C#100``) and parameters (``T 5``, ``FB 7``)."""
     if match := _BYTES.fullmatch(text):
         values = [_integer(item, None) for item in split_items(match[1])]
         if len(values) * 8 == _BYTES_BITS.get(base) and all(value is not None and 0 <= value < 256 for value in values):
@@ -191,7 +195,7 @@ def _classic(text: str, base: str) -> int | None:
 
 
 def _duration(text: str) -> int | None:
-    """Return nanoseconds, None for no duration or one finer than that."""
+    """Return a duration in nanoseconds, or None if it is malformed or finer than that."""
     sign = -1 if text.startswith("-") else 1
     text = text.lstrip("+-")
     total, position = Fraction(0), 0
@@ -240,13 +244,14 @@ def _text(text: str, element: ElementType) -> str | None:
     return _ESCAPE.sub(unescape, text[1:-1])
 
 
-# -- the way back --------------------------------------------------------------------------------------------
+# -- writing literals ----------------------------------------------------------------------------------------
 
 
 def literal_text(value: Value, register: Register) -> str:
-    """Return a value as people read it: times and dates as S7 literals, all else as ``to_text`` has it.
+    """Return a value as text for people, which ``parse_literal`` reads back.
 
-    ``T#1s500ms``, ``TOD#12:00:00``, ``D#2026-11-22``. ``parse_literal`` reads them back.
+    Times and dates become S7 literals (``T#1s500ms``, ``TOD#12:00:00``, ``D#2026-11-22``); all
+    other values are as ``to_text`` writes them.
     """
     element = register.element
     return _literal_text(value, element) if element.base in _WRITTEN else to_text(value, register)
@@ -269,7 +274,7 @@ def _literal_text(value: Value, element: ElementType) -> str:
 
 
 def _without_zeros(clock: str) -> str:
-    """``12:00:00.500`` as ``12:00:00.5``, ``12:00:00.000`` as ``12:00:00``."""
+    """Remove trailing zeros: ``12:00:00.500`` becomes ``12:00:00.5``."""
     return clock.rstrip("0").rstrip(".") if "." in clock else clock
 
 

@@ -1,4 +1,4 @@
-"""One element of each type: bytes to a Python value and back, exact and range-checked.
+"""Convert one element of each type between bytes and a Python value, with range checks.
 
 ===================================  ==========================================================================
 BOOL                                 bool
@@ -16,8 +16,9 @@ LDT, DTL                             str, ``2024-02-29T12:34:56.123456789``
 POINTER, ANY                         str, the bytes in hexadecimal
 ===================================  ==========================================================================
 
-Bytes that are no value of the type (a month 13, a BCD digit above 9, a STRING longer than its maximum) decode
-to None: a controller may hold such bytes, and one register must not spoil a frame. Encoding never writes them.
+Bytes that are not a valid value of the type (month 13, a BCD digit above 9, a STRING longer than
+its maximum) decode to None: a controller may hold such bytes, and one bad register must not make a
+whole frame unreadable. Encoding never writes them.
 
 Formats: Siemens, "STEP 7 Professional", chapter "Data types".
 """
@@ -37,7 +38,7 @@ from shmio.layout.values.date_types import Buffer, from_bcd, moment_codec
 
 Scalar = bool | int | float | str | None
 
-REAL_MAX = 3.4028235e38  # of 32 bits, in the fewest digits
+REAL_MAX = 3.4028235e38  # greatest 32-bit float, in its fewest digits
 MAX_TOD_MS = 86_399_999
 MAX_LTOD_NS = calendar.NS_PER_DAY - 1
 MAX_S5_MS = 9_990_000
@@ -45,19 +46,22 @@ _S5_BASES_MS = (10, 100, 1000, 10_000)
 
 
 class ScalarCodec(Protocol):
-    """One element. ``plain`` is the struct format when the value is just that, else empty."""
+    """Codec of one element.
+
+    ``plain`` is the ``struct`` format if that alone decodes the value, else empty.
+    """
 
     plain: str
 
     def decode(self, data: Buffer, offset: int) -> Scalar:
-        """Return the value at a byte offset, None for bytes that are none of the type."""
+        """Return the value at a byte offset, or None for bytes that are not a valid value."""
 
     def encode(self, value: object) -> bytes:
-        """Return the element's bytes; raises ValueRangeError."""
+        """Return the element's bytes; ValueRangeError if the type cannot hold the value."""
 
 
 class _Number:
-    """Integers, also those that count milliseconds or nanoseconds, and floats."""
+    """Codec of floats and integers, including times in milliseconds or nanoseconds."""
 
     def __init__(self, name: str, order: str, code: str, limit: int | None = None) -> None:
         self.plain = code if limit is None else ""
@@ -82,7 +86,7 @@ class _Number:
 
 
 def bounds(code: str, limit: int | None = None) -> tuple[float, float]:
-    """The least and the greatest number that a struct code can hold; ``limit`` if that is less."""
+    """Return the least and greatest number of a ``struct`` code; ``limit`` lowers the greatest."""
     if code in "fd":
         most = REAL_MAX if code == "f" else sys.float_info.max
         return -most, most
@@ -92,7 +96,7 @@ def bounds(code: str, limit: int | None = None) -> tuple[float, float]:
 
 
 class _Text:
-    """CHAR and WCHAR: exactly one character, one code unit."""
+    """Codec of CHAR and WCHAR: one character in one code unit."""
 
     plain = ""
 
@@ -110,7 +114,7 @@ class _Text:
 
 
 class _String:
-    """STRING and WSTRING: greatest length, actual length, characters."""
+    """Codec of STRING and WSTRING: maximum length, actual length, characters."""
 
     plain = ""
 
@@ -120,7 +124,8 @@ class _String:
         self._encoding, self._unit = encoding, unit
 
     def decode(self, data: Buffer, offset: int) -> str | None:
-        # The declared length rules: the greatest length in the data is 0 until the controller has set it.
+        # The declared length counts: the maximum length in the data is 0 until the controller
+        # sets it.
         actual = self._head.unpack_from(data, offset)[1]
         if actual > self._length:
             return None
@@ -136,7 +141,7 @@ class _String:
 
 
 class _S5Time:
-    """A BCD number of 0-999 and a time base in the bits 12 and 13."""
+    """Codec of S5TIME: a BCD number of 0-999, and a time base in bits 12 and 13."""
 
     plain = ""
 
@@ -150,7 +155,7 @@ class _S5Time:
 
     def encode(self, value: object) -> bytes:
         ms = to_int(value, "S5TIME")
-        for code, base in enumerate(_S5_BASES_MS):  # the finest base that can hold it
+        for code, base in enumerate(_S5_BASES_MS):  # the finest base that fits
             if 0 <= ms <= 999 * base and ms % base == 0:
                 return self._struct.pack(code << 12 | int(str(ms // base), 16))
         if 0 <= ms <= MAX_S5_MS:
@@ -159,7 +164,7 @@ class _S5Time:
 
 
 class _Opaque:
-    """POINTER and ANY: hexadecimal text."""
+    """Codec of POINTER and ANY: hexadecimal text."""
 
     plain = ""
 
@@ -202,7 +207,7 @@ _CODES = {
 
 
 def scalar_codec(element: ElementType, byte_order: str = "big") -> ScalarCodec:
-    """Return the codec of one element of any type but BOOL, which is not whole bytes."""
+    """Return the codec of one element of any type except BOOL."""
     base, order = element.base, ">" if byte_order == "big" else "<"
     utf16 = "utf-16-be" if byte_order == "big" else "utf-16-le"
     if base in _CODES:

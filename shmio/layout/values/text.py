@@ -1,7 +1,7 @@
-"""Values as text, as wire version 1 carries them.
+"""Convert values to and from the text that wire version 1 carries.
 
-The text of a number is the shortest that reads back to the same value in the register's own type: ``0.1`` for
-a REAL. Reading also takes numbers as Java prints them.
+A number's text is the shortest that reads back as the same value of the register's type: ``0.1``
+for a REAL. Reading also accepts numbers as Java prints them.
 """
 
 from __future__ import annotations
@@ -46,15 +46,16 @@ def wire_type(register: Register) -> WireType:
 
 
 def to_text(value: Value, register: Register) -> str:
-    """Return a register's decoded value as text: ``true``, ``-3``, ``0.1``, ``NaN``, text as it is, arrays as JSON.
+    """Return a register's decoded value as text.
 
-    A scalar of None (bytes that are no value of the type) is the empty text; in an array it is ``null``.
+    Examples are ``true``, ``-3``, ``0.1`` and ``NaN``; text is unchanged, and arrays are JSON. A
+    value of None (invalid bytes) becomes empty text, and ``null`` in an array.
     """
     return _text(register.element, value)
 
 
 def texts(register: Register) -> Callable[[Value], str]:
-    """Return ``to_text`` of one register, for who needs it often."""
+    """Return a function that is ``to_text`` for one register, for repeated use."""
     element = register.element
     return _real_text if element.base == "REAL" and not register.dims else partial(_text, element)
 
@@ -70,7 +71,7 @@ def _real_text(value: Any) -> str:
 
 
 def shortest(value: float, element: ElementType) -> float:
-    """Return the float of fewest digits that is the same value in a REAL; of an LREAL, the value itself."""
+    """Return the float with the fewest digits that is the same REAL; an LREAL is unchanged."""
     return _shortest_real(value) if element.base == "REAL" and math.isfinite(value) else value
 
 
@@ -79,9 +80,10 @@ def _shortest_real(value: float) -> float:
 
 
 def from_text(text: str, register: Register) -> Value:
-    """Return the value of a text: the reverse of ``to_text``, and numbers as Java prints them.
+    """Return the value of a text: the reverse of ``to_text``; also accepts Java's numbers.
 
-    Raises ValueRangeError: no value of the register's type, or out of its range.
+    Raises:
+        ValueRangeError: The text is not a value of the register's type, or is out of range.
     """
     if len(text) > MAX_TEXT:
         raise ValueRangeError(f"{register.path}: the text is longer than {MAX_TEXT} characters")
@@ -100,7 +102,7 @@ def from_text(text: str, register: Register) -> Value:
 
 
 def json_value(value: Value, element: ElementType) -> Value:
-    """Return a value fit for JSON: a REAL's shortest digits; NaN and infinities, which JSON does not know, as texts."""
+    """Return a value for JSON: a REAL with the fewest digits; NaN and infinities as text."""
     if isinstance(value, list):
         return [json_value(item, element) for item in value]
     if isinstance(value, float):
@@ -109,7 +111,7 @@ def json_value(value: Value, element: ElementType) -> Value:
 
 
 def _finite_or_not(value: object) -> object:
-    """Read the texts of ``json_value`` back."""
+    """Convert the texts that ``json_value`` writes for NaN and infinities back to floats."""
     if isinstance(value, list):
         return [_finite_or_not(item) for item in value]
     return _NON_FINITE.get(value, value) if isinstance(value, str) else value

@@ -1,4 +1,4 @@
-"""What a new value of a register changes in a block: bytes, or a single bit whose neighbours stay as they are."""
+"""Turn new values of registers into writes to a block: bytes, or a bit without its neighbours."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from shmio.layout.values.codec import codec
 
 
 class Write(NamedTuple):
-    """Bytes of a block to be changed.
+    """A change to bytes of a block.
 
-    ``mask`` 0: all of ``data`` goes to ``offset`` and on. Else ``mask`` has one bit, and of the one byte at ``offset``
-    only that bit changes, to what it is in the one byte of ``data``.
+    With ``mask`` 0, all of ``data`` is written from ``offset`` on. Otherwise ``mask`` has one bit
+    set, ``data`` is one byte, and only that bit of the byte at ``offset`` takes its value.
     """
 
     offset: int
@@ -26,12 +26,17 @@ class Write(NamedTuple):
 
 
 def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> list[Write]:
-    """The writes that give a register, an array or a part of one this value: one but for a slice of bits.
+    """Return the writes that set a register, an array or a part of one to a value.
 
-    ValueRangeError. An array of bits is whole bytes: what fills up a row's last byte belongs to nobody.
+    There is one write, or more for a slice of bits. An array of bits is written as whole bytes,
+    because no register uses the rest of a row's last byte.
+
+    Raises:
+        ValueRangeError: The value does not fit the register.
     """
     image = bytearray(register.size)
-    codec(replace(register, offset=0), byte_order).encode_into(value, image)  # so that where it lies costs nothing
+    # With offset 0, the image needs to be no larger than the register.
+    codec(replace(register, offset=0), byte_order).encode_into(value, image)
     if register.partial:
         writes = merge(image, bits_of(register), [(0, register.size)])
         return [write._replace(offset=register.offset + write.offset) for write in writes]
@@ -40,12 +45,12 @@ def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> 
 
 
 def sizes(register: Register) -> list[int]:
-    """Bytes of each of the writes that :func:`encode` makes of a value, at the most."""
+    """Return the maximum size in bytes of each write that :func:`encode` returns for a register."""
     return [register.size] + [1] * 14 if register.partial else [register.size]
 
 
 def apply(write: Write, image: bytearray | memoryview) -> None:
-    """Change an image as a write says."""
+    """Apply a write to an image of the block."""
     offset, mask, data = write
     if mask:
         image[offset] = image[offset] & (mask ^ 0xFF) | data[0] & mask
@@ -54,7 +59,7 @@ def apply(write: Write, image: bytearray | memoryview) -> None:
 
 
 def bits_of(register: Register) -> bytes:
-    """A mask of ``size`` bytes in which the bits that the register's :func:`encode` writes are set."""
+    """Return a mask of the register's ``size`` bytes with the bits that :func:`encode` writes."""
     if register.partial:
         bits = (1 << register.count) - 1 << (register.bit or 0)
         return bits.to_bytes(register.size, "little")
@@ -64,7 +69,7 @@ def bits_of(register: Register) -> bytes:
 
 
 def covering(registers: Iterable[Register], size: int) -> bytes:
-    """An image of ``size`` bytes in which the bits of these registers are set."""
+    """Return an image of ``size`` bytes in which the bits of these registers are set."""
     mask = bytearray(size)
     for register in registers:
         for at, bits in enumerate(bits_of(register), register.offset):
@@ -73,7 +78,11 @@ def covering(registers: Iterable[Register], size: int) -> bytes:
 
 
 def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
-    """An image of the layout's size in which the bits of all that the patterns name are set; PathError."""
+    """Return an image of the block in which the bits of all registers that match are set.
+
+    Raises:
+        PathError: A pattern is malformed, or names a part that its register does not have.
+    """
     named = (register for pattern in patterns for register in chosen(layout, pattern))
     mask = bytearray(covering(named, layout.size))
     for register in layout.registers:
@@ -83,15 +92,16 @@ def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
 
 
 def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
-    """The registers, and of arrays the elements, that a path, a structure's or a pattern names; PathError.
+    """Yield the registers that a path or a pattern names; a slice as its elements.
 
-    Of a slice the elements.
+    Raises:
+        PathError: The pattern is malformed, or names a part that its register does not have.
     """
     if "*" not in pattern:
         registers = find_each(layout, pattern)
         try:
             first = next(registers)
-        except PathError:  # a structure: what is below it
+        except PathError:  # a structure: take the registers below it
             if names_part(pattern) and not layout.members(pattern):
                 raise
         else:
@@ -107,7 +117,10 @@ def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
 
 
 def merge(image: bytes | bytearray, mask: bytes | bytearray, ranges: Iterable[tuple[int, int]]) -> list[Write]:
-    """The fewest writes that bring the masked bits of an image to a block, looked for in (start, stop) ranges."""
+    """Return the fewest writes that copy the masked bits of an image to a block.
+
+    Only the bytes in the ``ranges`` (start, stop) are searched.
+    """
     writes: list[Write] = []
     for start, stop in _joined(ranges):
         at = start
@@ -125,7 +138,7 @@ def merge(image: bytes | bytearray, mask: bytes | bytearray, ranges: Iterable[tu
 
 
 def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Ranges in order, those that touch joined."""
+    """Return the ranges in order, with those that touch joined."""
     joined: list[tuple[int, int]] = []
     for start, stop in sorted(ranges):
         if joined and start <= joined[-1][1]:
@@ -136,7 +149,7 @@ def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def elements(layout: Layout, register: Register) -> Iterator[Register]:
-    """The elements of an array, the last index running fastest."""
+    """Yield the elements of an array; the last index runs fastest."""
     index = [low for low, _ in register.dims]
     for _ in range(register.count):
         yield layout.element(register, tuple(index))
@@ -149,7 +162,7 @@ def elements(layout: Layout, register: Register) -> Iterator[Register]:
 
 
 def _fill_rows(mask: bytearray, register: Register) -> None:
-    """Where all bits of a row's last byte are covered one by one, the byte is."""
+    """Set the whole last byte of each row of bits in which all declared bits are set."""
     own = bytearray(register.size)
     for flat in range(register.count):
         byte, bit = element_position(register.element, register.shape, flat)
