@@ -50,7 +50,7 @@ class Derived:
 
     @property
     def begin_s(self) -> float:
-        """Start of the first declaration, in s; 0: there is none, or it has no start."""
+        """Start of the first declaration in s; 0 if there is none, or it has no start."""
         return min((one.start_s or 0.0 for one in self.declarations), default=0.0)
 
     def shifted(self, by_s: float) -> list[Declaration]:
@@ -150,7 +150,7 @@ class _Source:
             self._declare(laid, laid.declaration, None if event.text == "over" else event.clock_ns)
 
     def end(self) -> None:
-        """End the recording: the injections that are left have no end."""
+        """End the recording; injections that are still active get no end."""
         for laid in self._laid.values():
             for held in laid.held.values():
                 self._set(laid, held, None)
@@ -171,7 +171,10 @@ class _Source:
     def _declare(
         self, laid: _RecordedInjection, one: Declaration, until_ns: int | None, since_ns: int | None = None
     ) -> None:
-        """Add a declaration, limited to a time. A change is seen from the next cycle on, hence the extra ns."""
+        """Add a declaration, limited to a time.
+
+        The extra ns is there because consumers see a change from the next cycle on.
+        """
         since_s = (max(0, laid.since_ns if since_ns is None else since_ns) + 1) / NS
         if since_s > max(one.start_s or 0.0, 1 / NS):
             one = msgspec.structs.replace(one, start_s=_round(since_s))

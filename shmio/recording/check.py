@@ -42,9 +42,9 @@ class Findings:
 
 
 def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findings:
-    """Verify every CRC and every message, and that the numbers of each block continue except in gaps.
+    """Verify all CRCs and messages, and that each block's numbers have no holes except gaps.
 
-    Of a file that was not closed the existing part is checked.
+    If the file was not closed, the existing part is checked.
 
     Args:
         reader: Reader of the file.
@@ -95,7 +95,7 @@ class _Check:
             self._log.add(record, error)
 
     def end(self) -> Findings:
-        """Return the findings. RecordingError: not a recording of shmio."""
+        """Return the findings; RecordingError if the file is not a recording of shmio."""
         self._log.end()
         self._reader.require_ours()
         return self._found
@@ -136,7 +136,7 @@ class _Check:
             self._problem(f"the chunk at byte {record.at}: its times are not those of its messages")
 
     def _message(self, channel: Channel, data: memoryview) -> None:
-        if channel.encoding in (EVENT, FRAME) and len(data) >= U64.size:  # even if the rest is not to be decoded
+        if channel.encoding in (EVENT, FRAME) and len(data) >= U64.size:  # even if the rest cannot be decoded
             self._numbers.take(channel, *U64.unpack_from(data))
         item = self._reader.decode(channel, data)
         if isinstance(item, Gap):
@@ -147,7 +147,7 @@ class _Check:
         if count is None:
             raise RecordingError(f"{self._reader.file}: the index at byte {record.at} is damaged")
         channel = self._reader.channel(count.channel)
-        if channel is None or channel.encoding:  # or another program's
+        if channel is None or channel.encoding:  # or a message of another program
             self._indexes[count.channel] = count
 
     def _compare_indexes(self) -> None:

@@ -1,4 +1,4 @@
-"""What two recordings have in common, and where they differ: frame by frame, event by event."""
+"""Compare two recordings, frame by frame and event by event."""
 
 from __future__ import annotations
 
@@ -22,7 +22,11 @@ from shmio.segment.playhead import OWN_WORDS
 
 @dataclass(slots=True)
 class RegisterDifference:
-    """A register that differs in ``count`` frames, first in those at these times; ``largest``: of numbers."""
+    """A register that differs in ``count`` frames.
+
+    ``first`` has the log times, and ``values`` the values, of the first frames that differ;
+    ``largest`` is the largest difference of numbers.
+    """
 
     count: int
     first: tuple[int, int]
@@ -32,7 +36,10 @@ class RegisterDifference:
 
 @dataclass(slots=True)
 class Difference:
-    """Something that differs first: at these log times, numbers of frames or events; None: one has none."""
+    """The first difference: log times, and numbers of the frames or events, in both recordings.
+
+    None stands for a recording that lacks the frame or event.
+    """
 
     times_ns: tuple[int | None, int | None]
     numbers: tuple[int | None, int | None]
@@ -41,7 +48,7 @@ class Difference:
 
 @dataclass(slots=True)
 class Side:
-    """Frames or events of one source in both."""
+    """Result of comparing the frames, or the events, of one source."""
 
     compared: int = 0
     differing: int = 0
@@ -51,12 +58,15 @@ class Side:
 
     @property
     def same(self) -> bool:
-        """Whether both have the same."""
+        """Whether both recordings have the same frames or events."""
         return not (self.differing or self.only_first or self.only_second)
 
 
 class Timing:
-    """How far the distances of frames to the first one differ; percentiles to 5 %, in little memory."""
+    """Timing errors: how much the times of frames, measured from the first one, differ.
+
+    Percentiles are accurate to 5 %, and memory use is small for any number of frames.
+    """
 
     def __init__(self) -> None:
         self._bins: dict[int, int] = {}
@@ -65,7 +75,7 @@ class Timing:
         self.max_ns = 0
 
     def add(self, first_ns: int, second_ns: int) -> None:
-        """Log times of two frames that belong together."""
+        """Add the log times of two matching frames."""
         if self._first is None:
             self._first = first_ns, second_ns
         error_ns = abs((first_ns - self._first[0]) - (second_ns - self._first[1]))
@@ -75,7 +85,7 @@ class Timing:
         self._count += 1
 
     def percentile_ns(self, percent: float) -> int:
-        """So many of the errors are at most this; 0 without any."""
+        """Return the percentile of the errors in ns; 0 if there are no frames."""
         rest = self._count * percent / 100
         for place in sorted(self._bins):
             rest -= self._bins[place]
@@ -86,26 +96,30 @@ class Timing:
 
 @dataclass(slots=True)
 class SourceDifference:
-    """One source in both recordings."""
+    """Differences of one source between two recordings."""
 
     source: str
     frames: Side = field(default_factory=Side)
     events: Side = field(default_factory=Side)
     registers: dict[str, RegisterDifference] = field(default_factory=dict)
     fields: dict[str, int] = field(default_factory=dict)
-    """In how many frames something else differs."""
+    """Number of frames that differ, by field (quality, reason, source time)."""
     missing: list[str] = field(default_factory=list)
-    """Registers that only one has."""
+    """Registers that only one recording has."""
     timing: Timing = field(default_factory=Timing)
 
     @property
     def same(self) -> bool:
-        """Whether nothing differs that was asked for."""
+        """Whether the recordings agree in everything that was compared."""
         return self.frames.same and self.events.same and not self.missing
 
 
 IGNORABLE: Final = ("times", "cycle", "reason", "events", "ends")
-"""``ends``: what one of the two has before the first frame or event of both, or after the last."""
+"""What a comparison may ignore.
+
+``ends`` are the frames and events of one recording before the first, or after the last, that both
+have.
+"""
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
 
 T = TypeVar("T", Frame, Event)
@@ -114,9 +128,13 @@ _Chosen = tuple[Mapping[DumpBlock, Sequence[Register]], Mapping[DumpBlock, Seque
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What is compared: ``ignore`` of :data:`IGNORABLE`; ``only`` as of :meth:`Dump.select`, none for all.
+    """Options of a comparison.
 
-    REAL and LREAL are the same within ``tolerance`` or, relative to the larger one, ``relative``.
+    Attributes:
+        ignore: Items of :data:`IGNORABLE`.
+        only: Paths of the registers to compare, as for :meth:`Dump.select`; empty for all.
+        tolerance: Absolute difference up to which REAL and LREAL values count as equal.
+        relative: The same, relative to the larger value.
     """
 
     ignore: Collection[str] = ()
@@ -132,9 +150,23 @@ def compare(
     sources: Collection[str] | None = None,
     progress: Callable[[int], object] = lambda _: None,
 ) -> Iterator[SourceDifference]:
-    """Source by source. ``progress`` is told log times of the first. PathError: no such source, or register, in either.
+    """Compare two recordings source by source.
 
-    Frames belong together that have the same cycle; where that is ignored, the same source time; else in their order.
+    Frames are matched by cycle; if cycles are ignored, by source time; if times are ignored, too,
+    by their order.
+
+    Args:
+        first: A recording.
+        second: The other recording.
+        how: Options.
+        sources: Names of the sources to compare; None for all.
+        progress: Called with log times of the first recording.
+
+    Yields:
+        The differences of each source.
+
+    Raises:
+        PathError: A source or register is in neither recording.
     """
     names = list(dict.fromkeys((*first.sources, *second.sources)))
     chosen = _chosen(first, how), _chosen(second, how)
@@ -210,7 +242,10 @@ class _Source:
         self._alone(side, self._of_end(since, inside))
 
     def _of_end(self, since: _Alone, inside: _Alone) -> _Alone:
-        """What counts of that which stands before or behind all that both have: events are inside if frames are."""
+        """Return what counts before or after everything that both have.
+
+        If ends are ignored, only entries between the first and last common frame count.
+        """
         return inside if "ends" in self._how.ignore else since
 
     def _alone(self, side: Side, alone: _Alone) -> None:
@@ -248,7 +283,7 @@ class _Source:
         return what
 
     def _registers(self, one: DumpBlock | None, other: DumpBlock | None) -> _Registers | None:
-        """What to compare of two blocks; None: nothing of one of them was asked for."""
+        """Return the registers of two blocks to compare, or None if a block is not selected."""
         if one is None or other is None or one not in self._chosen[0] or other not in self._chosen[1]:
             return None
         if (one, other) not in self._pairs:
@@ -278,7 +313,7 @@ class _Source:
 
 
 class _Alone:
-    """What one of the two alone has, since both had the same."""
+    """Entries that only one recording has, since the last that both have."""
 
     def __init__(self) -> None:
         self.counts = [0, 0]
@@ -290,7 +325,7 @@ class _Alone:
 
 
 class _Common:
-    """The time, in each of the two, from the first to the last that both have."""
+    """Time span, in each recording, from the first to the last entry that both have."""
 
     def __init__(self) -> None:
         self._times: tuple[tuple[int, int], tuple[int, int]] | None = None
@@ -303,7 +338,7 @@ class _Common:
         )
 
     def has(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
-        """Whether what only one of them has lies within."""
+        """Return whether an entry that only one recording has is within the span."""
         if self._times is None:
             return False
         first, last = self._times
@@ -329,7 +364,10 @@ class _Registers:
         self._of_array: dict[str, _Places] = {}
 
     def differing(self, one: Frame, other: Frame) -> Iterator[tuple[str, tuple[Value, Value]]]:
-        """Paths and values, of an array its elements; of what was delivered, if that alone differs."""
+        """Yield path and values of each register, or array element, that differs in two frames.
+
+        Values are those that consumers saw, or those delivered by the source if only these differ.
+        """
         seen = set()
         for path, values in self._images(one.image, other.image):
             seen.add(path)
@@ -356,7 +394,7 @@ class _Registers:
 
 
 class _Places:
-    """Registers, or elements of one, where each of two layouts has them."""
+    """Compares registers, or array elements, whose places in two layouts may differ."""
 
     def __init__(
         self,
@@ -366,7 +404,10 @@ class _Places:
         *,
         alike: bool,
     ) -> None:
-        """``alike``: both layouts have them at the same places, so that bytes can be compared."""
+        """Take pairs of registers; ``alike`` if both layouts have them at the same places.
+
+        In that case bytes are compared.
+        """
         self._pairs = pairs
         self._how = how
         self._layouts = layouts
@@ -377,11 +418,11 @@ class _Places:
         self._scan = ChangeScan([one for one, _ in pairs]) if alike else None
 
     def like(self, pairs: Sequence[tuple[Register, Register]]) -> _Places:
-        """Others of the same layouts."""
+        """Return an object that compares other registers of the same layouts."""
         return _Places(pairs, self._layouts, self._how, alike=self._scan is not None)
 
     def differing(self, one: bytes, other: bytes) -> Iterator[tuple[tuple[Register, Register], tuple[Value, Value]]]:
-        """Those whose values in two images are not the same."""
+        """Yield the registers, and their values, that differ in two images."""
         if self._scan is not None and one == other:
             return
         places = range(len(self._pairs)) if self._scan is None else self._scan.changed(one, other)
@@ -397,7 +438,7 @@ class _Places:
 
 
 def _alike(one: Value, other: Value, how: Comparison) -> bool:
-    """Whether two values are the same within the tolerance for REAL and LREAL."""
+    """Return whether two REAL or LREAL values, or arrays, are equal within the tolerance."""
     if isinstance(one, list) and isinstance(other, list):
         return all(_alike(a, b, how) for a, b in zip(one, other, strict=True))
     if not isinstance(one, float) or not isinstance(other, float):
@@ -412,7 +453,7 @@ def _kind(register: Register) -> tuple[str, object]:
 
 
 def _frames(dump: Dump, source: str) -> Iterator[Entry[Frame]]:
-    """Those of the source itself: what a replay says of its own is not."""
+    """Yield the frames of the source, without the bad frames that a replay adds on its own."""
     if source in dump.sources:
         for entry in dump.frames(source):
             if entry.item.provenance is not Provenance.REPLAYED or not entry.item.reason.startswith(OWN_WORDS):
@@ -420,7 +461,7 @@ def _frames(dump: Dump, source: str) -> Iterator[Entry[Frame]]:
 
 
 def _events(dump: Dump, source: str) -> Iterator[Entry[Event]]:
-    """Those that are of the source itself: starts and ends of its process, and what a replay tells, are not."""
+    """Yield the events of the source, without those of its process and those of a replay."""
     if source in dump.sources:
         for entry in dump.events(source):
             if entry.item.kind not in _OF_PROCESSES and not _is_replays(entry.item):

@@ -1,4 +1,4 @@
-"""What recorded events are about, in the words of their block's layout: registers, values, direction, and who."""
+"""Explain recorded events: name their registers, values, direction and writer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.segment.events import NO_WRITER, Event, EventKind
 from shmio.segment.processes import GUEST_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096
-"""Commands under way, and injections, whose beginning is kept in mind."""
+"""Limit on unfinished commands, and on injections, whose first event is kept."""
 MAX_LAID_BYTES: Final = 1 << 16
 
 _INWARD: Final = frozenset(
@@ -32,7 +32,7 @@ _INWARD: Final = frozenset(
         EventKind.REJECTED,
     }
 )
-"""What happens to writes, which may be the values that an injection over ``/in`` gives."""
+"""Results of writes, including writes of values that an injection over ``/in`` generates."""
 _WITH_VALUES: Final = frozenset({EventKind.ACCEPTED, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_WRITES: Final = frozenset({*_INWARD, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_INJECTIONS: Final = frozenset(
@@ -42,7 +42,7 @@ _ROLES: Final = {writer: name for name, writer in WRITERS.items()}
 
 
 class Place(NamedTuple):
-    """A register, an element, a range or a part: its whole path, and its value if the event has one."""
+    """A register, an element, a slice or a part, with its full path, and its value if known."""
 
     path: str
     register: Register
@@ -56,14 +56,18 @@ class Place(NamedTuple):
 
     @property
     def plain(self) -> Any:
-        """The value as JSON has it."""
+        """The value for JSON."""
         return json_value(self.value, self.register.element)
 
 
 class Explained(NamedTuple):
-    """What an event is about. ``by``: grpc, mqtt, a program; empty: nobody, or it is not known.
+    """Explanation of an event.
 
-    ``laid``: of an injection that is laid how it is, as declared or as its client has laid it; with its last event.
+    Attributes:
+        places: The registers that the event concerns.
+        direction: ``in``, ``out`` or empty.
+        by: Who caused the event: grpc, mqtt or a program; empty if nobody did, or it is unknown.
+        laid: Definition of an injection that starts, with the last of its events; else None.
     """
 
     places: tuple[Place, ...]
@@ -78,10 +82,10 @@ class _Injection(NamedTuple):
 
 
 class Explainer:
-    """Explains the events of one block, which it is given in their order."""
+    """Explains the events of one block, in the order of the recording."""
 
     def __init__(self, source: str, layout: Layout | None) -> None:
-        """``layout``: None if it cannot be read: then nothing has a name."""
+        """Take the block's layout; None if it cannot be read, and registers stay unnamed."""
         self._source = source
         self._layout = layout
         self._injections: dict[int, _Injection] = {}
@@ -89,15 +93,15 @@ class Explainer:
         self._under_way: dict[tuple[int, int, int], dict[int, tuple[Place, ...]]] = {}
 
     def explain(self, event: Event) -> Explained:
-        """What the next event is about."""
+        """Explain the next event."""
         laid = self._laid(event) if event.kind == EventKind.INJECTED else None
         known = self._injections.get(event.injection)
         direction, places = "", tuple[Place, ...]()
         if event.kind in _OF_INJECTIONS:
             direction = known.direction if known else ""
-        elif event.kind in _INWARD and event.size:  # else it is none of a write
+        elif event.kind in _INWARD and event.size:  # without a size, it is not about a write
             direction = "in"
-        elif event.kind == EventKind.SHADOWED:  # over /in an injection's values are accepted, and written
+        elif event.kind == EventKind.SHADOWED:  # values over /in have events of writes
             direction = "out"
         if event.kind in _OF_WRITES:
             places = self._of_command(event)
@@ -108,7 +112,10 @@ class Explainer:
         return Explained(places, direction, by(event.writer), laid)
 
     def _of_command(self, event: Event) -> tuple[Place, ...]:
-        """Where it writes: of an end that is told for several items at once, as they were accepted."""
+        """Return the places that a command writes.
+
+        An event that ends several items at once gets the places of their acceptance.
+        """
         if event.kind in _WITH_VALUES:
             places = self._places(event.offset, len(event.data), event.mask, event.data)
             if event.kind == EventKind.ACCEPTED:
@@ -156,7 +163,7 @@ class Explainer:
     # ---- injections --------------------------------------------------------------------------------------------------
 
     def _laid(self, event: Event) -> dict[str, Any] | None:
-        """How an injection is laid, when all parts of that have come; it is kept in mind."""
+        """Return an injection's definition once all its parts have come, and remember its places."""
         document = (self._documents.pop(event.injection, b"") if event.offset else b"") + event.data
         try:
             laid = msgspec.json.decode(document, type=dict[str, Any])
@@ -178,7 +185,7 @@ class Explainer:
         return laid
 
     def _over(self, ranges: object) -> tuple[Place, ...]:
-        """What these ranges are over: (offset, size, bits of each byte)."""
+        """Return the places that ranges (offset, size, bits of each byte) cover."""
         try:
             parts = msgspec.convert(ranges, list[tuple[int, int, int]])
         except msgspec.ValidationError:
@@ -190,13 +197,13 @@ class Explainer:
 
 
 def _is_whole(register: Register, bits: bytearray) -> bool:
-    """Whether all bits of a register are among these."""
+    """Return whether all bits of a register are set in ``bits``."""
     there = bits[register.offset : register.offset + register.size]
     return all(own & bit == own for own, bit in zip(bits_of(register), there, strict=True))
 
 
 def by(writer: int) -> str:
-    """Whose a command queue is."""
+    """Return the owner of a command queue: an endpoint, a program, or empty for none."""
     if writer == NO_WRITER:
         return ""
     return _ROLES.get(writer, f"program {writer + 1}" if writer < GUEST_SLOTS else f"writer {writer}")

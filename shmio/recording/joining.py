@@ -1,4 +1,4 @@
-"""Which entries of two recordings belong together: those with the same key, and events of one key by what they say."""
+"""Match entries of two recordings: by key, and events with the same key by their content."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from shmio.recording.format.entries import Entry
 from shmio.segment import Event, Frame
 
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
-"""What an event says, wherever and in whichever run it was told."""
+"""Content of an event, which does not depend on the run."""
 MAX_AT_ONCE: Final = 4096
-"""Events of one key that are held in memory; where time stands there may be any number of one cycle."""
+"""Limit on events of one key in memory: while time is paused, one cycle may have any number."""
 
 T = TypeVar("T", Frame, Event)
 Pair = tuple[Entry[T] | None, Entry[T] | None]
@@ -21,12 +21,12 @@ Groups = Iterator[tuple[int, list[Entry[T]]]]
 
 
 def one_by_one(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int]) -> Groups[T]:
-    """Each entry with its key."""
+    """Yield each entry as a group of its own, with its key."""
     return ((key(entry), [entry]) for entry in entries)
 
 
 def at_once(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int]) -> Groups[T]:
-    """The entries that follow each other with the same key."""
+    """Yield groups of consecutive entries with the same key."""
     for value, some in groupby(entries, key):
         while group := list(islice(some, MAX_AT_ONCE)):
             yield value, group
@@ -37,7 +37,10 @@ def joined(
     second: Groups[T],
     align: Callable[[Sequence[Entry[T]], Sequence[Entry[T]]], Iterable[Pair[T]]],
 ) -> Iterator[Pair[T]]:
-    """Pairs of what belongs together, None in place of what one of them does not have. Keys ascend."""
+    """Yield pairs of matching entries, with None for an entry that one recording lacks.
+
+    The keys of both recordings must ascend. ``align`` matches the entries of two groups.
+    """
     one, other = next(first, None), next(second, None)
     while one is not None or other is not None:
         if one is not None and (other is None or one[0] < other[0]):
@@ -52,7 +55,7 @@ def joined(
 
 
 def aligned(ones: Sequence[Entry[Event]], others: Sequence[Entry[Event]]) -> Iterator[Pair[Event]]:
-    """Events that say the same, in whichever order; of the rest those of one kind about one place, or of one kind."""
+    """Pair events with the same content in any order, then by kind and place, then by kind."""
     left: list[Entry[Event]] = list(ones)
     right: list[Entry[Event]] = list(others)
     for alike in (_content, _place, _kind):

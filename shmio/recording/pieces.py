@@ -1,4 +1,4 @@
-"""All frames of a recording as columns, piece by piece, so that any length of it fits into memory."""
+"""Read a recording as columns, in pieces that fit into memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,12 @@ def pieces(
     *,
     raw: bool = False,
 ) -> Iterator[tuple[DumpBlock, Columns]]:
-    """The chosen registers of one source, in order; each piece is of one block. PathError, RecordingError."""
+    """Yield the chosen registers of one source in order; each piece belongs to one block.
+
+    Raises:
+        PathError: There is no such source.
+        RecordingError: A part of the recording cannot be read.
+    """
     collector, of = Collector(source), None
     for block, batch in dump.batches(source, from_ns, to_ns, raw=raw):
         if block not in chosen:

@@ -1,4 +1,4 @@
-"""One row of numbers for each block out of several files."""
+"""Join the numbered frames and events of several files."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from shmio.segment import Event, Frame
 
 
 class Sequence:
-    """Leaves out what came already, and tells of what is missing between two files."""
+    """Removes duplicates, and finds what is missing between two files."""
 
     def __init__(self) -> None:
         self._last: dict[tuple[DumpBlock, str], tuple[Contents, int, int]] = {}
-        """File, number and log time of what came last."""
+        """File, number and log time of the last item."""
 
     def next(self, file: Contents, block: DumpBlock, time_ns: int, item: Item) -> tuple[Gap | None, Item | None]:
-        """(what is missing before it, what is new of it)."""
+        """Return the gap before an item, or None, and the item without what came before, or None."""
         if isinstance(item, Gap):
             what, first, last = item.what, item.first, item.last
         elif isinstance(item, Frame | Event):

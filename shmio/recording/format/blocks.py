@@ -69,7 +69,7 @@ class DumpBlock:
 
 @dataclass(slots=True)
 class Contents:
-    """What the channels of one file are: by their numbers."""
+    """Channels of one file, by number."""
 
     blocks: dict[int, DumpBlock] = field(default_factory=dict)
     """Of frames and events."""
@@ -92,9 +92,9 @@ class Contents:
 
 
 def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Contents:
-    """What is in a file; blocks that are new are added to ``blocks``.
+    """Return the contents of a file, and add its new blocks to ``blocks``.
 
-    A block whose layout is damaged is left out, and told in the survey's damage.
+    A block with a damaged layout is left out and listed in the survey's damage.
     """
     found = Contents()
     for channel in sorted(part.reader.channels.values(), key=lambda channel: (channel.block, channel.number)):

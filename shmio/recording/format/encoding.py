@@ -1,6 +1,6 @@
-"""Frames, events, gaps and steps as the messages of a recording (docs/reference/dump-format.md).
+"""Encode and decode frames, events, gaps and steps (docs/reference/dump-format.md).
 
-Decoding trusts nothing: ValueError for bytes that are no such message.
+Decoding checks everything, and raises ValueError for malformed bytes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PROCESS: Final = "process"
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
 _COUNTED: Final = struct.Struct("<QQQQQ")  # how a frame begins: number, cycle, publish, clock, source
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
-_QUALITIES: Final = (*Quality, Quality.BAD)  # what is none is not to be trusted
+_QUALITIES: Final = (*Quality, Quality.BAD)  # an unknown quality counts as bad
 _PROVENANCES: Final = tuple(Provenance)
 _MAX_U64: Final = (1 << 64) - 1
 _EFFECTIVE: Final = 1  # flag: an effective image follows the raw one
@@ -189,10 +189,10 @@ def decode_frame(data: bytes) -> Frame:
 
 
 def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """A frame as FRAME_V2: with what its message's header tells, or nearly, as differences modulo 2^64.
+    """Convert a frame to FRAME_V2: replace its numbers and times by differences modulo 2^64.
 
-    Times differ in their last bytes from frame to frame, so that each costs as much again however often it is there;
-    differences hardly ever do.
+    The differences refer to the header of the message, and hardly change from frame to frame, so
+    that they compress well; absolute times do not.
     """
     number, cycle, publish, clock, source = _COUNTED.unpack_from(data)
     head = _COUNTED.pack(
@@ -203,7 +203,7 @@ def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
 
 
 def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """The frame that was made differences of; what is too short for one stays as it is, for the decoder to refuse."""
+    """Convert a frame from FRAME_V2; bytes that are too short stay unchanged for the decoder."""
     if len(data) < _FRAME.size:
         return data
     number, cycle, publish, clock, source = _COUNTED.unpack_from(data)

@@ -21,7 +21,7 @@ ItemT_co = TypeVar("ItemT_co", bound=Item, covariant=True)
 
 
 class Entry(NamedTuple, Generic[ItemT_co]):
-    """Something recorded. ``time_ns``: log time, UTC; ``block`` is None for what is of the instance, as a step."""
+    """A recorded item with its log time (UTC); ``block`` is None for items of the whole instance."""
 
     time_ns: int
     block: DumpBlock | None
@@ -31,7 +31,7 @@ class Entry(NamedTuple, Generic[ItemT_co]):
 def messages_of(
     part: Part, within: Contents, channels: Collection[int], from_ns: int, to_ns: int
 ) -> Iterator[tuple[Contents, Entry[Item]]]:
-    """What the channels of a file hold in a range of log times, with the file's contents."""
+    """Yield the messages of a file's channels in a range of log times, with the file's contents."""
     for channel, log_ns, item in part.messages(channels, from_ns, to_ns):
         block = (
             within.numbered.get((item.source, item.block))
@@ -42,7 +42,7 @@ def messages_of(
 
 
 def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[DumpBlock, Batch]]:
-    """Frames as arrays, some at a time. ``raw``: what the source delivered, not what consumers saw."""
+    """Yield frames as arrays in batches; ``raw`` for the source's images, not the consumers'."""
     for block, of_block in groupby(frames, key=lambda entry: entry.block):
         while block is not None and (some := list(islice(of_block, BATCH_FRAMES))):
             items = [entry.item for entry in some]

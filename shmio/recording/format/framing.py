@@ -1,4 +1,4 @@
-"""What the bytes of a record of MCAP say: how long it must be, and what is in a chunk. Nothing is trusted."""
+"""Check the lengths in MCAP records, and unpack chunks. No byte of a file is trusted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 MAX_CHUNK_BYTES: Final = 32 << 20
-"""Far more than a recorder makes: 1 MiB and one message of at most 2 MiB."""
+"""Limit far above a recorder's chunks, which have 1 MiB and one message of at most 2 MiB."""
 
 HEAD: Final = struct.Struct("<BQ")  # of any record: opcode, size of its content
 CHUNK: Final = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC; then the compression's name, size, data
@@ -23,7 +23,7 @@ SIZES: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: FOOTER.size}
 
 
 class _OfThread(threading.local):
-    """A decompressor costs more to make than a chunk to unpack, and is for one thread."""
+    """Decompressor of a thread: making one takes longer than unpacking a chunk."""
 
     def __init__(self) -> None:
         self.decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
@@ -33,9 +33,10 @@ _of_thread = _OfThread()
 
 
 def framed(opcode: int, size: int, look: bytes) -> bool:
-    """Whether the lengths in a record's content, of which this is the beginning, agree with that of the whole.
+    """Return whether the lengths inside a record agree with the length of the whole record.
 
-    A length that is damaged must not lead the walk past what is whole.
+    This keeps a damaged length from leading the reader past intact records. ``look`` is the
+    beginning of the content.
     """
     try:
         if opcode == Opcode.CHUNK:
@@ -60,7 +61,13 @@ def framed(opcode: int, size: int, look: bytes) -> bool:
 
 
 def unpack(content: bytes) -> bytes:
-    """The records of a chunk, uncompressed; ValueError, struct.error, ZstdError."""
+    """Return the uncompressed records of a chunk.
+
+    Raises:
+        ValueError: A size, the compression or the checksum is wrong.
+        struct.error: The chunk is too short.
+        ZstdError: The compressed data is damaged.
+    """
     _, _, size, crc = CHUNK.unpack_from(content)
     (name_size,) = U32.unpack_from(content, CHUNK.size)
     at = CHUNK.size + 4 + name_size

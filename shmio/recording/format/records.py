@@ -1,8 +1,8 @@
-"""The records of an MCAP file, walked from front to back without an index, so that a file that ends anywhere is read.
+"""Read the records of an MCAP file from front to back, without an index.
 
-Nothing is trusted: lengths are checked against the file, against each other and against limits, chunks against their
-CRC; no more than one chunk is in memory at a time. Behind a place that makes no sense the walk goes on with the next
-chunk or attachment that is whole.
+A file may therefore end anywhere. Nothing in it is trusted: lengths are checked against the file,
+each other and limits, and chunks against their CRC. At most one chunk is in memory at a time. After
+a damaged place, reading continues with the next intact chunk or attachment.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ LOOK_BYTES: Final = 4096
 BEAT_BYTES: Final = 1 << 20
 """After so much that was read or unpacked the reader's caller is told that it goes on."""
 
-_MARK: Final = re.compile(  # how each chunk and each attachment of ours begins
+_MARK: Final = re.compile(  # beginning of each chunk and attachment that shmio writes
     rb"\x06(?=.{36}\x04\x00\x00\x00zstd)|\x09(?=.{24}.\x00\x00\x00(?:layouts|config|sources)/)", re.DOTALL
 )
 _MARK_BYTES: Final = 64
 _SEARCH_BYTES: Final = 1 << 20
 _MAX_SEARCHED: Final = 100
-"""So many places that look like a chunk or an attachment and are none: then it is not searched any further."""
+"""The search ends after this many places that look like a chunk or attachment but are not."""
 
 
 class Record(NamedTuple):
-    """A record: where its content begins, and how long that is."""
+    """Place of a record: byte at which its content begins, and size of the content."""
 
     opcode: int
     at: int
@@ -56,27 +56,33 @@ class Record(NamedTuple):
 
     @property
     def start(self) -> int:
-        """Where the record itself begins."""
+        """Byte at which the record itself begins."""
         return self.at - HEAD.size
 
 
 class Records:
-    """A file's records. ``closed`` and ``damage`` are known when :meth:`walk` has ended."""
+    """Records of a file; ``closed`` and ``damage`` are valid after :meth:`walk`."""
 
     def __init__(self, file: Path, *, own: bool = False, beat: Callable[[], object] = lambda: None) -> None:
-        """Open; RecordingError for what is no MCAP file. OSError.
+        """Open a file.
 
-        ``own``: refuse what is no regular file of this user, a link to one too: nobody else may have made it.
-        ``beat`` is called each BEAT_BYTES of work, whatever the work is: a large file takes a while.
+        Args:
+            file: The path.
+            own: Whether to accept only a regular file of this user, and no symbolic link.
+            beat: Called after each BEAT_BYTES of work, because a large file takes long.
+
+        Raises:
+            RecordingError: The file is not an MCAP file.
+            OSError: The file cannot be opened.
         """
         self.file = file
         self._beat = beat
         self._worked_bytes = 0
         self.closed = False
-        """Whether the recorder closed it: index and footer are there."""
+        """Whether the recorder closed the file, so that index and footer exist."""
         self.damage = ""
-        """Where and why the walk ended before the footer."""
-        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a FIFO would wait for its writer
+        """Where and why the walk ended before the footer; empty if it did not."""
+        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # opening a FIFO would block
         self._fd = os.open(file, flags | os.O_NOFOLLOW if own else flags)
         try:
             found = os.fstat(self._fd)
@@ -100,11 +106,11 @@ class Records:
             raise RecordingError(f"{file} is no recording: it does not begin as MCAP")
 
     def walk(self, to: int | None = None) -> Iterator[Record]:
-        """All records up to the footer; ends where the file ends.
+        """Yield all records up to the footer, or to the end of the file.
 
-        ``to``: nothing is looked for from this byte on; how the file ends is then not known.
-        Bytes that make no sense are one record of opcode BROKEN, up to the next chunk or attachment that is whole, or
-        the footer.
+        Damaged bytes are one record with opcode BROKEN, up to the next intact chunk or attachment,
+        or the footer. With ``to``, reading stops at this byte, and the end of the file stays
+        unknown.
         """
         self.closed, self.damage, self._searched = False, "", 0
         at = len(MAGIC)
@@ -132,7 +138,7 @@ class Records:
             )
 
     def summary(self) -> Iterator[Record]:
-        """The records between data and footer of a file that was closed, which tell of channels once more."""
+        """Yield the records of the summary of a closed file, which describe the channels again."""
         footer = self._footer(len(MAGIC))
         if not footer:
             return
@@ -142,7 +148,7 @@ class Records:
             at = record.at + record.size
 
     def summary_damage(self) -> str:
-        """What the footer's CRC tells of the summary of a file that was closed; empty: it is whole, or has no CRC."""
+        """Return the damage that the CRC shows in a closed file's summary; empty if there is none."""
         footer = self._footer(len(MAGIC))
         start, _, crc = FOOTER.unpack(self.read(footer + HEAD.size, FOOTER.size))
         end = footer + HEAD.size + FOOTER.size - U32.size
@@ -150,14 +156,18 @@ class Records:
         return "" if whole else f"the index between byte {start} and byte {footer} is damaged: its checksum is wrong"
 
     def crc(self, at: int, end: int) -> int:
-        """CRC-32 of some bytes, however many; RecordingError: the file became shorter."""
+        """Return the CRC-32 of the bytes from ``at`` to ``end``.
+
+        Raises:
+            RecordingError: The file became shorter.
+        """
         found = 0
         for begin in range(at, end, _SEARCH_BYTES):
             found = zlib.crc32(self.read(begin, min(_SEARCH_BYTES, end - begin)), found)
         return found
 
     def _peek(self, at: int, size: int) -> bytes:
-        """Some bytes, or as many as there are before the end that the file had when it was opened."""
+        """Return up to ``size`` bytes, ending where the file ended when it was opened."""
         return self._pread(max(0, min(size, self.size - at)), at)
 
     def _pread(self, size: int, at: int) -> bytes:
@@ -165,7 +175,7 @@ class Records:
         try:
             return os.pread(self._fd, size, at)
         except OSError as error:
-            error.filename = str(self.file)  # the call knows no name
+            error.filename = str(self.file)  # os.pread does not know the name
             raise
 
     def _worked(self, size: int) -> None:
@@ -175,7 +185,7 @@ class Records:
             self._beat()
 
     def record(self, at: int) -> Record | None:
-        """The record that begins there; None if what is there makes no sense."""
+        """Return the record at a byte, or None if no valid record begins there."""
         head = self._peek(at, HEAD.size + LOOK_BYTES)
         if len(head) < HEAD.size:
             return None
@@ -188,7 +198,7 @@ class Records:
         return Record(opcode, content, size)
 
     def _whole(self, at: int, end: int) -> int:
-        """Where, before ``end``, the next chunk or attachment begins of which all is there, by its CRC; 0: nowhere."""
+        """Return the start of the next chunk or attachment whose CRC is right; 0 if there is none."""
         for begin in range(at, end, _SEARCH_BYTES):
             for found in _MARK.finditer(self._peek(begin, _SEARCH_BYTES + _MARK_BYTES - 1)):
                 record = self.record(begin + found.start())
@@ -202,12 +212,12 @@ class Records:
         return 0
 
     def footer(self) -> Record | None:
-        """The footer of a file that was closed."""
+        """Return the footer of a closed file, or None."""
         start = self._footer(len(MAGIC))
         return self.record(start) if start else None
 
     def _footer(self, at: int) -> int:
-        """Where the footer is that ends the file, if not before here; 0: there is none."""
+        """Return the start of the footer at the end of the file, if at or after ``at``; else 0."""
         start = self.size - len(MAGIC) - FOOTER.size - HEAD.size
         record = self.record(start) if start >= at else None
         if record is None or record.opcode != Opcode.FOOTER or record.at + record.size + len(MAGIC) != self.size:
@@ -215,7 +225,11 @@ class Records:
         return start
 
     def read(self, at: int, size: int, limit: int = MAX_RECORD_BYTES) -> bytes:
-        """Some bytes; RecordingError: more than the limit, or the file became shorter."""
+        """Return ``size`` bytes.
+
+        Raises:
+            RecordingError: The size exceeds the limit, or the file became shorter.
+        """
         if size > limit:
             raise RecordingError(f"{self.file}: a record of {size} bytes at byte {at} is larger than {limit}")
         data = self._pread(size, at)
@@ -224,16 +238,20 @@ class Records:
         return data
 
     def chunk_times(self, record: Record) -> tuple[int, int]:
-        """Log times of a chunk's first and last message."""
+        """Return the log times of a chunk's first and last message."""
         start_ns, end_ns, _, _ = CHUNK.unpack(self.read(record.at, min(record.size, CHUNK.size)).ljust(CHUNK.size))
         return start_ns, end_ns
 
     def chunk(self, record: Record) -> Iterator[tuple[int, memoryview]]:
-        """(opcode, content) of the records in a chunk. RecordingError: at once if the chunk as a whole is damaged."""
+        """Yield opcode and content of each record in a chunk.
+
+        Raises:
+            RecordingError: The chunk is damaged; raised at once, or at a damaged record.
+        """
         return self._split(record, memoryview(self.unpacked(record)))
 
     def unpacked(self, record: Record) -> bytes:
-        """The bytes in a chunk, whole by their CRC; RecordingError."""
+        """Return the uncompressed bytes of a chunk, checked against its CRC; else RecordingError."""
         try:
             data = unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES))
         except (ValueError, struct.error, zstandard.ZstdError) as error:
@@ -242,7 +260,7 @@ class Records:
         return data
 
     def check_crc(self, record: Record) -> None:
-        """RecordingError if a chunk's or an attachment's own CRC is wrong."""
+        """Raise RecordingError if the CRC of a chunk or an attachment is wrong."""
         if record.opcode == Opcode.CHUNK:
             self.chunk(record)
         elif record.opcode == Opcode.ATTACHMENT:
@@ -264,7 +282,10 @@ class Records:
             at += size
 
     def hold(self) -> None:
-        """Have recorders that delete what is old spare it, as long as it is open; where the file system has locks."""
+        """Lock the file while it is open, so that no recorder deletes it as old.
+
+        This has no effect on a file system without locks.
+        """
         with suppress(OSError):
             fcntl.flock(self._fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
@@ -276,5 +297,5 @@ class Records:
 
 
 def stream(data: bytes | memoryview) -> ReadDataStream:
-    """What the mcap library's records are read from; a bounded copy."""
+    """Return a stream from which the mcap library reads records; it has its own copy of the data."""
     return ReadDataStream(BytesIO(data))

@@ -1,1 +1,1 @@
-"""Reading recordings: whole ones, those of a killed recorder, and those being written."""
+"""Read recordings: closed ones, those of a killed recorder, and those being written."""

@@ -1,4 +1,4 @@
-"""Frames of a block as arrays, a chunk at a time, without a Python object for each."""
+"""Read the frames of a block as arrays, one chunk at a time, without a Python object for each."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ _TOLD: Final = np.dtype(
         ("publish_ns", "<i8"),
     ]
 )
-"""The same for numpy."""
+"""The record and message header for numpy."""
 _HEAD_SIZE: Final = 9
 _LOG_AT: Final = 15
 _WORTH: Final = 4
-"""Runs that are shorter cost more than they save: after some of these a chunk is walked through message by message."""
+"""Shorter runs do not pay: after ``_MAX_TRIES`` of them, a chunk is read message by message."""
 _MAX_TRIES: Final = 8
 
 _Bytes = npt.NDArray[np.uint8]
@@ -62,9 +62,11 @@ _Bytes = npt.NDArray[np.uint8]
 class Batch:
     """n frames of one block in order.
 
-    ``time_ns``: (n,) int64, log times. ``records``: (n, header + image size) uint8, each a header as of :data:`HEAD`
-    and the image: what consumers saw, or what the source delivered where that was asked for. ``reasons``: of the
-    frames; None if they are empty.
+    Attributes:
+        time_ns: Log times, int64, shape (n,).
+        records: Headers (:data:`HEAD`) and images, uint8, shape (n, header + image size). Images
+            are those that consumers saw, or the source's if these were requested.
+        reasons: The frames' reasons; None if all are empty.
     """
 
     time_ns: npt.NDArray[np.int64]
@@ -90,9 +92,18 @@ class Batch:
 
 
 def batch(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int, *, raw: bool = False) -> Batch | None:
-    """The frames of a channel, whose images have this size, in a chunk, in this range of log times; None without any.
+    """Return the frames of a channel in a chunk, or None if there are none in the range.
 
-    RecordingError: they cannot be decoded.
+    Args:
+        data: The uncompressed chunk.
+        channel: The channel.
+        size: Size of an image in bytes.
+        from_ns: First log time.
+        to_ns: Last log time.
+        raw: Whether to return the source's images instead of those that consumers saw.
+
+    Raises:
+        RecordingError: The frames cannot be decoded.
     """
     array = np.frombuffer(data, np.uint8)
     found = []
@@ -114,7 +125,11 @@ def batch(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int, *,
 
 
 def frames(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int) -> list[tuple[int, Frame]]:
-    """The same frames as objects, with their log times; RecordingError."""
+    """Return the frames of a channel in a chunk as objects, with their log times.
+
+    Raises:
+        RecordingError: The frames cannot be decoded.
+    """
     found = []
     at, end, unpack = 0, len(data), _MESSAGE.unpack_from
     while at < end:
@@ -145,10 +160,13 @@ def _frame(piece: bytes, size: int) -> Frame:
 
 
 def _runs(array: _Bytes, data: bytes, wanted: int) -> Iterator[_Bytes]:
-    """The messages of a channel: (n, bytes of a message) of such as have one size and one distance.
+    """Yield a channel's messages in runs (n, bytes of a message) of one size and distance.
 
-    Messages of several blocks mostly take turns, so that the records from one of the channel to the next come again and
-    again: then they are compared all at once, and not walked through one by one. RecordingError.
+    Messages of several blocks mostly take turns, so that the same pattern of records repeats. Such
+    a run is compared all at once instead of record by record.
+
+    Raises:
+        RecordingError: The records do not fit the chunk.
     """
     at, end, begin, tries = 0, len(data), -1, _MAX_TRIES
     pattern: list[int] = []
@@ -176,7 +194,7 @@ def _runs(array: _Bytes, data: bytes, wanted: int) -> Iterator[_Bytes]:
 
 
 def _repeats(array: _Bytes, begin: int, period: int, pattern: list[int]) -> int:
-    """How often the records at the places of the pattern, the first at ``begin``, come one behind another."""
+    """Return how often a pattern of records, first at ``begin``, repeats without interruption."""
     count = (len(array) - begin) // period
     rows = array[begin : begin + count * period].reshape(count, period)
     same = np.ones(count, np.bool_)
@@ -187,7 +205,7 @@ def _repeats(array: _Bytes, begin: int, period: int, pattern: list[int]) -> int:
 
 
 def _cut(array: _Bytes, begin: int, period: int, count: int, size: int) -> _Bytes:
-    """(count, size) bytes: messages of one size, whose beginnings are a period apart."""
+    """Return messages of one size, which begin ``period`` bytes apart, as bytes (count, size)."""
     if size < _MESSAGE.size:
         raise RecordingError("a message is shorter than its header")
     if count == 1:
@@ -196,7 +214,7 @@ def _cut(array: _Bytes, begin: int, period: int, count: int, size: int) -> _Byte
 
 
 def _restored(run: _Bytes) -> _Bytes:
-    """What :func:`~shmio.recording.format.encoding.restore` makes of each message of FRAME_V2, all at once."""
+    """Convert messages from FRAME_V2 all at once, as ``restore`` (``encoding.py``) converts one."""
     told = run[:, : _MESSAGE.size].view(_TOLD)[:, 0]
     frames = run[:, _MESSAGE.size :].copy()
     if frames.shape[1] >= HEAD.itemsize:
@@ -210,7 +228,7 @@ def _restored(run: _Bytes) -> _Bytes:
 
 
 def _regular(frames: _Bytes, size: int) -> bool:
-    """Whether these frames are a header and one image each."""
+    """Return whether each frame has a header and one image, and nothing else."""
     if frames.shape[1] != HEAD.itemsize + size:
         return False
     head = frames[:, : HEAD.itemsize].view(HEAD)[:, 0]
@@ -219,7 +237,7 @@ def _regular(frames: _Bytes, size: int) -> bool:
 
 
 def _decoded(frames: _Bytes, size: int, *, raw: bool) -> tuple[_Bytes, list[str]]:
-    """The same of any frames, one by one, and their reasons."""
+    """Decode any frames one by one; return records as in :class:`Batch`, and the reasons."""
     records, reasons = [], []
     for piece in map(bytes, frames):
         frame = _frame(piece, size)

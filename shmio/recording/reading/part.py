@@ -1,4 +1,4 @@
-"""One file of a dump, read from any time on."""
+"""Read one file of a dump from any time on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shmio.recording.reading.survey import Survey, Track, read_index, survey
 from shmio.segment.frame import Frame
 
 MAX_SUMMARY_BYTES: Final = 64 << 20
-"""A chunk takes about 90 bytes of it: a week."""
+"""A chunk takes about 90 bytes of the summary, so that this is enough for a week."""
 
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")  # first and last log time, start, length; bytes of the map that follows
 _PLACE: Final = struct.Struct("<HQ")  # a channel and where its message index is, or how many messages it has
@@ -29,7 +29,10 @@ _STATISTICS: Final = struct.Struct("<QHIIIIQQI")
 
 
 def survey_by_index(reader: Reader) -> Survey | None:
-    """As :func:`~shmio.recording.reading.survey.survey`; None where the file has no whole and consistent index."""
+    """Survey a recording by its index; None if it has no intact and consistent index.
+
+    The result is the same as that of :func:`~shmio.recording.reading.survey.survey`.
+    """
     try:
         data = _summary(reader)
         return _Work(reader).survey(data) if data else None
@@ -38,7 +41,7 @@ def survey_by_index(reader: Reader) -> Survey | None:
 
 
 def _summary(reader: Reader) -> bytes:
-    """The bytes of the summary, whole by their CRC; empty if there are none."""
+    """Return the summary's bytes if their CRC is right, else an empty object."""
     footer = reader.records.footer()
     if footer is None:
         return b""
@@ -57,7 +60,7 @@ class _Work:
         self._found = Survey()
         self._first: dict[int, tuple[Record, int]] = {}
         self._last: dict[int, tuple[Record, int]] = {}
-        """By channel the first and the last chunk with messages of it, and where their message indexes are."""
+        """First and last chunk with messages of a channel, and places of their message indexes."""
         self._counts: dict[int, int] = {}
         self._chunk_count = -1
 
@@ -93,7 +96,7 @@ class _Work:
         self._found.chunks.add(chunk, first_ns, last_ns, [number for number, _ in places])
 
     def _track(self, number: int, chunk: Record, index: int) -> None:
-        """RecordingError, ValueError."""
+        """Note the messages of a channel; RecordingError or ValueError if the index is wrong."""
         reader = self._reader
         channel = reader.channel(number)
         last_chunk, last_index = self._last[number]
@@ -125,7 +128,7 @@ def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
 
 
 def _places(content: memoryview, at: int) -> Iterator[tuple[int, int]]:
-    """The map of channels to numbers whose length stands before ``at``."""
+    """Yield the items of a map of channels to numbers; its length is before ``at``."""
     (size,) = struct.unpack_from("<I", content, at - 4)
     if size > len(content) - at or size % _PLACE.size:
         raise ValueError
@@ -139,10 +142,15 @@ T = TypeVar("T")
 
 
 class Part:
-    """A file, and where in it what is. OSError, RecordingError: it cannot be opened, or is no recording of ours."""
+    """One file of a dump, with a survey of its contents.
+
+    Raises:
+        OSError: The file cannot be opened.
+        RecordingError: The file is not a recording of shmio.
+    """
 
     def __init__(self, file: Path, damaged: Damaged | None) -> None:
-        """``damaged`` is told of what cannot be read; without it RecordingError is raised there."""
+        """Open a file; call ``damaged`` for damage, or raise RecordingError there if it is None."""
         self.file = file
         self.reader = Reader(file)
         self._damaged = damaged
@@ -156,7 +164,7 @@ class Part:
         self.begin_ns, self.end_ns = self.found.begin_ns, self.found.end_ns
 
     def messages(self, channels: Collection[int], from_ns: int, to_ns: int) -> Iterator[Message]:
-        """Messages of the channels with these numbers in a range of log times, as the file has them."""
+        """Yield the messages of channels in a range of log times, in file order."""
         records = (record for record, _, _ in self._chunks(from_ns, to_ns, channels))
         damaged = self._tell if self._damaged else None
         yield from self.reader.messages(
@@ -164,14 +172,17 @@ class Part:
         )
 
     def messages_before(self, channels: Collection[int], time_ns: int) -> Iterator[list[Message]]:
-        """Messages not after a time, chunk by chunk, the last chunk first; in each as the file has them."""
+        """Yield the messages up to a time, chunk by chunk, the last chunk first.
+
+        Within a chunk, messages are in file order.
+        """
         for record, _, _ in self.found.chunks.before(time_ns, self._sure(channels)):
             damaged = self._tell if self._damaged else None
             wanted = lambda channel: channel.number in channels  # noqa: E731
             yield list(self.reader.messages(wanted, 0, time_ns, damaged, [record]))
 
     def batches(self, number: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Iterator[Batch]:
-        """Frames of a channel, whose images have this size, chunk by chunk."""
+        """Yield the frames of a channel as arrays, chunk by chunk; ``size`` is that of an image."""
         channel = self.reader.channels[number]
         for found in self._each(
             channel.number, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)
@@ -180,13 +191,13 @@ class Part:
                 yield found
 
     def frames(self, number: int, size: int, from_ns: int, to_ns: int) -> Iterator[tuple[int, Frame]]:
-        """The same as objects, with their log times."""
+        """Yield the frames of a channel as objects, with their log times."""
         channel = self.reader.channels[number]
         for found in self._each(number, from_ns, to_ns, lambda data: frames(data, channel, size, from_ns, to_ns)):
             yield from found
 
     def _each(self, channel: int, from_ns: int, to_ns: int, decode: Callable[[bytes], T]) -> Iterator[T]:
-        """What is made of each chunk that may have something of a channel in a range of log times."""
+        """Decode each chunk that may have messages of a channel in a range of log times."""
         log = DamageLog(self._tell)
         for record, first_ns, last_ns in self._chunks(from_ns, to_ns, [channel]):
             try:
@@ -203,7 +214,7 @@ class Part:
 
     def _decoded(self, record: Record, decode: Callable[[bytes], T]) -> T:
         if record.opcode != Opcode.CHUNK:
-            self.reader.note(record)  # which says what is wrong with it
+            self.reader.note(record)  # raises an error about the damage
         data = self.reader.records.unpacked(record)
         try:
             return decode(data)
@@ -214,7 +225,10 @@ class Part:
         return self.found.chunks.between(from_ns, to_ns, self._sure(channels))
 
     def _sure(self, channels: Collection[int]) -> Collection[int] | None:
-        """A chunk's own index has no CRC: it must not hide a chunk that is whole."""
+        """Return the channels if the summary has been checked, else None.
+
+        The index of a single chunk has no CRC; it must not hide an intact chunk.
+        """
         return channels if self._indexed else None
 
     def _tell(self, damage: Damage) -> None:

@@ -46,7 +46,7 @@ MAX_LAYOUT_BYTES: Final = 64 << 20
 MAX_ATTACHMENTS: Final = 10_000
 
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_ATTACHMENT_HEAD: Final = 4096  # times, name, media type and size of any attachment fit in
+_ATTACHMENT_HEAD: Final = 4096  # enough for times, name, media type and size of any attachment
 _LAYOUTS: Final = "layouts/"
 
 
@@ -69,7 +69,7 @@ class Message(NamedTuple):
 
 
 class AttachmentEntry(NamedTuple):
-    """An attachment: where its data is, and the record that holds it."""
+    """Place of an attachment's data, and the record that contains it."""
 
     at: int
     size: int
@@ -268,12 +268,12 @@ class Reader:
             raise RecordingError(f"{self.file}: the record at byte {record.at} is damaged") from None
 
     def _is_cut_short(self) -> bool:
-        """Whether it ends within its header."""
+        """Return whether the file ends within its header."""
         start = self.records.read(len(MAGIC), min(1, self.records.size - len(MAGIC)))
         return start in (b"", bytes([Opcode.HEADER])) and self.records.record(len(MAGIC)) is None
 
     def _profile(self, record: Record) -> str:
-        """What a header says that the file is; nothing depends on it but what is said of one without content."""
+        """Return the profile in the header, which matters only for the message about an empty file."""
         with suppress(ValueError, struct.error, McapError):
             return str(Header.read(stream(self.records.read(record.at, min(record.size, LOOK_BYTES)))).profile)
         return ""
@@ -297,7 +297,7 @@ class Reader:
             channel = describe(content)
         except (ValueError, KeyError, struct.error, McapError):
             raise RecordingError(f"{self.file}: the description of a channel is damaged") from None
-        if self.channels.setdefault(channel.number, channel) != channel:  # whose messages could be read in two ways
+        if self.channels.setdefault(channel.number, channel) != channel:  # messages would be ambiguous
             raise RecordingError(f"{self.file}: channel {channel.number} is described twice, and differently")
 
     def require_ours(self) -> None:

@@ -1,4 +1,4 @@
-"""What is in a recording, found out without reading all of it: chunks are passed over where their indexes suffice."""
+"""Survey a recording without reading all of it: chunks are skipped if their indexes suffice."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from shmio.recording.reading.reader import Reader
 
 MAX_CHUNKS: Final = 1 << 22
 MAX_SETS: Final = 1 << 16
-"""Different sets of channels that chunks hold."""
+"""Limit on different sets of channels in the chunks."""
 
 _Times = npt.NDArray[np.uint64]
 
 
 class Chunks:
-    """A table of chunks, and of places that cannot be read, as the file has them; 40 bytes for each."""
+    """Table of chunks and damaged places in file order, with about 40 bytes for each."""
 
     def __init__(self) -> None:
         self._at = array("Q")
@@ -43,7 +43,11 @@ class Chunks:
         return len(self._at)
 
     def add(self, chunk: Record, first_ns: int, last_ns: int, channels: Collection[int]) -> None:
-        """The next chunk; RecordingError: more than any recorder makes."""
+        """Add the next chunk.
+
+        Raises:
+            RecordingError: There are more chunks than any recorder writes.
+        """
         held = frozenset(channels)
         if len(self._at) >= MAX_CHUNKS or (held not in self._sets and len(self._sets) >= MAX_SETS):
             raise RecordingError(f"more than {MAX_CHUNKS} chunks, or channels in more than {MAX_SETS} combinations")
@@ -55,22 +59,23 @@ class Chunks:
         self._last_ns.append(last_ns)
 
     def add_broken(self, record: Record) -> None:
-        """Bytes that make no sense, behind the last chunk; RecordingError."""
+        """Add damaged bytes after the last chunk; RecordingError as in :meth:`add`."""
         at_ns = self._last_ns[-1] if self._last_ns else 0
         self.add(record, at_ns, at_ns, ())
 
     def between(
         self, from_ns: int, to_ns: int, channels: Collection[int] | None = None
     ) -> Iterator[tuple[Record, int, int]]:
-        """(chunk, log time of its first message, of its last) of those that may hold something of this range.
+        """Yield the chunks that may have messages in a range of log times.
 
-        ``channels``: only those with messages of some of these.
+        With each chunk come the log times of its first and last message. ``channels`` selects the
+        chunks with messages of some of these channels.
         """
         begin, end = self._bounds(from_ns, to_ns)
         yield from self._rows(range(begin, end), from_ns, to_ns, channels)
 
     def before(self, time_ns: int, channels: Collection[int] | None = None) -> Iterator[tuple[Record, int, int]]:
-        """The same of those that begin not after a time, the last one first."""
+        """Yield the chunks that begin at or before a time, the last one first, as :meth:`between`."""
         _, end = self._bounds(0, time_ns)
         yield from self._rows(range(end - 1, -1, -1), 0, time_ns, channels)
 
@@ -84,7 +89,10 @@ class Chunks:
                 yield Record(self._opcode[index], self._at[index], self._size[index]), first_ns, last_ns
 
     def _bounds(self, from_ns: int, to_ns: int) -> tuple[int, int]:
-        """Indices between which all are that may hold something of this range: their times may overlap a little."""
+        """Return a range of indices that includes all chunks of a range of log times.
+
+        The times of neighbouring chunks may overlap a little.
+        """
         latest_ns, earliest_ns = self._sorted
         begin = int(np.searchsorted(latest_ns, np.uint64(min(max(from_ns, 0), _MAX_U64)), "left"))
         end = int(np.searchsorted(earliest_ns, np.uint64(min(max(to_ns, 0), _MAX_U64)), "right"))
@@ -92,7 +100,10 @@ class Chunks:
 
     @cached_property
     def _sorted(self) -> tuple[_Times, _Times]:
-        """The latest time up to each chunk, and the earliest from each on: both go up. The table is complete then."""
+        """The latest time up to each chunk, and the earliest from each on; both ascend.
+
+        They are computed once, when the table is complete.
+        """
         first_ns: npt.NDArray[Any] = np.array(self._first_ns, np.uint64)
         last_ns: npt.NDArray[Any] = np.array(self._last_ns, np.uint64)
         return np.maximum.accumulate(last_ns), np.minimum.accumulate(first_ns[::-1])[::-1]
@@ -102,16 +113,16 @@ _MAX_U64: Final = (1 << 64) - 1
 
 
 MAX_GAPS: Final = 1000
-"""Gaps that are kept one by one; all are counted."""
+"""Limit on gaps that are listed; all are counted."""
 MAX_DAMAGE: Final = 20
-"""Damaged places that are told."""
+"""Limit on damaged places that are listed."""
 MAX_BLOCKS: Final = 10_000
 
 _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
 
 
 class Count(NamedTuple):
-    """Messages of one channel in one chunk: how many, log times of the first and the last."""
+    """Number of messages of a channel in a chunk, and log times of the first and last."""
 
     channel: int
     messages: int
@@ -121,7 +132,7 @@ class Count(NamedTuple):
 
 @dataclass(slots=True)
 class Track:
-    """The messages of one channel: how many, from when to when, in which chunks the first and the last are."""
+    """Number of messages of one channel; times and chunks of the first and the last one."""
 
     channel: Channel
     count: int
@@ -131,22 +142,26 @@ class Track:
     last_in: Record
 
     def numbers(self, reader: Reader) -> tuple[int, int]:
-        """Numbers of its first and its last frame or event; RecordingError."""
+        """Return the numbers of the first and last frame or event.
+
+        Raises:
+            RecordingError: They cannot be read.
+        """
         return self._in(reader, self.first_in)[0], self.last(reader)
 
     def last(self, reader: Reader) -> int:
-        """Number of its last frame or event; RecordingError."""
+        """Return the number of the last frame or event; RecordingError if it cannot be read."""
         return self._in(reader, self.last_in)[-1]
 
     def _in(self, reader: Reader, chunk: Record) -> list[int]:
-        """Its numbers in a chunk: one at least."""
+        """Return the channel's numbers in a chunk, at least one."""
         found: list[int] = []
         try:
             for channel, _, data in reader.raw(chunk):
                 if channel.number == self.channel.number and len(data) >= U64.size:
-                    found.append(U64.unpack_from(data)[0])  # how frames and events begin
+                    found.append(U64.unpack_from(data)[0])  # frames and events begin with it
         except RecordingError:
-            if not found:  # otherwise it is messages of other channels that are lost
+            if not found:  # otherwise only messages of other channels are lost
                 raise
         if not found:
             raise RecordingError(f"{reader.file}: {self.channel.topic}: an index names messages that are not there")
@@ -155,34 +170,38 @@ class Track:
 
 @dataclass(slots=True)
 class Survey:
-    """A recording as a whole."""
+    """Contents of a recording as a whole."""
 
     tracks: dict[int, Track] = field(default_factory=dict)
-    """By the channel's number."""
+    """Messages by the channel's number."""
     gaps: list[Gap] = field(default_factory=list)
-    """The first ones."""
+    """The first gaps, at most ``MAX_GAPS``."""
     missed: dict[tuple[str, int, str], int] = field(default_factory=dict)
-    """How many by source, block, and what it is."""
+    """Number of missing items by source, block and kind."""
     missed_to: dict[tuple[str, int, str], int] = field(default_factory=dict)
-    """Highest number missed."""
+    """Highest missing number, by source, block and kind."""
     gap_count: int = 0
     damage: list[str] = field(default_factory=list)
-    """What could not be read."""
+    """Descriptions of what could not be read."""
     chunks: Chunks = field(default_factory=Chunks)
-    """All that can be told of, by their indexes or by themselves."""
+    """All chunks found, by their indexes or by reading them."""
 
     @property
     def begin_ns(self) -> int:
-        """Log time of the first frame or event; 0: there is none."""
+        """Log time of the first frame or event; 0 if there is none."""
         return min((track.first_ns for track in self.tracks.values() if track.channel.source), default=0)
 
     @property
     def end_ns(self) -> int:
-        """Log time of the last one."""
+        """Log time of the last frame or event; 0 if there is none."""
         return max((track.last_ns for track in self.tracks.values() if track.channel.source), default=0)
 
     def add_gap(self, gap: Gap) -> None:
-        """Something was missed. RecordingError: it is of more blocks than a recorder tells of."""
+        """Add a gap.
+
+        Raises:
+            RecordingError: There are gaps of more blocks than any recorder writes.
+        """
         key = (gap.source, gap.block, gap.what)
         if key not in self.missed and len(self.missed) >= MAX_BLOCKS:
             raise RecordingError(f"gaps of more than {MAX_BLOCKS} blocks")
@@ -194,7 +213,11 @@ class Survey:
 
 
 def survey(reader: Reader) -> Survey:
-    """Walk through the file. RecordingError: it is no recording of ours; damage within it is noted only."""
+    """Survey a recording by walking through the file; damage is noted and skipped.
+
+    Raises:
+        RecordingError: The file is not a recording of shmio.
+    """
     found = Survey()
     chunk: Record | None = None
     counts: list[Count] | None = []
@@ -204,7 +227,7 @@ def survey(reader: Reader) -> Survey:
             counts = None if counts is None or count is None else [*counts, count]
             continue
         if chunk is not None:
-            if record.opcode == BROKEN:  # which may be the rest of its indexes
+            if record.opcode == BROKEN:  # perhaps the rest of the chunk's indexes
                 counts = None
             _settle(reader, found, chunk, counts)
             chunk = None
@@ -217,7 +240,7 @@ def survey(reader: Reader) -> Survey:
                 reader.note(record)
             except RecordingError as error:
                 _damaged(found, str(error))
-    if chunk is not None:  # the last of a file that ends here: its indexes may be missing
+    if chunk is not None:  # the file ends here: indexes of its last chunk may be missing
         _settle(reader, found, chunk, None)
     if reader.summary_damage:
         _damaged(found, reader.summary_damage)
@@ -227,7 +250,7 @@ def survey(reader: Reader) -> Survey:
 
 
 def read_index(reader: Reader, record: Record) -> Count | None:
-    """What a message index says; None if it is of no use."""
+    """Read a message index; return None if it is invalid."""
     if not INDEX.size < record.size <= MAX_RECORD_BYTES or (record.size - INDEX.size) % _ENTRY.size:
         return None
     data = reader.records.read(record.at, record.size)
@@ -238,7 +261,7 @@ def read_index(reader: Reader, record: Record) -> Count | None:
 
 
 def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[Count] | None) -> None:
-    """Count a chunk's messages: by its indexes, unless something in it must be read."""
+    """Count a chunk's messages by its indexes, or by reading it if that is necessary."""
     if not counts or any(_must_read(reader, count.channel) for count in counts):
         counts = _read(reader, found, chunk)
     first_ns, last_ns = reader.records.chunk_times(chunk)
@@ -259,12 +282,12 @@ def _damaged(found: Survey, why: str) -> None:
 
 
 def _must_read(reader: Reader, number: int) -> bool:
-    channel = reader.channels.get(number)  # which a chunk describes, with a CRC; the summary is only for want of that
+    channel = reader.channels.get(number)  # as described in a chunk, which has a CRC; not in the summary
     return channel is None or channel.encoding == GAP
 
 
 def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
-    """Count what can be read of a chunk."""
+    """Count the readable messages of a chunk."""
     counts: dict[int, Count] = {}
     try:
         for channel, log_ns, data in reader.raw(chunk):
