@@ -1,6 +1,6 @@
-/* Follows one register of a running instance: every frame, once, with an exact count of what was lost.
+/* Follows one register of a running instance: prints every frame once, and counts lost frames exactly.
  *
- * Written from docs/reference/segment-format.md alone; uses nothing of shmio and needs nothing from the instance.
+ * Written from docs/reference/segment-format.md alone; uses no code of shmio.
  *     cc -std=c11 -o reader examples/reader.c
  *     ./reader a50 cell/Robot_800/Axs1_Pos [FRAMES]
  */
@@ -37,15 +37,16 @@ static _Noreturn void fail(const char *format, ...)
     exit(1);
 }
 
-/* Shared words, by single atomic accesses; who calls has checked that they lie within the mapping, aligned. */
+/* Read shared words by single atomic accesses. The caller has checked that they are within the
+ * mapping and aligned. */
 #define WORD(type, at, order) atomic_load_explicit((const _Atomic type *)(const void *)(base + (at)), order)
 static uint32_t get32(uint64_t at) { return WORD(uint32_t, at, memory_order_acquire); }
 static uint64_t get64(uint64_t at) { return WORD(uint64_t, at, memory_order_acquire); }
 static uint64_t relaxed64(uint64_t at) { return WORD(uint64_t, at, memory_order_relaxed); }
 static bool within(uint64_t at, uint64_t length) { return at <= size && length <= size - at; }
 
-typedef struct { /* of a ring: where its header is, and our own copy of its geometry, checked */
-    uint64_t at, entry, clock; /* entry: of the section table; clock: the page, 0: the source keeps real time */
+typedef struct { /* a ring: place of its header, and a checked copy of its geometry */
+    uint64_t at, entry, clock; /* entry: in the section table; clock: place of the page; 0: real time */
     uint32_t slots, stride, frame_size, effective;
     int64_t stale_ns;
 } Ring;
@@ -59,7 +60,7 @@ typedef struct {
 
 typedef struct {
     uint64_t number, cycle;
-    int64_t asked_ns; /* the image may be as old as this */
+    int64_t asked_ns; /* lower bound of the image's time */
     unsigned quality;
     char reason[257];
     uint8_t value[8];
@@ -82,7 +83,7 @@ static void map(const char *instance)
     if (get32(8) != ABI || get32(12) != 4096) fail("%s has ABI %u, this program knows %d", object, get32(8), ABI);
 }
 
-/* A tiny search in the layout's JSON, whose writer puts no blanks between tokens; enough for plain paths. */
+/* Searches in the layout's JSON, which has no blanks between tokens; enough for plain paths. */
 static bool find_register(const char *json, const char *path, Register *found)
 {
     char key[512];
@@ -94,7 +95,7 @@ static bool find_register(const char *json, const char *path, Register *found)
     if (sscanf(at + strlen(key), "%15[A-Z]", found->type) != 1) return false;
     if (strncmp(dims + 7, "null", 4) != 0) fail("%s is an array: name a register of one value", path);
     found->offset = strtoull(offset + 9, NULL, 10);
-    found->bit = (unsigned)strtoul(bit + 6, NULL, 10) & 7; /* null, of all but BOOL: 0 */
+    found->bit = (unsigned)strtoul(bit + 6, NULL, 10) & 7; /* null, for all types but BOOL, gives 0 */
     found->size = (unsigned)strtoul(bytes + 7, NULL, 10);
     found->big = strstr(json, "\"byte_order\":\"little\"") == NULL;
     return true;
@@ -131,8 +132,8 @@ static Ring find(const char *source, const char *path, Register *found)
 static bool read_frame(const Ring *ring, const Register *of, uint64_t number, Frame *frame)
 {
     uint64_t slot = ring->at + RING_HEADER + (uint64_t)ring->stride * (number & (ring->slots - 1));
-    if (get64(slot) != 2 * number + 2) return false; /* acquire: what follows is read after it */
-    uint64_t words[40], pair[2]; /* the slot's header and reason; a value of 8 bytes lies in two words at most */
+    if (get64(slot) != 2 * number + 2) return false; /* acquire: the reads below come after it */
+    uint64_t words[40], pair[2]; /* the slot's header and reason; a value spans at most two words */
     for (unsigned i = 1; i < 40; i++) words[i] = relaxed64(slot + 8 * i);
     uint64_t first = slot + (words[5] >> 48 & 1 ? ring->effective : RAW) + of->offset / 8 * 8;
     pair[0] = relaxed64(first);
@@ -155,17 +156,17 @@ static void show(const Frame *frame, const Register *of, uint64_t missed, bool i
 {
     uint64_t value = 0;
     for (unsigned i = 0; i < of->size; i++) value = value << 8 | frame->value[of->big ? i : of->size - 1 - i];
-    union { uint32_t half; uint64_t whole; float real; double lreal; } bits = {.whole = value}; /* half: its low one */
+    union { uint32_t half; uint64_t whole; float real; double lreal; } bits = {.whole = value}; /* half: the low half */
     const char *quality = is_stale ? "bad" : frame->quality == 2 ? "good" : frame->quality == 1 ? "uncertain" : "bad";
     printf("%" PRIu64 " cycle %" PRIu64 " missed %" PRIu64 " %s ", frame->number, frame->cycle, missed, quality);
     if (strcmp(of->type, "REAL") == 0) printf("%.9g", (double)bits.real);
     else if (strcmp(of->type, "LREAL") == 0) printf("%.17g", bits.lreal);
     else if (strcmp(of->type, "BOOL") == 0) printf("%s", value >> of->bit & 1 ? "true" : "false");
-    else if (strstr("SINT DINT LINT", of->type)) /* INT too, but none of the unsigned */
+    else if (strstr("SINT DINT LINT", of->type)) /* also INT, but no unsigned type */
         printf("%" PRId64, (int64_t)(value << (64 - 8 * of->size)) >> (64 - 8 * of->size));
     else printf("%" PRIu64, value);
     printf(" %s\n", is_stale ? "stale" : frame->reason);
-    if (fflush(stdout) != 0) exit(0); /* who read our output went away */
+    if (fflush(stdout) != 0) exit(0); /* the reader of the output has gone */
 }
 
 int main(int count, char **arguments)
@@ -179,17 +180,17 @@ int main(int count, char **arguments)
     Ring ring = find(arguments[2], path, &of);
     uint64_t left = count > 3 ? strtoull(arguments[3], NULL, 10) : UINT64_MAX, missed = 0, last = get64(ring.at + 64);
     for (bool told = true; left > 0;) {
-        uint32_t bell = get32(ring.at + 72); /* before looking, so that no ring of it is lost */
+        uint32_t bell = get32(ring.at + 72); /* before reading head, so that no wake-up is lost */
         for (uint64_t head; left > 0 && (head = get64(ring.at + 64)) > last;) {
             if (read_frame(&ring, &of, last + 1, &frame)) {
                 show(&frame, &of, missed, told = stale(&frame, &ring));
                 last++, left--;
-            } else { /* lapped; the oldest frames are about to go too, so leave room */
+            } else { /* overtaken; skip a few more frames, because the oldest are overwritten next */
                 uint64_t next = head > last + ring.slots ? head - ring.slots / 4 * 3 : last + 1;
                 missed += next - last, last = next;
             }
         }
-        struct stat status; /* a stopped instance rings no bell, but its object has lost its name */
+        struct stat status; /* a stopped instance wakes nobody, but its shared memory has been unlinked */
         if (stat(object, &status) != 0 || status.st_ino != inode) fail("%s has stopped", arguments[1]);
         if (get32(ring.entry + 4) & RETIRED) fail("source %s was changed by a reload: start anew", arguments[2]);
         if (!told && stale(&frame, &ring)) show(&frame, &of, missed, told = true);

@@ -15,7 +15,7 @@ static slot_info info;
 static uint8_t *plain;
 static uint8_t raw[FRAME_SIZE], out[FRAME_SIZE], effective[FRAME_SIZE], reason[REASON_SIZE];
 
-/* Tells the compiler that memory is looked at here, so that no copy is left out as useless. */
+/* Tells the compiler that memory is read here, so that it does not remove a copy as useless. */
 static void keep(const void *memory) { __asm__ volatile("" : : "r"(memory) : "memory"); }
 
 static void publish(void) { ring_publish(&ring, info, reason, raw, NULL); }

@@ -1,7 +1,8 @@
-/* From ring_publish to processes that wait for it and copy the frame, against an eventfd for each of them.
+/* Times the way from ring_publish to waiting processes that copy the frame, compared with one
+ * eventfd for each process.
  *
- * wakeup READERS ROUNDS prints a line "name call_ns last_ns" for each round: how long the writer's call took, and from
- * its beginning until the last reader was back.
+ * wakeup READERS ROUNDS prints a line "name call_ns last_ns" for each round: the duration of the
+ * writer's call, and the time from its beginning until the last reader has finished.
  */
 #include <signal.h>
 #include <stdio.h>
@@ -16,7 +17,7 @@
 #define FRAME_SIZE 2180u
 #define MAX_READERS 256
 #define SLOTS 8u
-#define WARM_UP 3 /* rounds that do not count */
+#define WARM_UP 3 /* rounds that are not measured */
 
 enum { RING, EVENTFD, WAYS };
 static const char *const names[WAYS] = {"ring,frame", "eventfd"};
@@ -78,7 +79,7 @@ static void call(int way, int readers)
             if (write(events[reader], &one, sizeof one) != sizeof one) abort();
 }
 
-/* When the last of them was back; a reader that died is waited for in vain, but not for ever. */
+/* Returns when the last reader had finished. The wait for a dead reader has a time-out. */
 static int64_t last_arrival(int readers, long rest_us)
 {
     for (int attempt = 0; attempt < 10000; attempt++) {

@@ -1,7 +1,7 @@
 /* Python binding of ring.h, relay.h and queue.h (limited API: one build serves CPython 3.11 and later).
  *
- * Everything here runs under the GIL except the wait on a doorbell and a relay. A Ring keeps its buffer exported, so the mapping
- * cannot be closed under it.
+ * Everything here holds the GIL except the wait on a doorbell and the relay. A Ring keeps its buffer
+ * exported, so that the mapping cannot be closed while it exists.
  */
 #include <Python.h>
 #include <stdlib.h>
@@ -16,7 +16,7 @@ typedef struct {
     PyObject_HEAD
     Py_buffer buffer;
     ring_view ring;
-    uint8_t *scratch; /* one effective image, so that it is allocated for Python only when there is one */
+    uint8_t *scratch; /* room for one effective image: Python gets bytes only if a frame has one */
     uint32_t incarnation;
 } Ring;
 
@@ -77,7 +77,7 @@ static PyObject *Ring_begin(Ring *self, PyObject *args)
     a32 *stored = &ring_head(&self->ring)->incarnation;
     unsigned int incarnation = 0;
     if (!PyArg_ParseTuple(args, "|I", &incarnation) || !Ring_writable(self)) return NULL;
-    /* Only the one writer changes it; readers see it in frames. */
+    /* Only the writer changes this offset; readers see it in frames. */
     if (!incarnation) incarnation = atomic_load_explicit(stored, memory_order_relaxed) + 1;
     self->incarnation = incarnation;
     atomic_store_explicit(stored, incarnation, memory_order_relaxed);
@@ -202,7 +202,8 @@ static PyObject *Ring_wake(Ring *self, PyObject *unused)
     Py_RETURN_NONE;
 }
 
-/* Waits with the GIL released; returns the word's value, after a signal too (its Python handler has then run). */
+/* Waits with the GIL released and returns the word's value. A signal ends the wait, too, after its
+ * Python handler has run. */
 static PyObject *wait_on(const a32 *word, unsigned int seen, long long timeout_ns)
 {
     int error;
@@ -225,7 +226,7 @@ static PyObject *Ring_wait(Ring *self, PyObject *args)
     return Ring_ready(self) ? wait_on(&ring_head(&self->ring)->doorbell, seen, timeout_ns) : NULL;
 }
 
-/* The relay in a buffer, which its caller has to release; NULL with an exception. */
+/* Returns the relay in a buffer, which the caller must release; NULL with an exception. */
 static relay *relay_in(PyObject *object, Py_buffer *buffer)
 {
     if (PyObject_GetBuffer(object, buffer, PyBUF_WRITABLE) < 0) return NULL;
@@ -307,7 +308,7 @@ static PyType_Spec Ring_spec = {"shmio.segment._atomics.Ring", sizeof(Ring), 0, 
 
 /* ---- words and cells ----------------------------------------------------------------------------------------------- */
 
-/* The aligned place of `size` bytes in a buffer, or NULL with an exception. */
+/* Returns the place of `size` aligned bytes in a buffer, or NULL with an exception. */
 static uint8_t *place(const Py_buffer *buffer, Py_ssize_t offset, Py_ssize_t size, Py_ssize_t alignment)
 {
     if (offset < 0 || size < 0 || size > buffer->len || offset > buffer->len - size) {
@@ -420,7 +421,7 @@ static PyObject *atomics_bell_wait(PyObject *module, PyObject *args)
     long long timeout_ns;
     if (!PyArg_ParseTuple(args, "y*nIL", &buffer, &offset, &seen, &timeout_ns)) return NULL;
     const a32 *at = (const a32 *)(void *)place(&buffer, offset, 4, 4);
-    PyObject *value = at ? wait_on(at, seen, timeout_ns) : NULL; /* the buffer is held meanwhile */
+    PyObject *value = at ? wait_on(at, seen, timeout_ns) : NULL; /* the buffer stays exported */
     PyBuffer_Release(&buffer);
     return value;
 }
@@ -435,7 +436,7 @@ static PyObject *atomics_bell_relay(PyObject *module, PyObject *args)
     long long turn_ns;
     if (!PyArg_ParseTuple(args, "y*nOiL", &buffer, &offset, &shared, &descriptor, &turn_ns)) return NULL;
     const a32 *at = (const a32 *)(void *)place(&buffer, offset, 4, 4);
-    PyObject *result = at ? relay_on(at, shared, descriptor, turn_ns) : NULL; /* the buffer is held meanwhile */
+    PyObject *result = at ? relay_on(at, shared, descriptor, turn_ns) : NULL; /* the buffer stays exported */
     PyBuffer_Release(&buffer);
     return result;
 }
@@ -465,7 +466,7 @@ static PyObject *atomics_relay_stop(PyObject *module, PyObject *object)
     Py_RETURN_NONE;
 }
 
-/* The queue at `offset`, whose data are `capacity` bytes, or NULL with an exception. */
+/* Returns the queue at `offset` with `capacity` bytes of data, or NULL with an exception. */
 static uint8_t *queue_place(const Py_buffer *buffer, Py_ssize_t offset, Py_ssize_t capacity)
 {
     if (capacity < 64 || capacity > (1 << 30) || (capacity & (capacity - 1)) != 0) {
@@ -523,8 +524,8 @@ done:
 typedef struct {
     uint32_t offset;
     uint32_t size;
-    uint32_t mask;  /* of the one byte, for bits; 0: all bytes count */
-    uint32_t index; /* reported; entries of one index follow each other */
+    uint32_t mask;  /* bits of the one byte to compare; 0: compare all bytes */
+    uint32_t index; /* what to report; entries with the same index are adjacent */
 } scan_entry;
 
 static bool entry_changed(const scan_entry *entry, const uint8_t *old, const uint8_t *new, const uint8_t *dirty)

@@ -1,8 +1,8 @@
-/* A queue of byte records in shared memory: one producer, one consumer, neither ever waits.
+/* A queue of byte records in shared memory: one producer, one consumer, and neither ever waits.
  *
- * Pure C11 like ring.h. Commands toward a source travel in these, one queue for each writer and block; the bytes are
- * described in docs/reference/segment-format.md. Plain accesses to the data are ordered by head and tail alone: what
- * lies between them is the consumer's, the rest the producer's.
+ * Pure C11 like ring.h. Commands to a source pass through such queues, one for each writer and block;
+ * docs/reference/segment-format.md describes the bytes. Only head and tail order the plain accesses to
+ * the data: the bytes between them belong to the consumer, all others to the producer.
  */
 #ifndef SHMIO_QUEUE_H
 #define SHMIO_QUEUE_H
@@ -13,16 +13,16 @@
 #define RECORD_HEADER_SIZE 8u /* u32 bytes of the record, u32 zero */
 
 typedef struct {
-    a64 head; /* bytes ever put in; the producer's line */
+    a64 head; /* bytes ever added; in the producer's cache line */
     uint64_t reserved0[7];
-    a64 tail; /* bytes ever taken out; the consumer's line */
+    a64 tail; /* bytes ever removed; in the consumer's cache line */
     uint64_t reserved1[7];
 } queue_header;
 _Static_assert(sizeof(queue_header) == QUEUE_HEADER_SIZE, "queue header");
 
 enum queue_result { QUEUE_EMPTY = 0, QUEUE_RECORD = 1, QUEUE_BROKEN = 2 };
 
-/* Copies that wrap at `capacity`, a power of two. */
+/* Copy bytes and wrap at `capacity`, a power of two. */
 static inline void queue_copy_in(uint8_t *data, uint64_t capacity, uint64_t at, const uint8_t *from, uint64_t size)
 {
     uint64_t start = at & (capacity - 1), first = size < capacity - start ? size : capacity - start;
@@ -37,29 +37,30 @@ static inline void queue_copy_out(uint8_t *to, const uint8_t *data, uint64_t cap
     memcpy(to + first, data, size - first);
 }
 
-/* False when there is no room. Nothing shows before the record is whole, so a producer that dies leaves no part of one. */
+/* Adds a record; false if there is no room. The consumer cannot see an incomplete record, so a producer
+ * that dies leaves no part of one. */
 static inline bool queue_push(uint8_t *queue, uint64_t capacity, const uint8_t *record, uint32_t size)
 {
     queue_header *header = (queue_header *)(void *)queue;
     uint8_t *data = queue + QUEUE_HEADER_SIZE;
     uint64_t needed = RECORD_HEADER_SIZE + align8(size);
-    uint64_t head = atomic_load_explicit(&header->head, memory_order_relaxed); /* ours alone to write */
-    /* Pairs with the release store in queue_drop: what the consumer has taken may be overwritten. */
+    uint64_t head = atomic_load_explicit(&header->head, memory_order_relaxed); /* only we write it */
+    /* Pairs with the release store in queue_drop: records that the consumer has removed may be overwritten. */
     uint64_t used = head - atomic_load_explicit(&header->tail, memory_order_acquire);
     if (used > capacity || needed > capacity - used) return false;
     uint32_t words[2] = {size, 0};
     queue_copy_in(data, capacity, head, (const uint8_t *)words, sizeof words);
     queue_copy_in(data, capacity, head + RECORD_HEADER_SIZE, record, size);
-    /* Pairs with the acquire load in queue_peek: who sees the head sees the record. */
+    /* Pairs with the acquire load in queue_peek: a consumer that sees this head sees the record. */
     atomic_store_explicit(&header->head, head + needed, memory_order_release);
     return true;
 }
 
-/* Size of the oldest record. BROKEN: the words contradict each other, which no producer of ours writes. */
+/* Returns the size of the oldest record. BROKEN: the words contradict each other; shmio never writes that. */
 static inline enum queue_result queue_peek(const uint8_t *queue, uint64_t capacity, uint32_t *size)
 {
     const queue_header *header = (const queue_header *)(const void *)queue;
-    uint64_t tail = atomic_load_explicit(&header->tail, memory_order_relaxed); /* ours alone to write */
+    uint64_t tail = atomic_load_explicit(&header->tail, memory_order_relaxed); /* only we write it */
     uint64_t used = atomic_load_explicit(&header->head, memory_order_acquire) - tail;
     if (used == 0) return QUEUE_EMPTY;
     uint32_t words[2];
@@ -70,17 +71,17 @@ static inline enum queue_result queue_peek(const uint8_t *queue, uint64_t capaci
     return QUEUE_RECORD;
 }
 
-/* Takes the record that queue_peek saw. */
+/* Removes the record that queue_peek saw. */
 static inline void queue_drop(uint8_t *queue, uint64_t capacity, uint8_t *record, uint32_t size)
 {
     queue_header *header = (queue_header *)(void *)queue;
     uint64_t tail = atomic_load_explicit(&header->tail, memory_order_relaxed);
     queue_copy_out(record, queue + QUEUE_HEADER_SIZE, capacity, tail + RECORD_HEADER_SIZE, size);
-    /* Pairs with the acquire load in queue_push: the copy is done. */
+    /* Pairs with the acquire load in queue_push: the record has been copied out. */
     atomic_store_explicit(&header->tail, tail + RECORD_HEADER_SIZE + align8(size), memory_order_release);
 }
 
-/* Throws away all there is; for the consumer, after BROKEN. */
+/* Discards all records; the consumer calls this after BROKEN. */
 static inline void queue_clear(uint8_t *queue)
 {
     queue_header *header = (queue_header *)(void *)queue;

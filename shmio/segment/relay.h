@@ -1,7 +1,7 @@
-/* From a doorbell to an event loop: what a thread does that waits for the one and tells the other by an eventfd(2).
+/* A thread that waits on a doorbell and wakes an event loop by an eventfd(2).
  *
- * Pure C11, as ring.h. An event loop cannot wait on a futex, and a thread that needs the interpreter's lock to tell it
- * of each ring fights with it for that lock; this one never needs it. */
+ * Pure C11 like ring.h. An event loop cannot wait on a futex. A thread that takes the interpreter's lock
+ * for each wake-up would compete with the loop for it; this thread never needs the lock. */
 #ifndef SHMIO_RELAY_H
 #define SHMIO_RELAY_H
 
@@ -9,26 +9,27 @@
 
 enum { RELAY_HEARD, RELAY_TOLD, RELAY_HELD, RELAY_STOPPED };
 
-/* What the thread and the event loop share. Whatever is not HEARD: the loop has not looked yet, and will. */
+/* State that the thread and the event loop share. Unless it is HEARD, the loop has yet to look, and will. */
 typedef struct {
     a32 state;
     a32 reserved;
-    _Atomic(const a32 *) word; /* the doorbell, as long as the thread waits for it */
+    _Atomic(const a32 *) word; /* the doorbell while the thread waits for it */
 } relay;
 _Static_assert(sizeof(relay) == 16, "relay");
 
-/* Makes `descriptor` readable at first, after each ring, and after `turn_ns` without one; a loop that has not heard of
- * the last one is not told again, and whoever rings need not wake us then. Returns when it is stopped. */
+/* Makes `descriptor` readable at the start, after each ring of the doorbell, and after `turn_ns` without
+ * one. While the loop has not yet handled the last wake-up there is no other, and ringing the doorbell
+ * need not wake this thread. Returns when it is stopped. */
 static inline void relay_run(relay *shared, const a32 *word, int descriptor, int64_t turn_ns)
 {
     const uint64_t one = 1;
     atomic_store(&shared->word, word);
     for (;;) {
-        /* Before telling: what comes from now on is told again. */
+        /* Before the write: the next ring from here on causes another wake-up. */
         uint32_t seen = atomic_load_explicit(word, memory_order_acquire);
         uint32_t state = RELAY_HEARD;
         if (atomic_compare_exchange_strong(&shared->state, &state, RELAY_TOLD)) {
-            if (write(descriptor, &one, sizeof one) < 0) return; /* never: its counter does not overflow by one */
+            if (write(descriptor, &one, sizeof one) < 0) return; /* cannot happen: the counter does not overflow */
         } else if (state == RELAY_TOLD && atomic_compare_exchange_strong(&shared->state, &state, RELAY_HELD)) {
             doorbell_wait(&shared->state, RELAY_HELD, -1);
         }
@@ -37,7 +38,7 @@ static inline void relay_run(relay *shared, const a32 *word, int descriptor, int
     }
 }
 
-/* Changes the state, unless the thread is to end: that is final. */
+/* Changes the state, unless the thread is stopping, which is final. */
 static inline void relay_free(relay *shared, uint32_t state)
 {
     uint32_t before = atomic_load(&shared->state);
@@ -45,21 +46,22 @@ static inline void relay_free(relay *shared, uint32_t state)
     if (before == RELAY_HELD) syscall(SYS_futex, &shared->state, FUTEX_WAKE, 1, NULL, NULL, 0);
 }
 
-/* The loop's, before it looks at what the doorbell rings for. Not after relay_stop: the descriptor may be another's. */
+/* The loop calls this before it looks at the shared data. Not to be called after relay_stop: the
+ * descriptor may have been closed and reused. */
 static inline void relay_heard(relay *shared, int descriptor)
 {
     uint64_t count;
-    if (read(descriptor, &count, sizeof count) < 0) count = 0; /* EAGAIN: told by something else */
+    if (read(descriptor, &count, sizeof count) < 0) count = 0; /* EAGAIN: something else woke the loop */
     relay_free(shared, RELAY_HEARD);
 }
 
-/* Has the thread return: at once, or, if it is just about to wait, within its `turn_ns` or by another relay_stop. It
- * tells nothing more. */
+/* Makes the thread return at once; if it is just about to wait, within its `turn_ns` or after another
+ * relay_stop. There are no more wake-ups. */
 static inline void relay_stop(relay *shared)
 {
     relay_free(shared, RELAY_STOPPED);
     const a32 *word = atomic_load(&shared->word);
-    if (word) syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0); /* others look, and wait on */
+    if (word) syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0); /* others look and continue to wait */
 }
 
 #endif

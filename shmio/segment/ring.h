@@ -1,10 +1,11 @@
 /* The shared-memory mechanisms of shmio: frame ring, cell, doorbell.
  *
- * Pure C11, no Python: _atomics.c wraps it, tests/native/ exercises it under the sanitizers. The bytes are described in
- * docs/reference/segment-format.md; this file is their reference implementation.
+ * Pure C11, no Python: _atomics.c wraps it, and tests/native/ runs it under the sanitizers.
+ * docs/reference/segment-format.md describes the bytes; this file is their reference implementation.
  *
- * Every word that two processes may touch at once is accessed atomically, so there is no data race by the C11 rules. The
- * seqlock follows Boehm, "Can seqlocks get along with programming language memory models?", MSPC 2012, section 4.
+ * Every word that two processes may access concurrently is accessed atomically, so there is no data race
+ * by the C11 rules. The seqlock follows Boehm, "Can seqlocks get along with programming language memory
+ * models?", MSPC 2012, section 4.
  */
 #ifndef SHMIO_RING_H
 #define SHMIO_RING_H
@@ -35,7 +36,7 @@ typedef _Atomic uint32_t a32;
 _Static_assert(sizeof(a64) == 8 && sizeof(a32) == 4, "atomics must have the size of what they hold");
 _Static_assert(ATOMIC_LLONG_LOCK_FREE == 2 && ATOMIC_INT_LOCK_FREE == 2, "atomics in shared memory must be lock-free");
 
-/* First line: fixed when the segment is built. Second line: the writer's. */
+/* First cache line: fixed when the segment is built. Second cache line: written by the ring's writer. */
 typedef struct {
     uint32_t slot_count; /* a power of two */
     uint32_t slot_stride;
@@ -48,15 +49,15 @@ typedef struct {
     int64_t period_ns;
     int64_t stale_ns;
     uint64_t reserved1[2];
-    a64 head;     /* number of the last whole frame; 0: none yet */
-    a32 doorbell; /* futex word: bumped after every frame */
+    a64 head;     /* number of the last complete frame; 0: none yet */
+    a32 doorbell; /* futex word: incremented after every frame */
     a32 incarnation;
     uint64_t reserved2[6];
 } ring_header;
 _Static_assert(sizeof(ring_header) == RING_HEADER_SIZE, "ring header");
 
 typedef struct {
-    a64 sequence; /* 2*frame+1 while frame is being written, 2*frame+2 when whole */
+    a64 sequence; /* 2*frame+1 while the frame is being written, 2*frame+2 when complete */
     a64 words[7]; /* slot_info, as words */
 } slot_header;
 _Static_assert(sizeof(slot_header) == SLOT_HEADER_SIZE, "slot header");
@@ -64,20 +65,21 @@ _Static_assert(sizeof(slot_header) == SLOT_HEADER_SIZE, "slot header");
 typedef struct {
     uint64_t cycle;
     int64_t publish_ns; /* CLOCK_MONOTONIC */
-    int64_t clock_ns;   /* the instance's clock, since its start */
-    int64_t source_ns;  /* UTC, as good as the source knows it */
+    int64_t clock_ns;   /* instance clock, since the start */
+    int64_t source_ns;  /* UTC, as accurate as the source's clock */
     uint32_t incarnation;
     uint8_t quality;
     uint8_t provenance;
     uint16_t flags;
     uint16_t reason_size;
     uint16_t reserved0;
-    uint32_t delay_us; /* how old the image may have been at publish_ns already: its source had asked for it then */
-    uint64_t event; /* of a frame: number of the last event before it; of an event: of the last frame */
+    uint32_t delay_us; /* maximum age of the image at publish_ns: time since the source requested it */
+    uint64_t event; /* in a frame: number of the last event before it; in an event: of the last frame */
 } slot_info;
 _Static_assert(sizeof(slot_info) == SLOT_HEADER_SIZE - 8, "slot info");
 
-/* A checked view of one ring: geometry copied out of shared memory once, so that no later change of it can lead outside. */
+/* A checked view of one ring. It has its own copy of the geometry, so that a later change in shared memory
+ * cannot lead out of the mapping. */
 typedef struct {
     uint8_t *base;
     uint32_t slot_count, slot_stride, frame_size, effective_offset;
@@ -92,7 +94,7 @@ static inline uint8_t *ring_slot(const ring_view *ring, uint64_t frame)
     return ring->base + RING_HEADER_SIZE + (uint64_t)ring->slot_stride * (frame & (ring->slot_count - 1));
 }
 
-/* NULL when the ring's header is sound within `size` bytes, else what is wrong with it. */
+/* Checks a ring's header within `size` bytes; returns NULL if it is sound, else the text of an error. */
 static inline const char *ring_open(ring_view *ring, uint8_t *base, uint64_t size)
 {
     if (((uintptr_t)base & 7u) != 0) return "ring is not aligned to 8 bytes";
@@ -112,7 +114,7 @@ static inline const char *ring_open(ring_view *ring, uint8_t *base, uint64_t siz
     return NULL;
 }
 
-/* Copies to and from shared memory, in relaxed 64-bit words; the last word may be partial on the private side only. */
+/* Copy to and from shared memory in relaxed 64-bit words; only the private side may end within a word. */
 static inline void words_store(uint8_t *shared, const uint8_t *data, size_t size)
 {
     a64 *words = (a64 *)(void *)shared;
@@ -143,15 +145,16 @@ static inline void words_load(uint8_t *data, const uint8_t *shared, size_t size)
     }
 }
 
-/* Wakes everyone who waits on this word. Waiters may hold a read-only mapping, so they leave no trace to look for. */
+/* Wakes all who wait on this word. They may have a read-only mapping, so they cannot register as waiters. */
 static inline void doorbell_ring(a32 *word)
 {
-    /* release: a waiter that sees the new value sees all that was written before the bell. */
+    /* release: a waiter that sees the new value sees everything written before it. */
     atomic_fetch_add_explicit(word, 1, memory_order_release);
     syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 }
 
-/* Waits until the word differs from `seen` or the time is over (negative: for ever); 0, or errno (EINTR, ETIMEDOUT). */
+/* Waits until the word differs from `seen`, or until the time-out (negative: none). Returns 0 or errno
+ * (EINTR, ETIMEDOUT). */
 static inline int doorbell_wait(const a32 *word, uint32_t seen, int64_t timeout_ns)
 {
     if (atomic_load_explicit(word, memory_order_acquire) != seen) return 0;
@@ -160,13 +163,13 @@ static inline int doorbell_wait(const a32 *word, uint32_t seen, int64_t timeout_
     return result == 0 || errno == EAGAIN ? 0 : errno;
 }
 
-/* One writer only. `effective` is NULL if what consumers see is raw, and where slots have no room for it. Returns the
- * frame's number. */
+/* Publishes a frame and returns its number. Each ring has one writer. `effective` is NULL if consumers see
+ * the raw image, or if slots have no room for another. */
 static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const uint8_t *reason, const uint8_t *raw,
                                     const uint8_t *effective)
 {
     ring_header *header = ring_head(ring);
-    uint64_t frame = atomic_load_explicit(&header->head, memory_order_relaxed) + 1; /* ours alone to write */
+    uint64_t frame = atomic_load_explicit(&header->head, memory_order_relaxed) + 1; /* only we write it */
     uint8_t *base = ring_slot(ring, frame);
     slot_header *slot = (slot_header *)(void *)base;
 
@@ -178,15 +181,16 @@ static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const
     if (info.reason_size) words_store(base + SLOT_HEADER_SIZE, reason, info.reason_size);
     words_store(base + RAW_OFFSET, raw, ring->frame_size);
     if (effective) words_store(base + ring->effective_offset, effective, ring->frame_size);
-    /* Pairs with the acquire load of the sequence in ring_read: who sees it even sees the whole frame. */
+    /* Pairs with the acquire load of the sequence in ring_read: a reader that sees it even sees the whole frame. */
     atomic_store_explicit(&slot->sequence, 2 * frame + 2, memory_order_release);
-    /* Pairs with the acquire load of head in every reader: the slot of a frame up to head was whole. */
+    /* Pairs with the acquire load of head in every reader: the slots of all frames up to head were complete. */
     atomic_store_explicit(&header->head, frame, memory_order_release);
     doorbell_ring(&header->doorbell);
     return frame;
 }
 
-/* Copies one frame; false when the slot does not hold it (overwritten, or being overwritten). `reason` has REASON_SIZE bytes. */
+/* Copies one frame; false if the slot no longer has it, or is being overwritten. `reason` has
+ * REASON_SIZE bytes. */
 static inline bool ring_read(const ring_view *ring, uint64_t frame, slot_info *info, uint8_t *reason, uint8_t *raw,
                              uint8_t *effective)
 {
@@ -205,7 +209,8 @@ static inline bool ring_read(const ring_view *ring, uint64_t frame, slot_info *i
     return atomic_load_explicit(&slot->sequence, memory_order_relaxed) == whole;
 }
 
-/* The newest frame's number, or 0: no frame yet, or (after READ_ATTEMPTS laps of the whole ring) no stable one. */
+/* Copies the newest frame and returns its number. Returns 0 if there is none yet, or if the writer overtook
+ * each of READ_ATTEMPTS reads. */
 static inline uint64_t ring_latest(const ring_view *ring, slot_info *info, uint8_t *reason, uint8_t *raw, uint8_t *effective)
 {
     for (int attempt = 0; attempt < READ_ATTEMPTS; attempt++) {
@@ -215,7 +220,7 @@ static inline uint64_t ring_latest(const ring_view *ring, slot_info *info, uint8
     return 0;
 }
 
-/* A cell: a sequence word, then bytes that have one writer and are read whole. */
+/* A cell: a sequence word, then bytes with one writer, which readers get only as a whole. */
 static inline void cell_write(uint8_t *cell, const uint8_t *data, size_t size)
 {
     a64 *sequence = (a64 *)(void *)cell;

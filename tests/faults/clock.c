@@ -1,9 +1,10 @@
-/* Stands between a program and CLOCK_REALTIME: a host whose clock is set, for one family of processes.
+/* Shifts CLOCK_REALTIME for a family of processes, as if somebody had set the host's clock.
  *
- * Loaded by LD_PRELOAD. The offset in ns is an int64 in the file that SHMIO_FAULTS_CLOCK names, mapped, so that it can be
- * changed at any moment. CLOCK_MONOTONIC is never touched, as setting a host's clock never touches it. Of the waits until
- * a time of the clock, the futex's is turned into the kernel's (gRPC has such; Python waits by CLOCK_MONOTONIC); one that
- * is under way when the offset changes is not prolonged or cut short, as the kernel would do.
+ * Loaded by LD_PRELOAD. The offset in ns is an int64 in the file that SHMIO_FAULTS_CLOCK names. The file
+ * is mapped, so that the offset can change at any moment. CLOCK_MONOTONIC is never changed, as setting a
+ * host's clock does not change it. Of the waits for a time of the clock only the futex's is converted to
+ * the kernel's clock (gRPC uses it; Python waits by CLOCK_MONOTONIC). Unlike in the kernel, a change of
+ * the offset has no effect on waits that have begun.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>

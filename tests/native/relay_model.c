@@ -1,9 +1,10 @@
-/* All interleavings of what meets in relay.h: its thread, an event loop, and whoever rings.
+/* Runs all interleavings of the parties of relay.h: its thread, an event loop, and the one that rings.
  *
- * The header itself is compiled here, with each of its accesses to shared memory and each of its system calls replaced by
- * one that first lets another party go on. From each state every party is tried; a state is known by what each party has
- * seen so far and by what they share, so each is gone on from once. Memory is taken for sequentially consistent, and a
- * futex wakes without a reason, too, as after a signal. Exit status 0: no ring was lost, and who is stopped ends. */
+ * The header itself is compiled here. Each of its accesses to shared memory and each of its system calls
+ * is replaced by one that first lets another party continue. Every party is tried from each state. A state
+ * is identified by what each party has seen and by the shared data, so that each is explored once. Memory
+ * is assumed to be sequentially consistent, and a futex may also wake without a reason, as after a signal.
+ * Exit status 0: no ring of the doorbell was lost, and a stopped thread ends. */
 #include <errno.h>
 #include <linux/futex.h>
 #include <setjmp.h>
@@ -18,7 +19,7 @@
 #include <ucontext.h>
 #include <unistd.h>
 
-static void turn(void);          /* another party may go on before what follows */
+static void turn(void);          /* another party may continue here */
 static uint64_t saw(uint64_t value); /* what a party has seen decides what it does next */
 static long model_syscall(long number, const volatile void *word, int operation, uint32_t value, ...);
 static ssize_t model_read(int descriptor, void *data, size_t size);
@@ -51,7 +52,7 @@ static ssize_t model_write(int descriptor, const void *data, size_t size);
 static void forget(void);
 #include "../../shmio/segment/ring.h"
 #undef atomic_load_explicit
-/* relay_run begins each of its turns with one, and nothing that it has seen before matters from there. */
+/* relay_run begins each turn with this call; nothing that it saw earlier matters from here on. */
 #define atomic_load_explicit(at, order) (forget(), atomic_load(at))
 #include "../../shmio/segment/relay.h"
 
@@ -61,11 +62,11 @@ static void forget(void);
 enum { THREAD, LOOP, RINGER, STOPPER, PARTIES, DEEPEST = 400, SPURIOUS = 1, STATES = 1 << 22, DESCRIPTOR = 7 };
 
 static struct {
-    ucontext_t context; /* to begin */
-    jmp_buf at;         /* to go on */
+    ucontext_t context; /* where it begins */
+    jmp_buf at;         /* where it continues */
     bool begun;
-    uint64_t seen;             /* a digest of all it has seen */
-    const volatile void *waits; /* for this futex, or, the loop, for the descriptor */
+    uint64_t seen;             /* digest of all that it has seen */
+    const volatile void *waits; /* for this futex; for the descriptor, if it is the loop */
     bool done;
 } parties[PARTIES];
 static jmp_buf chooser;
@@ -73,7 +74,7 @@ static ucontext_t nowhere;
 static int now;
 static char stacks[PARTIES][1 << 16];
 
-/* What they share. */
+/* Data that the parties share. */
 static relay shared;
 static a32 word;
 static uint32_t frames, looked_at, told;
@@ -137,11 +138,11 @@ static ssize_t model_write(int descriptor, const void *data, size_t size)
 
 static void run_thread(void) { relay_run(&shared, &word, DESCRIPTOR, 1); }
 
-/* Hears when it is told, and looks. Once it is also woken by something else, as event loops are. */
+/* Handles each wake-up and looks. Once, something else wakes it, too, as happens to event loops. */
 static void run_loop(void)
 {
     for (bool once = !stopping;; once = false) {
-        forget(); /* nothing that it has seen matters from here */
+        forget(); /* nothing that it saw earlier matters from here on */
         saw(once);
         turn();
         while (!told && !once) {
@@ -261,12 +262,12 @@ static int broken(const char *what, int depth)
     return 1;
 }
 
-/* Nobody can go on: what is wrong with that? */
+/* Nobody can continue: check whether that is right. */
 static const char *wrong_end(void)
 {
     if (!stopping) return looked_at == rings ? NULL : "a ring was lost";
     if (parties[THREAD].done) return NULL;
-    /* It was just about to wait, for its turn_ns: who waits for its end stops it again. */
+    /* The thread was just about to wait for its turn_ns: whoever waits for its end stops it again. */
     if (parties[THREAD].waits == &word)
         return shared.state == RELAY_STOPPED ? NULL : "one that was stopped goes on";
     return "one that was stopped waits for the loop";

@@ -1,11 +1,12 @@
-/* Whether the memory orders in ring.h suffice, on any machine: all that C11 lets a reader see of what a writer did.
+/* Checks the memory orders in ring.h by trying everything that C11 lets a reader see of a writer's actions.
  *
- * The header itself is compiled here, with each atomic access replaced by one to a memory of messages: a location keeps all
- * values that it ever had, each with what whoever reads it with acquire must see from then on. A load may return any that is
- * not older than what the reader has seen of it. That is C11 as RC11 mends it (Lahav et al., PLDI 2017), without seq_cst.
- * On x86 most of it never happens, so no test that runs there finds an order that is too weak. The writer reads nothing of
- * the reader's, so all of it is done first, and only what the reader may see is tried out. Exit status 0: all of that is
- * right. */
+ * The header itself is compiled here. Each atomic access is replaced by one to a memory of messages: a
+ * location keeps all values that it ever had, each with the view that a reader gains by reading it with
+ * acquire. A load may return any value that is not older than those the reader has seen. This is C11 as
+ * corrected by RC11 (Lahav et al., PLDI 2017), without seq_cst. On x86 most of it never happens, so no
+ * test on such a machine finds an order that is too weak. The writer reads nothing that the reader writes;
+ * therefore the writer runs first, and only the reader's choices are explored. Exit status 0: all
+ * results are right. */
 #include <setjmp.h>
 #include <stdatomic.h>
 #include <stdbool.h>
@@ -43,7 +44,7 @@ typedef struct {
 } message;
 
 typedef struct {
-    view now, acquired, released; /* what counts; what an acquire fence adds; what the last release fence gives on */
+    view now, acquired, released; /* in effect; added by an acquire fence; passed on by the last release fence */
 } party;
 
 static const volatile void *places[LOCATIONS];
@@ -51,7 +52,7 @@ static message messages[LOCATIONS][MESSAGES];
 static int counts[LOCATIONS], locations;
 static party writer, reader, *self;
 
-static unsigned char choices[DEEPEST], limits[DEEPEST]; /* of the present run: what was chosen, of how many */
+static unsigned char choices[DEEPEST], limits[DEEPEST]; /* in this run: number chosen, of how many */
 static int depth;
 static jmp_buf over;
 static uint64_t first_loaded;
@@ -64,7 +65,7 @@ static int location(const volatile void *at)
         if (places[i] == at) return i;
     if (locations == LOCATIONS) abort();
     places[locations] = at;
-    counts[locations] = 1; /* zero, that everybody has seen */
+    counts[locations] = 1; /* zero, which everybody has seen */
     return locations++;
 }
 
@@ -90,7 +91,7 @@ static uint64_t model_add(volatile void *at, uint64_t value, memory_order order)
     int where = location(at);
     message before = messages[where][counts[where] - 1];
     model_store(at, before.value + value, order);
-    join(&messages[where][counts[where] - 1].view, &before.view); /* a release sequence goes on */
+    join(&messages[where][counts[where] - 1].view, &before.view); /* a release sequence continues */
     return before.value;
 }
 
@@ -98,7 +99,7 @@ static uint64_t model_load(const volatile void *at, memory_order order)
 {
     int where = location(at), oldest = self->now.of[where], number = counts[where] - 1;
     if (self == &reader && number > oldest) {
-        if (depth == DEEPEST) longjmp(over, 1); /* it tries again, which brings nothing new */
+        if (depth == DEEPEST) longjmp(over, 1); /* a repeated attempt shows nothing new */
         limits[depth] = (unsigned char)(number - oldest + 1);
         number = oldest + choices[depth++];
     }
@@ -116,7 +117,7 @@ static void model_fence(memory_order order)
     if (order != memory_order_acquire) self->released = self->now;
 }
 
-/* What may be seen. */
+/* The data under test. */
 
 static uint8_t memory[RING_HEADER_SIZE + SLOTS * (RAW_OFFSET + SIZE)] __attribute__((aligned(64)));
 static uint8_t cell[8 + 16] __attribute__((aligned(64)));
