@@ -10,9 +10,9 @@ from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
 from shmio.local.reading import Reading
 from shmio.local.replays import ReplayRequest
-from shmio.local.writer import Outcome
+from shmio.model.clock import Clock
+from shmio.model.outcome import Outcome
 from shmio.model.replay_status import Playing
-from shmio.segment.clock import ClockState
 from shmio.segment.standing_injections import StandingInjection
 
 
@@ -108,7 +108,7 @@ class Cell(Protocol):
         """Remove all injections, and return them with their sources."""
 
     @property
-    def clock(self) -> ClockState:
+    def clock(self) -> Clock:
         """The state of the instance's clock."""
 
     def real_sources(self) -> list[str]:

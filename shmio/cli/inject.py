@@ -104,13 +104,13 @@ def _lift(cell: Cell, options: argparse.Namespace) -> int:
         chosen = cell.lift_all()
     else:
         standing = [(source, one) for source, all_of_it in cell.injections().items() for one in all_of_it]
-        chosen = [(source, one) for source, one in standing if one.id == options.lift]
+        chosen = [(source, one) for source, one in standing if one.number == options.lift]
         if not chosen:
             raise CommandError(f"there is no injection {options.lift}; shmio inject lists them")
         for source, one in chosen:
-            cell.lift(source, one.id)
+            cell.lift(source, one.number)
     for source, one in chosen:
-        print(f"{one.id}: lifted from {source}{f' ({printable(one.name)})' if one.name else ''}")
+        print(f"{one.number}: lifted from {source}{f' ({printable(one.name)})' if one.name else ''}")
     return 0
 
 

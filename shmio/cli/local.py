@@ -17,10 +17,10 @@ from shmio.local.attach import Attachment
 from shmio.local.injection import Shadow
 from shmio.local.reading import Reading, reading
 from shmio.local.replays import ReplayRequest
-from shmio.local.writer import Outcome
+from shmio.model.clock import Clock
+from shmio.model.outcome import Outcome
 from shmio.model.replay_status import Playing
 from shmio.segment import Block, Cursor, Event, EventKind, Frame, Quality
-from shmio.segment.clock import ClockState
 from shmio.segment.standing_injections import StandingInjection
 
 IDLE_S: Final = 0.5
@@ -134,7 +134,7 @@ class Local:
         return self.attachment.lift_all()
 
     @property
-    def clock(self) -> ClockState:
+    def clock(self) -> Clock:
         """The state of the instance's clock."""
         return self.attachment.clock
 

@@ -16,7 +16,7 @@ from shmio.layout.values.literal import literal_text
 from shmio.layout.values.text import json_value
 from shmio.local.reading import Reading
 from shmio.logs import printable
-from shmio.segment.frame import Provenance, Quality
+from shmio.model.values import Provenance, Quality
 
 CUT = "… (all: --full)"
 

@@ -16,8 +16,6 @@ from shmio.cli.cell import Campaign, CampaignEvent, Change, Selected, Shadow
 from shmio.cli.readings import choose
 from shmio.client import BlockLayout, Client, Happening, Outcome, Update, connect
 from shmio.client import Campaign as ClientCampaign
-from shmio.client import Quality as ClientQuality
-from shmio.client import Running as ClientRunning
 from shmio.client import Shadow as ClientShadow
 from shmio.config import Declaration
 from shmio.config.address import UNIX, Address
@@ -27,11 +25,11 @@ from shmio.layout.types import element_type
 from shmio.layout.values.codec import Value
 from shmio.local.reading import Reading
 from shmio.local.replays import ReplayRequest
-from shmio.local.writer import Outcome as LocalOutcome
+from shmio.model.clock import Clock
+from shmio.model.injection import Running
 from shmio.model.replay_status import Playing
-from shmio.segment import EventKind, Quality
-from shmio.segment.clock import ClockMode, ClockState
-from shmio.segment.standing_injections import DeclaredState, StandingInjection
+from shmio.segment import Quality
+from shmio.segment.standing_injections import StandingInjection
 
 
 @contextmanager
@@ -121,9 +119,9 @@ class Remote:
                     shown[what.path] = seen
                     yield Change(what, now, width)
 
-    def write(self, values: Mapping[str, object], timeout_s: float | None) -> list[LocalOutcome]:
+    def write(self, values: Mapping[str, object], timeout_s: float | None) -> list[Outcome]:
         """Write registers of one source as one command."""
-        return _outcomes(self._client.write(values, timeout_s))
+        return self._client.write(values, timeout_s)
 
     @contextmanager
     def _lay(self, shadow: ClientShadow) -> Iterator[Shadow]:
@@ -163,13 +161,9 @@ class Remote:
         ]
 
     @property
-    def clock(self) -> ClockState:
+    def clock(self) -> Clock:
         """The state of the instance's clock."""
-        now = self._client.clock()
-        mode = ClockMode.VIRTUAL if now.virtual else ClockMode.WALL
-        return ClockState(
-            mode, now.step, now.time_ns, 0, now.step, now.step_size_ns, now.playing, now.rate, note=now.note
-        )
+        return self._client.clock()
 
     def real_sources(self) -> list[str]:
         """Return the names of the sources that steps do not affect; version 0.1 reports none."""
@@ -204,8 +198,8 @@ class _RemoteShadow:
         self.number = shadow.number
         self._shadow = shadow
 
-    def set(self, values: Mapping[str, object]) -> list[LocalOutcome]:
-        return _outcomes(self._shadow.set(values))
+    def set(self, values: Mapping[str, object]) -> list[Outcome]:
+        return self._shadow.set(values)
 
 
 class _RemoteCampaign:
@@ -248,13 +242,9 @@ class _RemoteCampaign:
         return found
 
 
-def _running(found: ClientRunning) -> DeclaredState:
+def _running(found: Running[Mapping[str, Any]]) -> Running[Declaration]:
     declaration = msgspec.convert(found.declaration, Declaration)
-    return DeclaredState(declaration, found.state, found.seed, found.runs, found.cycle, found.time_ns)
-
-
-def _outcomes(found: Sequence[Outcome]) -> list[LocalOutcome]:
-    return [LocalOutcome(one.path, EventKind[one.kind.upper()], one.text) for one in found]
+    return Running(declaration, found.state, found.seed, found.runs, found.cycle, found.time_ns)
 
 
 def _layout(found: BlockLayout) -> Layout:
@@ -288,9 +278,9 @@ def _reading(update: Update, place: int) -> Reading:
     quality, reason = update.quality_of(path)
     return Reading(
         value,
-        Quality[quality.name],
+        quality,
         reason,
         str(update.provenance_of(path)),
         update.source_ns / 1e9 if update.source_ns else None,
-        round(update.age_ns / 1e9, 6) if update.age_ns or quality is not ClientQuality.BAD else None,
+        round(update.age_ns / 1e9, 6) if update.age_ns or quality is not Quality.BAD else None,
     )

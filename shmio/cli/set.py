@@ -18,9 +18,9 @@ from shmio.layout.topic import look_up, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.literal import parse_literal
 from shmio.layout.values.text import from_text, wire_type
-from shmio.local.writer import MIN_PERIODS, TIMEOUT_S, Outcome
+from shmio.local.writer import MIN_PERIODS, TIMEOUT_S
 from shmio.logs import printable
-from shmio.segment import EventKind
+from shmio.model.outcome import Outcome, OutcomeKind
 
 HELP = "Write values of registers, and print what became of each."
 MATCHES = 3
@@ -174,10 +174,10 @@ def _print(outcomes: dict[str, Outcome], complaint: str) -> None:
 
 def _complaint(path: str, outcome: Outcome) -> str:
     """Return the error text for a failed write, with a remedy."""
-    if outcome.kind == EventKind.REJECTED:
+    if outcome.kind == OutcomeKind.REJECTED:
         return f"{path}: not written, the source took nothing: {outcome.text}; see shmio-supervisor status"
-    if outcome.kind == EventKind.REFUSED:
+    if outcome.kind == OutcomeKind.REFUSED:
         return f"{path}: the source refused it: {outcome.text}"
-    if outcome.kind == EventKind.EXPIRED:
+    if outcome.kind == OutcomeKind.EXPIRED:
         return f"{path}: not written: {outcome.text}; try again, or with a longer --timeout"
     return f"{path}: {outcome.text}; look with shmio get {shlex.quote(path)} before writing it again"

@@ -17,8 +17,7 @@ from os import PathLike
 from pathlib import Path
 
 from shmio.client.aio import client
-from shmio.client.calls import Clock, Outcome, Stepped, Target
-from shmio.client.injections import Declared, Happening, Injection, Lifted, Running
+from shmio.client.calls import Stepped, Target
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
 from shmio.client.replay import Wish
@@ -27,9 +26,13 @@ from shmio.client.sync.client import Client, Subscription
 from shmio.client.sync.injection import Shadow
 from shmio.client.sync.model import Simulation
 from shmio.client.sync.steps import Steps
-from shmio.client.table import Change, Column, Register, Table
-from shmio.client.update import Piece, Provenance, Quality, Snapshot, Update
+from shmio.client.table import Change, Register, Table
+from shmio.client.update import Piece, Snapshot, Update
+from shmio.model.clock import Clock
+from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
+from shmio.model.outcome import Outcome, OutcomeKind
 from shmio.model.replay_status import Playing
+from shmio.model.values import Column, Provenance, Quality
 
 __all__ = [
     "BlockLayout",
@@ -43,6 +46,7 @@ __all__ = [
     "Injection",
     "Lifted",
     "Outcome",
+    "OutcomeKind",
     "Piece",
     "Playing",
     "Provenance",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -22,9 +22,12 @@ from shmio.errors import (
     ValueRangeError,
 )
 from shmio.messages import value_to_wire
+from shmio.model.clock import Clock, ClockMode
+from shmio.model.outcome import Outcome, OutcomeKind
 from shmio.wire import shmio_v1_pb2 as wire
 
 STEP_PATIENCE_S: Final = 60.0
+_CLOCK_KEYS: Final = ("virtual", "step", "time_ns", "step_size_ns", "playing", "rate", "note")
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 WRITE_PATIENCE_S: Final = 30.0
 """Beyond its own time-out a write is given so long to be answered: a slow source has its cycles."""
@@ -148,23 +151,6 @@ def _is_here(address: str) -> bool:
         return host == "localhost" or address.startswith(_UNIX)
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of one value. ``kind``: written, taken, rejected, refused, expired, unknown, shadowed or accepted.
-
-    ``text``: the reason, if there is one to give.
-    """
-
-    path: str
-    kind: str
-    text: str = ""
-
-    @property
-    def done(self) -> bool:
-        """Whether it has gone where it was meant to."""
-        return self.kind in ("written", "taken", "shadowed", "accepted")
-
-
 def ns(dt_s: float | None) -> int:
     """A step's size in ns; 0: the step size that there is. ValueRangeError."""
     if dt_s is None:
@@ -212,27 +198,17 @@ def outcomes(paths: Iterable[str], found: Any) -> list[Outcome]:
     return [Outcome(path, _kind(end.kind), end.reason) for path, end in zip(paths, ends, strict=True)]
 
 
-def _kind(kind: int) -> str:
+def _kind(kind: int) -> OutcomeKind:
     known = wire.Outcome.Kind.values()
-    return wire.Outcome.Kind.Name(kind).removeprefix("KIND_").lower() if kind in known else "unknown"
+    return OutcomeKind[wire.Outcome.Kind.Name(kind).removeprefix("KIND_")] if kind in known else OutcomeKind.UNKNOWN
 
 
-@dataclass(frozen=True, slots=True)
-class Clock:
-    """How time stands. ``virtual``: only steps move it; ``step``: number of the last one that all have finished."""
-
-    virtual: bool
-    step: int
-    time_ns: int
-    step_size_ns: int
-    playing: bool
-    rate: float
-    note: str
-
-    @classmethod
-    def of(cls, found: Any) -> Clock:
-        """From the wire."""
-        return cls(found.virtual, found.step, found.time_ns, found.step_size_ns, found.playing, found.rate, found.note)
+def clock(found: Any) -> Clock:
+    """Convert the state of the clock from a message."""
+    return Clock(
+        ClockMode.VIRTUAL if found.virtual else ClockMode.WALL, found.step, found.time_ns, done=found.step,
+        step_size_ns=found.step_size_ns, playing=found.playing, rate=found.rate, note=found.note,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,7 +244,7 @@ def status(found: Any) -> dict[str, Any]:
         else None,
         "processes": list(map(_process, found.processes)),
         "note": found.note,
-        "clock": asdict(Clock.of(found.clock)),
+        "clock": {name: getattr(found.clock, name) for name in _CLOCK_KEYS},
     }
 
 

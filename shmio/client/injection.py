@@ -10,10 +10,11 @@ import numpy as np
 
 from shmio.client import calls
 from shmio.client.arrays import InjectRequest
-from shmio.client.calls import Outcome
-from shmio.client.table import DTYPES, FIELDS, Array, Column, Table
+from shmio.client.table import DTYPES, FIELDS, Array, Table
 from shmio.client.update import Piece, Tables, Update
 from shmio.errors import RemoteError, ValueRangeError
+from shmio.model.outcome import Outcome
+from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_WAITING: Final = 4096

@@ -11,9 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from shmio.client.calls import Clock
-from shmio.client.table import FIELDS, Array, Column, Register, Table
+from shmio.client import calls
+from shmio.client.table import FIELDS, Array, Register, Table
 from shmio.errors import ConflictError, LostError, PathError, RemoteError, ShmioError, ValueRangeError
+from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 
 RETRY_S: Final = 0.25
@@ -93,7 +94,7 @@ class Part:
         self.inputs = Values(self._inputs)
         self.outputs = Values(self._outputs)
         self.computed: bool = joined.computed
-        self.clock = Clock.of(joined.clock)
+        self.clock = calls.clock(joined.clock)
         self.period_s: float = joined.period_ns / 1e9
 
     def take(self, found: Any) -> Work:

@@ -5,28 +5,16 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from shmio.errors import PathError, RemoteError
+from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 
 Array = np.ndarray[Any, np.dtype[Any]]
-
-
-class Column(IntEnum):
-    """Where the values of a type are."""
-
-    BOOL = 1
-    INT32 = 2
-    INT64 = 3
-    UINT64 = 4
-    FLOAT = 5
-    DOUBLE = 6
-    TEXT = 7
 
 
 DTYPES: Final[Mapping[Column, np.dtype[Any]]] = {

@@ -3,36 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 from shmio.client.arrays import SubscribeResponse
-from shmio.client.table import Array, Change, Column, Table, unknown
+from shmio.client.table import Array, Change, Table, unknown
 from shmio.errors import QualityError, RemoteError
+from shmio.model.values import Column, Provenance, Quality
 from shmio.wire import shmio_v1_pb2 as wire
-
-
-class Quality(IntEnum):
-    """Trust in a value."""
-
-    BAD = 0
-    UNCERTAIN = 1
-    GOOD = 2
-
-    def __str__(self) -> str:
-        return self.name.lower()
-
-
-class Provenance(IntEnum):
-    """Where values come from."""
-
-    LIVE = 0
-    SIMULATED = 1
-    REPLAYED = 2
-    INJECTED = 3
-
-    def __str__(self) -> str:
-        return self.name.lower()
 
 
 class Piece(NamedTuple):

@@ -29,11 +29,13 @@ from shmio.local.declared_injections import DeclaredInjection, declare
 from shmio.local.injection import Diversion, Shadow, lift_all, written
 from shmio.local.reading import Reading, View, reading
 from shmio.local.timekeeper import TimeMethods
-from shmio.local.writer import Outcome, SourceWriter
+from shmio.local.writer import SourceWriter
+from shmio.model.outcome import Outcome
+from shmio.model.values import Quality
 from shmio.segment.block import Block
 from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor, Entry
-from shmio.segment.frame import Frame, Quality
+from shmio.segment.frame import Frame
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
 from shmio.segment.standing_injections import StandingInjection
@@ -407,7 +409,7 @@ class Attachment(TimeMethods):
             CommandError: Some injections could not be lifted; the message gives the reasons.
         """
         standing = [(source, one) for source, ones in self.injections().items() for one in ones if not one.lifted]
-        lift_all([(self._source_writer(self.block(source)), one.id) for source, one in standing])
+        lift_all([(self._source_writer(self.block(source)), one.number) for source, one in standing])
         return standing
 
     def note(self, text: str, source: str | None = None) -> None:

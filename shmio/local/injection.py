@@ -12,7 +12,8 @@ from shmio.errors import CommandError, PathError
 from shmio.layout.topic import parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import cover, merge
-from shmio.local.writer import Outcome, PendingCommand, SourceWriter
+from shmio.local.writer import PendingCommand, SourceWriter
+from shmio.model.outcome import Outcome
 from shmio.segment.block import Block
 from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor
@@ -209,7 +210,7 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
     left = [
         number
         for source_writer, number in chosen
-        if any(one.id == number and not one.lifted for one in source_writer.block.standing.read())
+        if any(one.number == number and not one.lifted for one in source_writer.block.standing.read())
     ]
     if left:
         raise CommandError(f"{len(left)} of {len(chosen)} injections still stand: {'; '.join(reasons)}")

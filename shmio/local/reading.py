@@ -11,8 +11,9 @@ from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import Value, codec
+from shmio.model.values import Provenance, Quality
 from shmio.segment.block import Block
-from shmio.segment.frame import Frame, Provenance, Quality
+from shmio.segment.frame import Frame
 
 if TYPE_CHECKING:
     import numpy as np

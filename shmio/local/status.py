@@ -9,8 +9,8 @@ from pathlib import Path
 import msgspec
 
 from shmio.errors import NotRunningError, SegmentError
-from shmio.segment.clock import ClockState
-from shmio.segment.frame import Quality
+from shmio.model.clock import Clock
+from shmio.model.values import Quality
 from shmio.segment.header import State as InstanceState
 from shmio.segment.processes import Phase, ProcessSlot
 from shmio.segment.segment import Segment, running_instances
@@ -154,7 +154,7 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
     return status
 
 
-def clock_status(state: ClockState) -> ClockStatus:
+def clock_status(state: Clock) -> ClockStatus:
     """Convert the state of the clock page to the units of a status."""
     return ClockStatus(
         str(state.mode), state.present_ns / 1e9, state.done, state.step_size_ns / 1e6, state.playing, state.rate,

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from shmio.errors import SegmentError
+from shmio.model.values import Quality
 from shmio.segment.block import Block
-from shmio.segment.frame import Quality
 from shmio.segment.segment import Segment
 
 _NOBODY: Final = "no source lives on the instance's clock: steps move none; those with a device go on in real time"

@@ -13,8 +13,9 @@ from typing import Final
 
 from shmio.errors import TimeError, ValueRangeError
 from shmio.local.step_answers import StepWait, describe_silence, step_answer, take_over_note, unmoved_note
+from shmio.model.clock import Clock, ClockMode
 from shmio.segment.block import Block
-from shmio.segment.clock import ClockMode, ClockState, time_lock
+from shmio.segment.clock import time_lock
 from shmio.segment.processes import ProcessSlot
 from shmio.segment.segment import Segment
 
@@ -78,7 +79,7 @@ class Coordinator:
         self._lock_byte = time_lock(segment.header)
         self._owns = False
 
-    def read(self) -> ClockState:
+    def read(self) -> Clock:
         """Read the clock page."""
         return self._segment.clock.read()
 
@@ -241,7 +242,7 @@ class Coordinator:
         self._owns = False
         self._segment.clock.bell.ring()  # again, for a process that waits for the lock
 
-    def _write(self, state: ClockState) -> None:
+    def _write(self, state: Clock) -> None:
         self._segment.clock.write(state)
 
     def _take_lock(self, until_ns: int) -> None:
@@ -258,7 +259,7 @@ class Coordinator:
                 raise TimeError(f"the time of instance {name!r} is moved by {self._owner(state.owner)}{how}")
             bell.wait(seen, min(rest_ns, TURN_NS))
 
-    def _frozen(self, state: ClockState) -> ClockState:
+    def _frozen(self, state: Clock) -> Clock:
         """Return the state of virtual time that continues wall time from now."""
         now_ns = self._segment.clock_ns(time.monotonic_ns()) + state.offset_ns
         step = max([state.step, *(self._cycle(block, state, now_ns) for block in self._participants())])
@@ -269,7 +270,7 @@ class Coordinator:
         return [block for block in self._segment.blocks.values() if block.attributes.stepped]
 
     @staticmethod
-    def _cycle(block: Block, state: ClockState, now_ns: int) -> int:
+    def _cycle(block: Block, state: Clock, now_ns: int) -> int:
         """Return the present cycle of a free-running block, or a later one that it has published.
 
         For a block that replays a recording it is 0: the recording's cycles are not steps.
@@ -288,9 +289,7 @@ class Coordinator:
             if slot.name in sources:
                 self._segment.clock.slot_bell(slot.index).ring()
 
-    def _await_frames(
-        self, number: int, participants: Sequence[Block], asked: ClockState
-    ) -> Generator[StepWait, None, str]:
+    def _await_frames(self, number: int, participants: Sequence[Block], asked: Clock) -> Generator[StepWait, None, str]:
         """Wait for each block's frame for a step; returns who failed and why, or an empty string."""
         begun_ns = time.monotonic_ns()
         waiting = list(participants)

@@ -9,7 +9,7 @@ from typing import Final
 from shmio.errors import NotRunningError, ShmioError, TimeError
 from shmio.local.replays import Replays
 from shmio.local.time_control import Coordinator, Step, check_step
-from shmio.segment.clock import ClockState
+from shmio.model.clock import Clock
 from shmio.segment.segment import Segment
 
 PATIENCE_S: Final = 2.0
@@ -113,7 +113,7 @@ class TimeMethods:
         """The instance's replays. The attachment must be ``writable`` to change them."""
 
     @property
-    def clock(self) -> ClockState:
+    def clock(self) -> Clock:
         """State of the instance's clock: wall time, or virtual time with its last step."""
         return self._segment.clock.read()
 

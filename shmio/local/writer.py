@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import TYPE_CHECKING, Final, Unpack
+from typing import TYPE_CHECKING, Final, NamedTuple, Unpack
 
 import msgspec
 
@@ -16,6 +16,7 @@ from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge
+from shmio.model.outcome import Outcome, OutcomeKind
 from shmio.segment.commands import MAX_NAME_BYTES, CommandKind, CommandSender, InjectionOptions
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
@@ -36,24 +37,12 @@ REPLACED: Final = f"{RETIRED}{_UNKNOWN}"
 SILENT: Final = f"the source gave no answer in time{_UNKNOWN}"
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """The outcome of one written value.
-
-    Attributes:
-        path: Path within the source.
-        kind: The event that ended the write.
-        text: The reason, if there is one.
-    """
+class _End(NamedTuple):
+    """How a value, or another command, has ended."""
 
     path: str
     kind: EventKind
-    text: str = ""
-
-    @property
-    def done(self) -> bool:
-        """Whether the device confirmed the value, an injection took it, or consumers see it."""
-        return self.kind in DONE
+    text: str
 
 
 @dataclass(slots=True)
@@ -230,9 +219,9 @@ class SourceWriter:
         self._expect(ticket, EventKind.LIFTED)
 
     def _expect(self, ticket: PendingCommand, kind: EventKind) -> None:
-        (outcome,) = self.outcomes(ticket)
-        if outcome.kind is not kind:
-            raise CommandError(f"{self.block.source}: {outcome.text}")
+        (end,) = self._ends(ticket)
+        if end.kind is not kind:
+            raise CommandError(f"{self.block.source}: {end.text}")
 
     def _encode(self, register: Register, path: str, value: object) -> list[Write]:
         try:
@@ -271,20 +260,23 @@ class SourceWriter:
 
     def outcomes(self, ticket: PendingCommand) -> list[Outcome]:
         """Wait until a command has ended; returns the outcome of each value, in the given order."""
+        return [Outcome(path, OutcomeKind[kind.name], text) for path, kind, text in self._ends(ticket)]
+
+    def _ends(self, ticket: PendingCommand) -> list[_End]:
         open_items = set(range(len(ticket.paths)))
         ends: dict[int, Event] = {}
         while open_items and (event := self._next(ticket)) is not None:
             if event.kind == EventKind.REJECTED:
-                return [Outcome(path, EventKind.REJECTED, event.text) for path in dict.fromkeys(ticket.paths)]
+                return [_End(path, EventKind.REJECTED, event.text) for path in dict.fromkeys(ticket.paths)]
             if event.kind in ENDS:
                 ended = open_items.intersection(range(event.item, event.item + event.items))
                 open_items -= ended
                 ends |= dict.fromkeys(ended, event)
-        outcomes = []
+        found = []
         for path, items in ticket.values:
-            told = [self._outcome(ticket, place, path, ends) for place in items]
-            outcomes.append(next((outcome for outcome in told if not outcome.done), told[0]))
-        return outcomes
+            told = [self._end(ticket, place, path, ends) for place in items]
+            found.append(next((end for end in told if end.kind not in DONE), told[0]))
+        return found
 
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Send values as one command, and wait for their outcomes; raises as :meth:`submit`."""
@@ -316,11 +308,11 @@ class SourceWriter:
                 ticket.until_ns = min(ticket.until_ns, time.monotonic_ns() + round(PATIENCE_S * 1e9))
         return None
 
-    def _outcome(self, ticket: PendingCommand, place: int, path: str, ends: Mapping[int, Event]) -> Outcome:
+    def _end(self, ticket: PendingCommand, place: int, path: str, ends: Mapping[int, Event]) -> _End:
         end = ends.get(place)
         if end is None:
-            return Outcome(path, EventKind.UNKNOWN, self._silence(ticket))
-        return Outcome(path, EventKind(end.kind), end.text)
+            return _End(path, EventKind.UNKNOWN, self._silence(ticket))
+        return _End(path, EventKind(end.kind), end.text)
 
     def _silence(self, ticket: PendingCommand) -> str:
         if self.block.retired:

@@ -12,8 +12,9 @@ from shmio.errors import ConfigError
 from shmio.injection import Program, compile_program
 from shmio.layout.model import Layout
 from shmio.layout.values.write import cover
+from shmio.model.injection import Running
 from shmio.segment import NO_WRITER
-from shmio.segment.standing_injections import DeclaredState, StandingInjection, declared_document, encode, ranges_of
+from shmio.segment.standing_injections import StandingInjection, declared_document, encode, ranges_of
 
 
 def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
@@ -77,5 +78,5 @@ def _standing(program: Program) -> StandingInjection:
     declaration = program.declaration
     return StandingInjection(
         2**64 - 1, program.direction, declaration.priority, True, declaration.name, NO_WRITER, 0,
-        ranges_of(program.cover.tobytes()), DeclaredState(declaration, "waiting", 2**63 - 1),
+        ranges_of(program.cover.tobytes()), Running(declaration, "waiting", 2**63 - 1),
     )  # fmt: skip

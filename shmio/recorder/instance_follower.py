@@ -6,11 +6,11 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Final, NamedTuple
 
+from shmio.model.clock import Clock
 from shmio.recorder.block_follower import BlockEntry, BlockFollower, InstanceEntry
 from shmio.recorder.selection import Selection
 from shmio.recording.format.encoding import BlockPosition, ProcessChange, ProcessEvent, Reason, StepMark
 from shmio.segment import Block, Segment
-from shmio.segment.clock import ClockState
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.processes import Phase, ProcessSlot
 
@@ -206,7 +206,7 @@ class InstanceFollower:
             [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]
         )
 
-    def _step(self, state: ClockState) -> list[InstanceEntry]:
+    def _step(self, state: Clock) -> list[InstanceEntry]:
         """Return the end of a step that was read completely."""
         self.done = state.done
         if state.done != state.step or not state.dt_ns:  # the length of that step is unknown

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from shmio.errors import SegmentError
+from shmio.model.values import Provenance, Quality
 from shmio.segment._atomics import REASON_SIZE, Ring
 from shmio.segment.cursor import Cursor
 from shmio.segment.events import EventKind, EventRing, Record
-from shmio.segment.frame import Frame, Provenance, Quality
+from shmio.segment.frame import Frame
 from shmio.segment.header import cut
 
 if TYPE_CHECKING:

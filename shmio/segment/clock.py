@@ -19,15 +19,12 @@ import math
 import struct
 import time
 from collections.abc import Callable
-from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import Final
 
+from shmio.model.clock import Clock, ClockMode
 from shmio.segment import _atomics
 from shmio.segment.double_buffer import DoubleBuffer
 from shmio.segment.header import Header, cut, text
-
-STEP_SIZE_NS: Final = 50_000_000
-"""Default length of a step."""
 
 _SLOTS_AT: Final = 8
 _STEPPED_AT: Final = 12
@@ -41,70 +38,6 @@ _TIME: Final = struct.Struct("<IIQqq")  # the first fields of _STATE
 _NOTE_SIZE: Final = 167
 _PLAYING: Final = 1
 _STEPPING: Final = 2
-
-
-class ClockMode(IntEnum):
-    """Whether time is real or moved by steps."""
-
-    WALL = 0
-    VIRTUAL = 1
-    """Only steps move time, from take-over until release or the end of the instance."""
-
-    def __str__(self) -> str:
-        return self.name.lower()
-
-
-class ClockState(NamedTuple):
-    """A snapshot of the clock page.
-
-    Attributes:
-        mode: Whether time is real or virtual.
-        step: Number of the last requested step.
-        time_ns: The instance's clock after that step; in wall time the clock now.
-        dt_ns: Length of that step.
-        done: Number of the last step that all sources have finished.
-        step_size_ns: Default length of a step.
-        playing: Whether the owner of time steps continuously.
-        rate: Speed of playing, relative to real time.
-        stepping: Whether the last requested step is under way.
-        owner: Pid of the owner of time; 0: nobody.
-        note: Which processes a step waits for, why the last step failed, or what it did not move.
-        resumed_ns: In wall time: the clock at which time was released.
-        offset_ns: In wall time: how far the clock is ahead of the real time since the start.
-    """
-
-    mode: ClockMode = ClockMode.WALL
-    step: int = 0
-    time_ns: int = 0
-    dt_ns: int = 0
-    done: int = 0
-    step_size_ns: int = STEP_SIZE_NS
-    playing: bool = False
-    rate: float = 1.0
-    stepping: bool = False
-    owner: int = 0
-    note: str = ""
-    resumed_ns: int = 0
-    offset_ns: int = 0
-
-    @property
-    def virtual(self) -> bool:
-        """Whether time is virtual: only steps move it."""
-        return self.mode is ClockMode.VIRTUAL
-
-    @property
-    def present_ns(self) -> int:
-        """The instance's clock; during a step the time before it."""
-        return self.time_ns - self.dt_ns if self.stepping else self.time_ns
-
-    @property
-    def basis(self) -> tuple[ClockMode, int, int, int]:
-        """Base of clock and cycles in wall time; it changes whenever time is taken over or released."""
-        return self.mode, self.step, self.resumed_ns, self.offset_ns
-
-    def lead(self, period_ns: int) -> int:
-        """Return how many cycles of this period are ahead of the clock, in wall time."""
-        return self.step - self.resumed_ns // period_ns
 
 
 class Doorbell:
@@ -151,7 +84,7 @@ class ClockPage:
         self._offset = offset
         self._state = _cell(memory, offset)
         self._owned = owned
-        self._last = b"", ClockState()  # the last state read
+        self._last = b"", Clock()  # the last state read
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
         self.bell = Doorbell(memory, offset + _BELL_AT)
         """Doorbell that is rung at every change of the page."""
@@ -162,7 +95,7 @@ class ClockPage:
     def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int = 0) -> None:
         """Write the page of a new segment. ``virtual``: time stands still at ``time_ns`` until it is stepped."""
         struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
-        state = ClockState(ClockMode.VIRTUAL, time_ns=time_ns) if virtual else ClockState()
+        state = Clock(ClockMode.VIRTUAL, time_ns=time_ns) if virtual else Clock()
         _cell(memory, offset).write(_pack(state))
 
     @property
@@ -170,7 +103,7 @@ class ClockPage:
         """Whether the configuration makes time virtual from the start."""
         return bool(_word(self._memory, self._offset + _STEPPED_AT))
 
-    def read(self) -> ClockState:
+    def read(self) -> Clock:
         """Return the present state. If the owner of time has died, nobody plays it.
 
         Raises:
@@ -183,7 +116,7 @@ class ClockPage:
             return state
         return state._replace(time_ns=time.monotonic_ns() - self._started_ns + state.offset_ns)
 
-    def told(self) -> ClockState:
+    def told(self) -> Clock:
         """Return the state as last written, even if its writer is dead. SegmentError: the page is corrupt."""
         data = self._state.read(_STATE.size)
         before, state = self._last
@@ -192,7 +125,7 @@ class ClockPage:
             self._last = data, state
         return state
 
-    def write(self, state: ClockState, *, ring: bool = True) -> None:
+    def write(self, state: Clock, *, ring: bool = True) -> None:
         """Write the page and ring its doorbell. Only the owner of time may.
 
         ``ring`` is False if there is nothing to do yet for those who wait.
@@ -275,7 +208,7 @@ def _cell(memory: memoryview, offset: int) -> DoubleBuffer:
     return DoubleBuffer(memory, (offset + first, offset + second), complaint)
 
 
-def _pack(state: ClockState) -> bytes:
+def _pack(state: Clock) -> bytes:
     flags = (_PLAYING if state.playing else 0) | (_STEPPING if state.stepping else 0)
     time_ns, dt_ns = state.time_ns, state.dt_ns
     if not state.virtual:
@@ -286,9 +219,9 @@ def _pack(state: ClockState) -> bytes:
     )  # fmt: skip
 
 
-def _unpack(data: bytes) -> ClockState:
+def _unpack(data: bytes) -> Clock:
     mode, flags, step, time_ns, dt_ns, done, step_size_ns, rate, owner, note = _STATE.unpack(data)
-    state = ClockState(
+    state = Clock(
         ClockMode.VIRTUAL if mode else ClockMode.WALL, step, time_ns, dt_ns, done, step_size_ns,
         bool(flags & _PLAYING), rate if math.isfinite(rate) and rate > 0 else 1.0, bool(flags & _STEPPING), owner,
         text(note),

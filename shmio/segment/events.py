@@ -10,8 +10,8 @@ import struct
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from shmio.model.values import Quality
 from shmio.segment.cursor import Cursor
-from shmio.segment.frame import Quality
 
 if TYPE_CHECKING:
     from collections.abc import Callable

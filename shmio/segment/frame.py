@@ -2,31 +2,9 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import NamedTuple
 
-
-class Quality(IntEnum):
-    """Quality of a value, as in OPC UA (OPC 10000-8, section 6.3). Zeroed memory is bad."""
-
-    BAD = 0
-    UNCERTAIN = 1
-    GOOD = 2
-
-    def __str__(self) -> str:
-        return self.name.lower()
-
-
-class Provenance(IntEnum):
-    """Where a value comes from."""
-
-    LIVE = 0
-    SIMULATED = 1
-    REPLAYED = 2
-    INJECTED = 3
-
-    def __str__(self) -> str:
-        return self.name.lower()
+from shmio.model.values import Provenance, Quality
 
 
 class Frame(NamedTuple):

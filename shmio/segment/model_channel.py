@@ -15,8 +15,8 @@ from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import select
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import near
+from shmio.model.values import Provenance, Quality
 from shmio.segment import _atomics
-from shmio.segment.frame import Provenance, Quality
 from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
 

@@ -14,6 +14,7 @@ import msgspec
 from shmio.config import Declaration
 from shmio.layout.model import Register
 from shmio.layout.values.write import bits_of
+from shmio.model.injection import Injection
 from shmio.segment import _atomics
 from shmio.segment.events import NO_WRITER
 
@@ -21,50 +22,8 @@ STANDING_SIZE: Final = 32_768
 CELL_SIZE: Final = 8 + STANDING_SIZE
 
 
-class DeclaredState(msgspec.Struct, frozen=True):
-    """State of a declared injection.
-
-    Attributes:
-        declaration: The declaration.
-        state: ``waiting``, ``active``, ``over``, or ``lifted`` before its time.
-        seed: The run's only source of randomness; drawn by the source if the declaration has none.
-        runs: How often it has become active.
-        cycle: Cycle of the last activation.
-        time_ns: The instance's clock at the last activation.
-    """
-
-    declaration: Declaration
-    state: str
-    seed: int
-    runs: int = 0
-    cycle: int = 0
-    time_ns: int = 0
-
-
-class StandingInjection(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A present injection of a block; the innermost comes first in lists.
-
-    Attributes:
-        id: Number of the injection.
-        direction: ``out`` or ``in``.
-        priority: Priority; the highest is outermost.
-        keep: Whether it outlives the process that laid it.
-        name: Name of the injection.
-        writer: Command queue that it came from; NO_WRITER: the configuration.
-        pid: Process that it came from; 0: the configuration.
-        ranges: The covered bits as (offset, size, mask).
-        running: State of a declared injection; None: a client gives the values.
-    """
-
-    id: int
-    direction: str
-    priority: int
-    keep: bool
-    name: str
-    writer: int
-    pid: int
-    ranges: tuple[tuple[int, int, int], ...]
-    running: DeclaredState | None = None
+class StandingInjection(Injection[Declaration], frozen=True, omit_defaults=True):
+    """A present injection as its block lists it; the innermost comes first."""
 
     @property
     def configured(self) -> bool:

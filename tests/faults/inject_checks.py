@@ -6,7 +6,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmio.segment import EventKind
+from shmio.model.outcome import OutcomeKind
 from tests.faults.checks import Complain, Counts, Source
 from tests.faults.write_checks import SURELY_NOT
 
@@ -24,28 +24,28 @@ class GuardCheck:
     source: Source
     complain: Complain
     counts: Counts = field(default_factory=Counts)
-    _known: dict[int, EventKind] = field(default_factory=dict)
+    _known: dict[int, OutcomeKind] = field(default_factory=dict)
 
-    def written(self, value: int, kind: EventKind, text: str, *, stood: bool, free: bool) -> None:
+    def written(self, value: int, kind: OutcomeKind, text: str, *, stood: bool, free: bool) -> None:
         """What the writer of ``value`` was told. ``stood``: one injection stood all the while; ``free``: none could."""
         self._known[value] = kind
         self.counts.values += 1
-        if kind is EventKind.WRITTEN and stood:
+        if kind is OutcomeKind.WRITTEN and stood:
             self._say(f"{value} was written past the injection that stood before it")
-        elif kind is EventKind.TAKEN and free:
+        elif kind is OutcomeKind.TAKEN and free:
             self._say(f"{value} was taken, but there was no injection")
-        elif kind not in SURELY_NOT | {EventKind.WRITTEN, EventKind.TAKEN, EventKind.UNKNOWN}:
+        elif kind not in SURELY_NOT | {OutcomeKind.WRITTEN, OutcomeKind.TAKEN, OutcomeKind.UNKNOWN}:
             self._say(f"{value} ended as {kind.name} ({text})")
-        self.counts.good += kind is EventKind.TAKEN
+        self.counts.good += kind is OutcomeKind.TAKEN
 
     def look(self, value: int) -> None:
         """See what has come of it, and of what was given in its place; values before it are forgotten."""
         assert self.source.guarded is not None
         assert self.source.given is not None
         kind, landed_ns = self._known[value], self.source.guarded.since_ns(value)
-        if landed_ns is not None and kind in SURELY_NOT | {EventKind.TAKEN}:
+        if landed_ns is not None and kind in SURELY_NOT | {OutcomeKind.TAKEN}:
             self._say(f"{value} was {kind.name}, but the PLC got it")
-        if landed_ns is None and kind is EventKind.WRITTEN:
+        if landed_ns is None and kind is OutcomeKind.WRITTEN:
             self._say(f"{value} was WRITTEN, but the PLC never got it")
         answer_ns, given_ns = self.source.guarded.since_ns(value + 1), self.source.given.since_ns(value + 1)
         if answer_ns is not None and (given_ns is None or given_ns > answer_ns):

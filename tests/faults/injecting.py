@@ -14,7 +14,7 @@ from typing import Final
 
 from shmio.errors import CommandError, PathError, QualityError
 from shmio.local.attach import Attachment
-from shmio.segment import EventKind
+from shmio.model.outcome import OutcomeKind
 from shmio.segment.standing_injections import StandingInjection
 from tests.faults.checker import Checker
 from tests.faults.checks import Counts, Source, word_at
@@ -200,7 +200,7 @@ class Injecting:
     def _lift_rest(self, target: Target) -> None:
         """Nothing stands afterwards; CommandError."""
         for one in self._standing(target.source.name):
-            self._attachment.lift(target.source.name, one.id)
+            self._attachment.lift(target.source.name, one.number)
 
     def _standing(self, source: str) -> list[StandingInjection]:
         return standing(self._attachment, source, "n")
@@ -219,16 +219,16 @@ class Injecting:
 
     def _write(self, target: Target, *, free: bool) -> None:
         name, value = target.source.name, next(self._numbers)
-        before = {one.id for one in self._standing(name) if one.direction == "in"}
-        kind, text = EventKind.REJECTED, ""
+        before = {one.number for one in self._standing(name) if one.direction == "in"}
+        kind, text = OutcomeKind.REJECTED, ""
         try:
             (outcome,) = self._attachment.write({f"{name}/guarded": value}, 0.5)
             kind, text = outcome.kind, outcome.text
         except CommandError as error:
             text = str(error)
-        after = {one.id for one in self._standing(name) if one.direction == "in"}
+        after = {one.number for one in self._standing(name) if one.direction == "in"}
         target.guard.written(value, kind, text, stood=bool(before & after), free=free and not before | after)
-        if kind is EventKind.TAKEN:
+        if kind is OutcomeKind.TAKEN:
             target.guard.counts.since_ns = self._effect_ns = time.monotonic_ns()
         target.past.append(value)
         target.guard.look(target.past[0])

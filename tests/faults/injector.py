@@ -16,8 +16,7 @@ from pathlib import Path
 
 import shmio
 from shmio.errors import ShmioError
-from shmio.local.writer import Outcome
-from shmio.segment import EventKind
+from shmio.model.outcome import Outcome, OutcomeKind
 from tests.faults.truth import Truth
 
 PAUSE_S = 0.05
@@ -114,13 +113,13 @@ def local(client: Client) -> None:
                 for value in diversion.values.values():
                     assert isinstance(value, int)
                     shadow.set({order.word: client.note(value + 1)})
-            if not any(one.id == shadow.number for one in cell.injections()[order.source]):
+            if not any(one.number == shadow.number for one in cell.injections()[order.source]):
                 return
 
 
 def gone(outcomes: list[Outcome]) -> bool:
     """Whether the injection was lifted under its client."""
-    return any(outcome.kind is EventKind.REJECTED and "no injection" in outcome.text for outcome in outcomes)
+    return any(outcome.kind is OutcomeKind.REJECTED and "no injection" in outcome.text for outcome in outcomes)
 
 
 def v1(client: Client) -> None:

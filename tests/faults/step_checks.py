@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from shmio.model.clock import Clock
 from shmio.segment import Quality
-from shmio.segment.clock import ClockState
 from tests.faults.checks import Complain
 
 MODELS: Final = '''
@@ -57,9 +57,7 @@ class StepCheck:
 
     complain: Complain
 
-    def done(
-        self, before: ClockState, number: int, dt_ns: int, after: ClockState, answers: Mapping[str, Answer]
-    ) -> None:
+    def done(self, before: Clock, number: int, dt_ns: int, after: Clock, answers: Mapping[str, Answer]) -> None:
         """A step is over: its number as the call told it, the page before and after, each source's frame for it."""
         self._page(before, after, dt_ns)
         if number != after.step or after.done != number or after.step != before.step + 1:
@@ -81,13 +79,13 @@ class StepCheck:
                 seen, counted = follow.values["seen"], lead.values["count"]
                 self._say(before, after, f"follow has seen {seen} in step {number}, which made it {counted}")
 
-    def failed(self, before: ClockState, text: str, dt_ns: int, after: ClockState) -> None:
+    def failed(self, before: Clock, text: str, dt_ns: int, after: Clock) -> None:
         """A step has failed with this text."""
         if not NAMED.search(text):
             self._say(before, after, f"a step has failed and names nobody: {text}")
         self.unclear(before, dt_ns, after)
 
-    def unclear(self, before: ClockState, dt_ns: int, after: ClockState) -> None:
+    def unclear(self, before: Clock, dt_ns: int, after: Clock) -> None:
         """Nobody has told what became of a step: it was done, or not."""
         if after.step not in (before.step, before.step + 1):
             self._say(before, after, "one step has used up more than its number")
@@ -96,13 +94,13 @@ class StepCheck:
         if after.step != before.step:
             self._page(before, after, dt_ns)
 
-    def _page(self, before: ClockState, after: ClockState, dt_ns: int) -> None:
+    def _page(self, before: Clock, after: Clock, dt_ns: int) -> None:
         if not (before.virtual and after.virtual):
             self._say(before, after, "time is not virtual")
         if after.time_ns != before.time_ns + dt_ns:
             self._say(before, after, f"a step of {dt_ns} ns does not lead there")
 
-    def _say(self, before: ClockState, after: ClockState, problem: str) -> None:
+    def _say(self, before: Clock, after: Clock, problem: str) -> None:
         self.complain(f"{problem} (from {before} to {after})")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.segment import EventKind
+from shmio.model.outcome import OutcomeKind
 from tests.faults.checks import Source
 from tests.faults.inject_checks import INNER, LIFTED_NS, OUTER, QUIET_NS, SHOWN_NS, ChainCheck, GuardCheck, LifeCheck
 from tests.faults.truth import Truth
@@ -48,11 +48,11 @@ def test_what_an_injection_takes_is_held_to_what_the_plc_got(source: Source, fou
     give(source, 5, 20)
     land(source, 5, 20)
     land(source, 8, 30)
-    guard.written(2, EventKind.WRITTEN, "", stood=False, free=True)
-    guard.written(4, EventKind.TAKEN, "", stood=True, free=False)
-    guard.written(6, EventKind.TAKEN, "", stood=False, free=False)  # nothing was given in its place
-    guard.written(8, EventKind.UNKNOWN, "no answer", stood=True, free=False)
-    guard.written(10, EventKind.REJECTED, "not now", stood=False, free=True)
+    guard.written(2, OutcomeKind.WRITTEN, "", stood=False, free=True)
+    guard.written(4, OutcomeKind.TAKEN, "", stood=True, free=False)
+    guard.written(6, OutcomeKind.TAKEN, "", stood=False, free=False)  # nothing was given in its place
+    guard.written(8, OutcomeKind.UNKNOWN, "no answer", stood=True, free=False)
+    guard.written(10, OutcomeKind.REJECTED, "not now", stood=False, free=True)
     for value in (2, 4, 6, 8, 10):
         guard.look(value)
     assert found == []
@@ -62,16 +62,16 @@ def test_what_an_injection_takes_is_held_to_what_the_plc_got(source: Source, fou
 @pytest.mark.parametrize(
     ("kind", "stood", "free", "landed", "answered", "problem"),
     [
-        (EventKind.WRITTEN, True, False, True, False, "past the injection that stood"),
-        (EventKind.TAKEN, False, True, False, False, "there was no injection"),
-        (EventKind.ACCEPTED, False, False, False, False, "ended as ACCEPTED"),
-        (EventKind.TAKEN, True, False, True, False, "was TAKEN, but the PLC got it"),
-        (EventKind.WRITTEN, False, True, False, False, "the PLC never got it"),
-        (EventKind.TAKEN, True, False, False, True, "the PLC got 3, which no injection had given"),
+        (OutcomeKind.WRITTEN, True, False, True, False, "past the injection that stood"),
+        (OutcomeKind.TAKEN, False, True, False, False, "there was no injection"),
+        (OutcomeKind.ACCEPTED, False, False, False, False, "ended as ACCEPTED"),
+        (OutcomeKind.TAKEN, True, False, True, False, "was TAKEN, but the PLC got it"),
+        (OutcomeKind.WRITTEN, False, True, False, False, "the PLC never got it"),
+        (OutcomeKind.TAKEN, True, False, False, True, "the PLC got 3, which no injection had given"),
     ],
 )  # fmt: skip
 def test_what_goes_past_one_is_found(
-    source: Source, found: list[str], kind: EventKind, stood: bool, free: bool, landed: bool, answered: bool,
+    source: Source, found: list[str], kind: OutcomeKind, stood: bool, free: bool, landed: bool, answered: bool,
     problem: str,
 ) -> None:  # fmt: skip
     guard = check(source, found)

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
+from shmio.model.clock import Clock, ClockMode
 from shmio.segment import Quality
-from shmio.segment.clock import ClockMode, ClockState
 from tests.faults.step_checks import PARTICIPANTS, Answer, RecordedSteps, StepCheck
 
 MS = 1_000_000
-BEFORE = ClockState(ClockMode.VIRTUAL, 7, 100 * MS, 20 * MS, 7)
+BEFORE = Clock(ClockMode.VIRTUAL, 7, 100 * MS, 20 * MS, 7)
 AFTER = BEFORE._replace(step=8, time_ns=150 * MS, dt_ns=50 * MS, done=8)
 VALUES: dict[str, dict[str, object]] = {
     "lead": {"count": 8, "at_s": 0.15}, "follow": {"seen": 7, "at_s": 0.15}, "panel": {},
@@ -69,7 +69,7 @@ def test_a_step_that_is_not_whole_is_found(changed: dict[str, Any], problem: str
         (AFTER._replace(mode=ClockMode.WALL), "time is not virtual"),
     ],
 )
-def test_a_page_that_tells_something_else_is_found(after: ClockState, problem: str, found: list[str]) -> None:
+def test_a_page_that_tells_something_else_is_found(after: Clock, problem: str, found: list[str]) -> None:
     StepCheck(found.append).done(BEFORE, 8, 50 * MS, after, answers())
     assert any(problem in line for line in found), found
 
@@ -83,7 +83,7 @@ def test_a_page_that_tells_something_else_is_found(after: ClockState, problem: s
         ("step 8: lead: ?", AFTER._replace(done=7, time_ns=0), "does not lead there"),
     ],
 )
-def test_a_step_that_fails_otherwise_is_found(text: str, after: ClockState, problem: str, found: list[str]) -> None:
+def test_a_step_that_fails_otherwise_is_found(text: str, after: Clock, problem: str, found: list[str]) -> None:
     StepCheck(found.append).failed(BEFORE, text, 50 * MS, after)
     assert any(problem in line for line in found), found
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.segment import EventKind
+from shmio.model.outcome import OutcomeKind
 from tests.faults.checks import Source
 from tests.faults.truth import Truth
 from tests.faults.write_checks import LATE_NS, PublishCheck, WriteCheck
@@ -34,20 +34,20 @@ def test_writes_are_held_to_what_the_plc_got(source: Source, landed: Truth, foun
     check = WriteCheck(source, found.append)
     for value in (1, 2, 3, 9):
         landed.land(value, value)
-    check.outcome(1, EventKind.WRITTEN, "")
-    check.outcome(2, EventKind.UNKNOWN, "no answer")
-    check.outcome(4, EventKind.UNKNOWN, "no answer")
-    check.outcome(5, EventKind.EXPIRED, "too late")
+    check.outcome(1, OutcomeKind.WRITTEN, "")
+    check.outcome(2, OutcomeKind.UNKNOWN, "no answer")
+    check.outcome(4, OutcomeKind.UNKNOWN, "no answer")
+    check.outcome(5, OutcomeKind.EXPIRED, "too late")
     landed.land(4, 10)  # nobody promised anything about it
     for value in (1, 2, 4, 5):
         check.again(value)
     assert found == []
     assert (check.counts.values, check.counts.good, check.counts.since_ns) == (4, 1, 1)
-    check.outcome(6, EventKind.WRITTEN, "")
-    check.outcome(3, EventKind.REFUSED, "protected")
-    check.outcome(7, EventKind.ACCEPTED, "")
-    check.outcome(8, EventKind.REJECTED, "not now")
-    check.outcome(9, EventKind.WRITTEN, "")
+    check.outcome(6, OutcomeKind.WRITTEN, "")
+    check.outcome(3, OutcomeKind.REFUSED, "protected")
+    check.outcome(7, OutcomeKind.ACCEPTED, "")
+    check.outcome(8, OutcomeKind.REJECTED, "not now")
+    check.outcome(9, OutcomeKind.WRITTEN, "")
     landed.land(8, 11)
     landed.land(9, 12)
     check.again(8)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from shmio.segment import EventKind
+from shmio.model.outcome import OutcomeKind
 from tests.faults.checks import Complain, Counts, Source
 
-SURELY_NOT = {EventKind.REJECTED, EventKind.REFUSED, EventKind.EXPIRED}
+SURELY_NOT = {OutcomeKind.REJECTED, OutcomeKind.REFUSED, OutcomeKind.EXPIRED}
 """Outcomes after which the device has never had the value."""
 
 
@@ -28,14 +28,14 @@ class _ValueCheck:
 class WriteCheck(_ValueCheck):
     """Holds what a writer is told of its values to what the PLC got; each value is written once."""
 
-    _known: dict[int, tuple[EventKind, int | None]] = field(default_factory=dict)
+    _known: dict[int, tuple[OutcomeKind, int | None]] = field(default_factory=dict)
 
-    def outcome(self, value: int, kind: EventKind, text: str) -> None:
+    def outcome(self, value: int, kind: OutcomeKind, text: str) -> None:
         """What the writer was told of ``value``."""
         since_ns = self._since_ns(value)
         self._known[value] = kind, since_ns
         self.counts.values += 1
-        if kind is EventKind.WRITTEN:
+        if kind is OutcomeKind.WRITTEN:
             self.counts.good += 1
             if since_ns is None:
                 self.complain(f"{self.source.name}: {value} was reported as written, but the PLC never got it")
@@ -43,14 +43,14 @@ class WriteCheck(_ValueCheck):
                 self.counts.since_ns = max(self.counts.since_ns, since_ns)
         elif kind in SURELY_NOT and since_ns is not None:
             self.complain(f"{self.source.name}: {value} was reported as {kind.name} ({text}), but the PLC got it")
-        elif kind is not EventKind.UNKNOWN and kind not in SURELY_NOT:
+        elif kind is not OutcomeKind.UNKNOWN and kind not in SURELY_NOT:
             self.complain(f"{self.source.name}: {value} ended as {kind.name}")
 
     def again(self, value: int) -> None:
         """Look later: what was surely not sent does not come late, what was written does not come twice."""
         kind, before_ns = self._known[value]
         since_ns = self._since_ns(value)
-        if kind is not EventKind.UNKNOWN and since_ns != before_ns:
+        if kind is not OutcomeKind.UNKNOWN and since_ns != before_ns:
             self.complain(f"{self.source.name}: {value} was {kind.name}, and came to the PLC later, at {since_ns}")
         for old in [key for key in self._known if key < value]:
             del self._known[old]

@@ -13,7 +13,7 @@ import grpc
 
 from shmio.errors import CommandError
 from shmio.local.attach import Attachment
-from shmio.segment import EventKind
+from shmio.model.outcome import OutcomeKind
 from shmio.wire.simlog_v1_pb2 import PubRequest, ROSMessage, TopicDescriptor
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 from tests.faults.checker import Checker
@@ -42,7 +42,7 @@ def write(checker: Checker, source: Source) -> None:
                 (outcome,) = attachment.write({f"{source.name}/command": value}, chance.choice((0.05, 0.5, 2.0)))
                 kind, text = outcome.kind, outcome.text
             except CommandError as error:
-                kind, text = EventKind.REJECTED, str(error)
+                kind, text = OutcomeKind.REJECTED, str(error)
             check.outcome(value, kind, text)
             past.append(value)
             check.again(past[0])

@@ -20,8 +20,8 @@ import pytest
 
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import codec
+from shmio.model.clock import Clock, ClockMode
 from shmio.segment import Attributes, BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
-from shmio.segment.clock import ClockMode, ClockState
 
 SOURCE = Path(__file__).parents[2] / "examples/reader.c"
 COMPILER = shutil.which("cc") or shutil.which("gcc") or "cc"
@@ -205,18 +205,18 @@ def test_bad_and_stale_are_said(reader: Path, instance: str) -> None:
 def test_what_lives_on_the_clock_is_as_old_as_that_says(reader: Path, instance: str) -> None:
     with segment(instance, stale_ns=300_000_000, stepped=True) as made:
         hour_ns = 3600 * 10**9
-        made.clock.write(ClockState(ClockMode.VIRTUAL, 7, hour_ns, 10**7, 7))
+        made.clock.write(Clock(ClockMode.VIRTUAL, 7, hour_ns, 10**7, 7))
         writer = made.writer("device")
         with Running(reader, writer, instance, "device/on") as running:
-            made.clock.write(ClockState(ClockMode.VIRTUAL, 8, 2 * hour_ns, hour_ns, 7, stepping=True))
+            made.clock.write(Clock(ClockMode.VIRTUAL, 8, 2 * hour_ns, hour_ns, 7, stepping=True))
             number = writer.publish(image(), cycle=7)
             assert running.line()[:4] == (str(number), "7", "0", "good"), "the step is under way"
-            made.clock.write(ClockState(ClockMode.VIRTUAL, 8, 2 * hour_ns, hour_ns, 8))
+            made.clock.write(Clock(ClockMode.VIRTUAL, 8, 2 * hour_ns, hour_ns, 8))
             assert running.line() == (str(number), "7", "0", "bad", "true", "stale")
             writer.at_ns = made.clock.monotonic_ns(2 * hour_ns)
             number = writer.publish(image(), cycle=8)
             assert running.line()[:4] == (str(number), "8", "0", "good")
-            made.clock.write(ClockState(step=8, resumed_ns=2 * hour_ns, offset_ns=-10 * hour_ns))  # real time again
+            made.clock.write(Clock(step=8, resumed_ns=2 * hour_ns, offset_ns=-10 * hour_ns))  # real time again
             writer.at_ns = made.clock.now_ns() + hour_ns  # is not old, however slow the host is
             number = writer.publish(image(), cycle=9)
             assert running.line()[:4] == (str(number), "9", "0", "good")

@@ -11,7 +11,7 @@ from shmio.cli.target import config_option, target
 from shmio.errors import NotRunningError
 from shmio.local.status import ClockStatus, InstanceStatus, ProcessStatus, SourceStatus, read_status
 from shmio.logs import printable
-from shmio.segment.clock import ClockMode
+from shmio.model.clock import ClockMode
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 

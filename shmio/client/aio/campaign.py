@@ -8,8 +8,8 @@ from typing import Any, Protocol, Self
 
 from shmio.client import injections
 from shmio.client.aio.transport import Stream
-from shmio.client.injections import Happening
 from shmio.errors import CommandError, PathError
+from shmio.model.injection import Happening
 
 
 class Lift(Protocol):

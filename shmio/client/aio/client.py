@@ -14,13 +14,15 @@ from shmio.client.aio.model import Simulation
 from shmio.client.aio.steps import Steps
 from shmio.client.aio.transport import CLOSED, Channel, Duplex, Step, Stream, sleep
 from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
-from shmio.client.calls import Clock, Outcome, Target
-from shmio.client.injections import Injection, Lifted
+from shmio.client.calls import Target
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S, RETRY_S, Rejoining
 from shmio.client.replay import Wish
 from shmio.client.update import Snapshot, Tables, Update
 from shmio.errors import CommandError, ConflictError, RemoteError
+from shmio.model.clock import Clock
+from shmio.model.injection import Injection, Lifted
+from shmio.model.outcome import Outcome
 from shmio.model.replay_status import Playing
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
@@ -138,7 +140,7 @@ class Client:
         request = injections.declare_request(declarations, keep=keep)
         return await Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
-    async def injections(self, *sources: str) -> list[Injection]:
+    async def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
         """What stands at present, on these sources or all; of each the innermost first."""
         request = wire.ListInjectionsRequest(sources=sources)
         return injections.injections(await self._call(self._stub.ListInjections, request))
@@ -200,7 +202,7 @@ class Client:
 
     async def clock(self) -> Clock:
         """How time stands."""
-        return Clock.of((await self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
+        return calls.clock((await self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
 
     async def step(self, dt_s: float | None = None) -> Clock:
         """Take time over, and move it by one step; it returns when all streams have what has changed in it.
@@ -208,7 +210,7 @@ class Client:
         CommandError: the step failed, or another program owns time; ValueRangeError.
         """
         request = wire.StepRequest(dt_ns=calls.ns(dt_s))
-        return Clock.of(await self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
+        return calls.clock(await self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
 
     def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
         """Take time over, and move it by so many steps, by one call: see :class:`Steps`. ValueRangeError."""
@@ -217,19 +219,19 @@ class Client:
 
     async def set_step_size(self, dt_s: float) -> Clock:
         """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
-        return Clock.of(await self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
+        return calls.clock(await self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
 
     async def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
         """Have time step by itself, ``rate`` times as fast as real time. CommandError, ValueRangeError."""
-        return Clock.of(await self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
+        return calls.clock(await self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
 
     async def pause(self) -> Clock:
         """Have time step no more by itself; takes it over. CommandError."""
-        return Clock.of(await self._call(self._stub.Pause, wire.PauseRequest()))
+        return calls.clock(await self._call(self._stub.Pause, wire.PauseRequest()))
 
     async def release(self) -> Clock:
         """Have time go by itself again, from where it stands; how it stands then. CommandError."""
-        return Clock.of(await self._call(self._stub.Release, wire.ReleaseRequest()))
+        return calls.clock(await self._call(self._stub.Release, wire.ReleaseRequest()))
 
     async def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
         """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.

@@ -7,9 +7,9 @@ from typing import Any, Self
 
 from shmio.client import calls, injection
 from shmio.client.aio.transport import Background, Channel, Condition, Duplex
-from shmio.client.calls import Outcome
 from shmio.client.update import Update
 from shmio.errors import CommandError, RemoteError, ShmioError
+from shmio.model.outcome import Outcome
 
 
 class Shadow(AsyncIterator[Update]):

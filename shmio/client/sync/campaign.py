@@ -8,9 +8,9 @@ from contextlib import suppress
 from typing import Any, Protocol, Self
 
 from shmio.client import injections
-from shmio.client.injections import Happening
 from shmio.client.sync.transport import Stream
 from shmio.errors import CommandError, PathError
+from shmio.model.injection import Happening
 
 
 class Lift(Protocol):

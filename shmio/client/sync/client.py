@@ -10,8 +10,7 @@ import grpc
 
 from shmio.client import calls, injection, injections, replay
 from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
-from shmio.client.calls import Clock, Outcome, Target
-from shmio.client.injections import Injection, Lifted
+from shmio.client.calls import Target
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S, RETRY_S, Rejoining
 from shmio.client.replay import Wish
@@ -22,6 +21,9 @@ from shmio.client.sync.steps import Steps
 from shmio.client.sync.transport import CLOSED, Channel, Duplex, Step, Stream, sleep
 from shmio.client.update import Snapshot, Tables, Update
 from shmio.errors import CommandError, ConflictError, RemoteError
+from shmio.model.clock import Clock
+from shmio.model.injection import Injection, Lifted
+from shmio.model.outcome import Outcome
 from shmio.model.replay_status import Playing
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
@@ -139,7 +141,7 @@ class Client:
         request = injections.declare_request(declarations, keep=keep)
         return Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
-    def injections(self, *sources: str) -> list[Injection]:
+    def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
         """What stands at present, on these sources or all; of each the innermost first."""
         request = wire.ListInjectionsRequest(sources=sources)
         return injections.injections(self._call(self._stub.ListInjections, request))
@@ -201,7 +203,7 @@ class Client:
 
     def clock(self) -> Clock:
         """How time stands."""
-        return Clock.of((self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
+        return calls.clock((self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
 
     def step(self, dt_s: float | None = None) -> Clock:
         """Take time over, and move it by one step; it returns when all streams have what has changed in it.
@@ -209,7 +211,7 @@ class Client:
         CommandError: the step failed, or another program owns time; ValueRangeError.
         """
         request = wire.StepRequest(dt_ns=calls.ns(dt_s))
-        return Clock.of(self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
+        return calls.clock(self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
 
     def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
         """Take time over, and move it by so many steps, by one call: see :class:`Steps`. ValueRangeError."""
@@ -218,19 +220,19 @@ class Client:
 
     def set_step_size(self, dt_s: float) -> Clock:
         """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
-        return Clock.of(self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
+        return calls.clock(self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
         """Have time step by itself, ``rate`` times as fast as real time. CommandError, ValueRangeError."""
-        return Clock.of(self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
+        return calls.clock(self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
 
     def pause(self) -> Clock:
         """Have time step no more by itself; takes it over. CommandError."""
-        return Clock.of(self._call(self._stub.Pause, wire.PauseRequest()))
+        return calls.clock(self._call(self._stub.Pause, wire.PauseRequest()))
 
     def release(self) -> Clock:
         """Have time go by itself again, from where it stands; how it stands then. CommandError."""
-        return Clock.of(self._call(self._stub.Release, wire.ReleaseRequest()))
+        return calls.clock(self._call(self._stub.Release, wire.ReleaseRequest()))
 
     def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
         """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
 from shmio.client import calls, injection
-from shmio.client.calls import Outcome
 from shmio.client.sync.transport import Background, Channel, Condition, Duplex
 from shmio.client.update import Update
 from shmio.errors import CommandError, RemoteError, ShmioError
+from shmio.model.outcome import Outcome
 
 
 class Shadow(Iterator[Update]):

@@ -27,8 +27,9 @@ from shmio.injection.activation import State
 from shmio.injection.expression import Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.write import Write
+from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Block, Command, EventKind, Frame, Quality, Record
-from shmio.segment.standing_injections import DeclaredState, StandingInjection
+from shmio.segment.standing_injections import StandingInjection
 
 
 class ConditionValues:
@@ -130,7 +131,7 @@ class DeclaredInjections:
         time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
         self._publisher.injections.now = CycleImage(frame.cycle, time_ns, frame.raw)
 
-    def resume(self, standing: StandingInjection, running: DeclaredState, seen: Bits) -> None:
+    def resume(self, standing: StandingInjection, running: Running[Declaration], seen: Bits) -> None:
         """Resume an injection of the previous process.
 
         ``seen`` is the image that consumers saw last.
@@ -138,7 +139,7 @@ class DeclaredInjections:
         owner = Owner(standing.writer, standing.pid)
         try:
             program = self._program(running.declaration)
-            layer = resumed(declared(standing.id, program, owner, running.seed, keep=standing.keep), running, seen)
+            layer = resumed(declared(standing.number, program, owner, running.seed, keep=standing.keep), running, seen)
         except (ConfigError, ValueError) as error:
             log.warning("injection %s is not gone on with: %s", standing.name, error)
             return

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from shmio.config import Declaration
 from shmio.connectors.injection.layers import Bits, CycleImage, Layer, Owner, parts_of
 from shmio.injection import Program
 from shmio.injection.activation import Activation, State
@@ -16,8 +17,8 @@ from shmio.injection.draw import SeededRandom
 from shmio.injection.expression import Memory, Number
 from shmio.injection.operations import Delay, Drop, Operation, OperationContext
 from shmio.layout.values.write import Write
+from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Direction
-from shmio.segment.standing_injections import DeclaredState
 
 MAX_HELD: Final = 256
 """Writes that one delay over ``/in`` holds before further writes are rejected."""
@@ -68,11 +69,11 @@ class DeclaredLayer(Layer):
         return len(self.held) >= MAX_HELD
 
     @property
-    def running(self) -> DeclaredState:
+    def running(self) -> Running[Declaration]:
         """Its present state, as published in the segment."""
         now = self.activation
         declaration = self.program.declaration
-        return DeclaredState(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
+        return Running(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
 
     def advance(self, now: CycleImage, values: Sequence[Number | None]) -> bool:
         """Advance to the next image, given the values of its condition.
@@ -168,7 +169,7 @@ def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bo
     )
 
 
-def resumed(layer: DeclaredLayer, running: DeclaredState, seen: Bits) -> DeclaredLayer:
+def resumed(layer: DeclaredLayer, running: Running[Declaration], seen: Bits) -> DeclaredLayer:
     """Restore a layer to the state of the previous process.
 
     ``seen`` is the image that consumers saw last.

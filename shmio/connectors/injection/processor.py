@@ -163,7 +163,7 @@ class InjectionProcessor:
                 continue
             direction = Direction.IN if one.direction == "in" else Direction.OUT
             owner = Owner(one.writer, one.pid)
-            layer = Layer(one.id, direction, one.priority, one.keep, one.name, owner, covers[place], seen.copy())
+            layer = Layer(one.number, direction, one.priority, one.keep, one.name, owner, covers[place], seen.copy())
             self._publisher.restore(layer)
             hidden = np.zeros(block.layout.size, np.uint8)
             for outer, cover in zip(standing[place + 1 :], covers[place + 1 :], strict=True):

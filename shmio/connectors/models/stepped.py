@@ -16,8 +16,9 @@ from shmio.connectors.schedule import Schedule
 from shmio.connectors.source_status import Counters, QualityLog
 from shmio.errors import ShmioError
 from shmio.layout.values.write import Write
+from shmio.model.clock import Clock
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
-from shmio.segment.clock import ClockPage, ClockState
+from shmio.segment.clock import ClockPage
 
 RESTARTED: Final = "its process was started anew within this step; it goes on with the next one"
 
@@ -108,7 +109,7 @@ class SteppedLoop:
         self._page = writer.block.clock
         writer.utc_ns = self._page.utc_ns
         self._from_start = self._schedule = schedule
-        self._basis = ClockState().basis  # the zero of the schedule
+        self._basis = Clock().basis  # the zero of the schedule
         self._clock = clock
         self._inputs = inputs
         self._output = Output(writer, clock.now_ns)
@@ -197,7 +198,7 @@ class SteppedLoop:
         self._compute(due.cycle, time_ns, period_ns if self._time_ns is None else time_ns - self._time_ns)
         return False
 
-    def _resume(self, state: ClockState) -> None:
+    def _resume(self, state: Clock) -> None:
         """Follow real time again after virtual time was released."""
         self._basis = state.basis
         self._schedule = self._from_start.moved(state.offset_ns, state.lead(self._writer.block.period_ns))

@@ -13,7 +13,8 @@ from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.connection.connection import BrokerConnection
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.outbox import Outbox
-from shmio.segment.clock import ClockPage, ClockState
+from shmio.model.clock import Clock
+from shmio.segment.clock import ClockPage
 
 PATIENCE_S: Final = 3.0
 """Time limit for a broker to acknowledge a step; less than a step's own time-out."""
@@ -46,7 +47,7 @@ class StepDelivery:
             self.done, self._delivering = self._delivering.number, None
             self._clock.deliver(self._index, self.done)
 
-    def _begin(self, state: ClockState, feeds: Iterable[Feed]) -> None:
+    def _begin(self, state: Clock, feeds: Iterable[Feed]) -> None:
         for feed in feeds:
             feed.command_client.poll()
             feed.step()
@@ -75,7 +76,7 @@ class StepDelivery:
 class StepMarker:
     """The channel of the message that says that a step is over."""
 
-    def __init__(self, topic: str, state: ClockState) -> None:
+    def __init__(self, topic: str, state: Clock) -> None:
         self.number = state.done
         self.topic = topic
         self.sent: Message | None = None

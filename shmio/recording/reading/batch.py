@@ -12,9 +12,10 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
+from shmio.model.values import Provenance
 from shmio.recording.format.channels import Channel
 from shmio.recording.format.encoding import decode_frame, restore
-from shmio.segment.frame import Frame, Provenance
+from shmio.segment.frame import Frame
 
 HEAD: Final = np.dtype(
     [

@@ -15,8 +15,8 @@ from shmio.cli.cell import CampaignEvent, Cell
 from shmio.cli.user import main
 from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
+from shmio.model.clock import Clock, ClockMode
 from shmio.segment import BlockSpec, ProcessSpec, Segment
-from shmio.segment.clock import ClockMode, ClockState
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)))
 GOOD = '[[injection]]\nname = "x"\ntarget = "cell/a"\noperation = "noise"\namplitude = 1\n'
@@ -58,7 +58,7 @@ def test_a_file_with_a_fault_lays_nothing(
 class Still:
     """An instance whose time stands, and in which everything is over at once."""
 
-    clock = ClockState(ClockMode.VIRTUAL, time_ns=3_000_000_000)
+    clock = Clock(ClockMode.VIRTUAL, time_ns=3_000_000_000)
     stands = False
 
     def news(self) -> list[CampaignEvent]:
@@ -69,10 +69,10 @@ class Still:
         yield self
 
 
-@pytest.mark.parametrize("clock", [Still.clock, Still.clock._replace(playing=True), ClockState()])
+@pytest.mark.parametrize("clock", [Still.clock, Still.clock._replace(playing=True), Clock()])
 @pytest.mark.parametrize("from_now", [True, False])
 def test_where_time_stands_a_campaign_by_time_says_who_moves_it(
-    tmp_path: Path, clock: ClockState, from_now: bool, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, clock: Clock, from_now: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (file := tmp_path / "c.toml").write_text(GOOD)
     cell = Still()

@@ -177,7 +177,7 @@ def test_all_injections_are_lifted_at_once_whoever_laid_them(rig: Rig, local: At
     numbers = {rig.client.inject(["speed"]), rig.other.inject(["axis"], keep=True)}
     kept = local.inject("cell/lamps", keep=True)
     lifted = local.lift_all()
-    assert {one.id for _, one in lifted} == numbers | {kept.number}
+    assert {one.number for _, one in lifted} == numbers | {kept.number}
     assert {source for source, _ in lifted} == {"cell"}
     assert local.injections() == {"cell": ()}
     assert local.lift_all() == []

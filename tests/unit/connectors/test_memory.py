@@ -16,7 +16,8 @@ from shmio.errors import CommandError, ConfigError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.local.reading import reading
 from shmio.local.writer import SourceWriter
-from shmio.segment import Attributes, BlockSpec, EventKind, Frame, ProcessSpec, Provenance, Quality, Segment
+from shmio.model.outcome import OutcomeKind
+from shmio.segment import Attributes, BlockSpec, Frame, ProcessSpec, Provenance, Quality, Segment
 
 TABLE = b"""
 [registers]
@@ -87,7 +88,7 @@ def test_what_is_written_is_there_at_once_and_stays(segment: Segment) -> None:
     with running(segment) as source_writer:
         for number in range(20):
             (outcome,) = source_writer.write({"position": number + 0.25})
-            assert outcome.kind is EventKind.WRITTEN
+            assert outcome.kind is OutcomeKind.WRITTEN
             assert values(segment)["position"] == number + 0.25, "the outcome was told before the frame"
             until("position", number + 0.25)
         source_writer.write({"lamps/3": True, "name": "R800"})

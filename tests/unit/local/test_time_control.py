@@ -14,8 +14,8 @@ import pytest
 from shmio.errors import TimeError, ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.local.time_control import Coordinator, Step
+from shmio.model.clock import Clock, ClockMode
 from shmio.segment import Attributes, BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
-from shmio.segment.clock import ClockMode, ClockState
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
 PERIOD_NS = 20_000_000
@@ -38,7 +38,7 @@ def built(instance: str, *blocks: BlockSpec, stepped: bool = True) -> Iterator[S
 class Participant:
     """A source that answers each step as it is told to; ``None``: not at all."""
 
-    def __init__(self, instance: str, name: str, answer: Callable[[ClockState], str | None] = lambda _: "") -> None:
+    def __init__(self, instance: str, name: str, answer: Callable[[Clock], str | None] = lambda _: "") -> None:
         self.segment = Segment.open(instance, writable=True)
         self.name, self.answer = name, answer
         self.steps: list[tuple[int, int, int]] = []
@@ -76,7 +76,7 @@ class Participant:
 
 
 def test_a_step_is_over_when_all_have_done_it(instance: str) -> None:
-    delivered: list[tuple[Step, ClockState]] = []
+    delivered: list[tuple[Step, Clock]] = []
     with built(instance, spec("a"), spec("b"), spec("plc", stepped=False)) as segment, ExitStack() as stack:
         coordinator = Coordinator(segment, deliver=lambda step: delivered.append((step, segment.clock.read())))
         parts = [stack.enter_context(Participant(instance, name)) for name in ("a", "b")]
@@ -187,7 +187,7 @@ def test_nothing_is_stale_while_a_long_step_is_under_way(instance: str) -> None:
     qualities: list[Quality] = []
     with built(instance, spec("a"), spec("b")) as segment:
 
-        def look(state: ClockState) -> str:
+        def look(state: Clock) -> str:
             block = segment.blocks["b"]
             frame = block.latest()
             if frame is not None:
@@ -234,7 +234,7 @@ def test_a_cycle_that_had_begun_when_time_was_taken_over_is_gone_on_from(
         writer, write = segment.writer("a"), segment.clock.write
         modes: list[ClockMode] = []
 
-        def told(state: ClockState, *, ring: bool = True) -> None:
+        def told(state: Clock, *, ring: bool = True) -> None:
             write(state, ring=ring)
             modes.append(state.mode)
             if len(modes) == 1:
@@ -264,7 +264,7 @@ def test_the_step_size_is_remembered_and_checked(instance: str) -> None:
 def test_a_model_that_fails_fails_the_step_by_name(instance: str) -> None:
     with built(instance, spec("a"), spec("b")) as segment:
 
-        def raises_once(state: ClockState) -> str:
+        def raises_once(state: Clock) -> str:
             return "ZeroDivisionError: division by zero" if state.step == 1 else ""
 
         with Participant(instance, "a", raises_once), Participant(instance, "b") as other:
@@ -319,7 +319,7 @@ def test_after_the_soft_time_out_the_page_tells_whom_it_waits_for(instance: str)
     with built(instance, spec("b"), spec("a")) as segment:
         coordinator = Coordinator(segment, soft_s=0.001, hard_s=60)
 
-        def late(state: ClockState) -> str:
+        def late(state: Clock) -> str:
             while latest_cycle(segment, "a") < state.step:
                 segment.blocks["a"].ring.wait(segment.blocks["a"].ring.doorbell(), 1 * MS)
             while not segment.clock.read().note:

@@ -12,6 +12,7 @@ import shmio
 from shmio.errors import CommandError, PathError, SegmentError, ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.local.writer import SourceWriter
+from shmio.model.outcome import OutcomeKind
 from shmio.segment import Attributes, BlockSpec, BlockWriter, Command, EventKind, ProcessSpec, Record, Segment
 
 LAYOUT = Layout(
@@ -83,15 +84,15 @@ def test_each_value_has_its_outcome_in_the_order_given(writer: BlockWriter, sour
     source.append(both(tell(EventKind.REFUSED, 0, 1, "no"), tell(EventKind.WRITTEN, 1, 1)))
     outcomes = SourceWriter(writer.block, 5).write({"count": 7, "bits": [True] * 11})
     assert [(o.path, o.kind, o.text, o.done) for o in outcomes] == [
-        ("count", EventKind.REFUSED, "no", False),
-        ("bits", EventKind.WRITTEN, "", True),
+        ("count", OutcomeKind.REFUSED, "no", False),
+        ("bits", OutcomeKind.WRITTEN, "", True),
     ]
 
 
 def test_a_rejected_command_is_rejected_for_all(writer: BlockWriter, source: list[Answer]) -> None:
     source.append(tell(EventKind.REJECTED, text="not connected"))
     outcomes = SourceWriter(writer.block, 5).write({"count": 7, "bits/3": True})
-    assert [(o.kind, o.text) for o in outcomes] == [(EventKind.REJECTED, "not connected")] * 2
+    assert [(o.kind, o.text) for o in outcomes] == [(OutcomeKind.REJECTED, "not connected")] * 2
 
 
 def test_a_copy_by_fork_cannot_write(writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +112,7 @@ def test_of_a_slow_source_a_command_waits_for_some_cycles(instance: str) -> None
 
 def test_silence_is_unknown_after_the_time_is_over(writer: BlockWriter) -> None:
     (outcome,) = SourceWriter(writer.block, 5).write({"count": 7}, timeout_s=-0.95)
-    assert outcome.kind is EventKind.UNKNOWN
+    assert outcome.kind is OutcomeKind.UNKNOWN
     assert "gave no answer in time" in outcome.text
 
 
@@ -126,7 +127,7 @@ def test_a_restart_of_the_source_is_told_without_waiting_for_ever(
     source.append(die)
     began = time.monotonic()
     (outcome,) = SourceWriter(writer.block, 5).write({"count": 7}, timeout_s=600)
-    assert outcome.kind is EventKind.UNKNOWN
+    assert outcome.kind is OutcomeKind.UNKNOWN
     assert "the source was restarted meanwhile" in outcome.text
     assert time.monotonic() - began < 60
 

@@ -10,12 +10,13 @@ import pytest
 
 from shmio.errors import FormatError
 from shmio.layout.model import Layout, Register
+from shmio.model.clock import Clock, ClockMode
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
-from shmio.segment.clock import ClockMode, ClockState, time_lock
+from shmio.segment.clock import time_lock
 from shmio.segment.header import SectionKind, read_sections, table_state
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
-STATE = ClockState(
+STATE = Clock(
     ClockMode.VIRTUAL, 12, 5_000_000_000, 20_000_000, 11, 30_000_000, True, 2.5, True, 4711, "step 12 waits for sim"
 )
 
@@ -84,7 +85,7 @@ def test_the_present_is_before_the_step_that_is_under_way(segment: Segment) -> N
 
 def test_released_time_goes_on_from_where_it_stood_for_all_who_read(segment: Segment, instance: str) -> None:
     segment.clock.write(STATE)
-    real = ClockState(step=12, done=11, resumed_ns=5_000_000_000, offset_ns=-7_000_000_000)
+    real = Clock(step=12, done=11, resumed_ns=5_000_000_000, offset_ns=-7_000_000_000)
     segment.clock.write(real)
     with Segment.open(instance) as reader:
         assert reader.clock.told() == real._replace(time_ns=5_000_000_000)

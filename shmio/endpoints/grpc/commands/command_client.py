@@ -389,7 +389,7 @@ async def have_lifted(commands: CommandClient, injection: int, name: str) -> Non
 def stands(commands: CommandClient, injection: int) -> bool:
     """Return whether an injection still stands."""
     standing = commands.block.standing.read()
-    return not commands.block.retired and any(one.id == injection and not one.lifted for one in standing)
+    return not commands.block.retired and any(one.number == injection and not one.lifted for one in standing)
 
 
 def _check(commands: CommandClient) -> None:

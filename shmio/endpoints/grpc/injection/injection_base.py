@@ -32,7 +32,7 @@ class InjectionBase:
         before = self._inner
         bits = np.zeros(len(self.given), np.uint8)
         for one in self._block.standing.read() if self.number else ():
-            if one.id == self.number:
+            if one.number == self.number:
                 break
             if one.direction == "out" and one.active:
                 for offset, size, mask in one.ranges:

@@ -14,8 +14,8 @@ from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.endpoints.grpc.time.virtual_time import TimeStatus
 from shmio.errors import EndpointError, ShmioError, ValueRangeError
+from shmio.model.clock import Clock
 from shmio.segment import Segment
-from shmio.segment.clock import ClockState
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_ANSWERS: Final = 1024
@@ -170,7 +170,7 @@ class TimeCalls:
             news.set()
 
 
-def clock(state: ClockState) -> wire.Clock:
+def clock(state: Clock) -> wire.Clock:
     """Convert the state of the clock page to a message."""
     return wire.Clock(
         virtual=state.virtual,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -16,20 +15,9 @@ from shmio.layout.model import ByteOrder, Register, bit_positions
 from shmio.layout.types import ElementType
 from shmio.layout.values.date_types import Buffer
 from shmio.layout.values.scalar import Scalar, scalar_codec
+from shmio.model.values import Column
 
 Array = np.ndarray[Any, np.dtype[Any]]
-
-
-class Column(IntEnum):
-    """The type columns, numbered as ``Column`` and as the fields of ``Values`` on the wire."""
-
-    BOOL = 1
-    INT32 = 2
-    INT64 = 3
-    UINT64 = 4
-    FLOAT = 5
-    DOUBLE = 6
-    TEXT = 7
 
 
 _COLUMNS: Final = {

@@ -189,7 +189,7 @@ class CommandCalls:
         """
         try:
             (block,) = self.blocks([request.source])
-            standing = [one for one in block.standing.read() if one.id == request.number and not one.lifted]
+            standing = [one for one in block.standing.read() if one.number == request.number and not one.lifted]
             if not standing:
                 raise PathError(f"{request.source}: there is no injection {request.number}; ListInjections lists them")
             lifted = await self._lift(block, standing[0])
@@ -213,8 +213,8 @@ class CommandCalls:
         return wire.LiftResponse(lifted=lifted)
 
     async def _lift(self, block: Block, one: StandingInjection) -> wire.Lifted:
-        failure = await command_client.lift(self._feeds[block.source].commands, one.id)
-        return wire.Lifted(source=block.source, number=one.id, name=one.name, failure=failure)
+        failure = await command_client.lift(self._feeds[block.source].commands, one.number)
+        return wire.Lifted(source=block.source, number=one.number, name=one.name, failure=failure)
 
     def blocks(self, sources: Collection[str]) -> list[Block]:
         """Return the blocks of these sources, or of all. PathError: no such source."""

@@ -6,12 +6,14 @@ from collections.abc import Iterator
 
 import msgspec
 
+from shmio.config import Declaration
 from shmio.endpoints.grpc.shmio_v1.clock import clock
 from shmio.endpoints.grpc.shmio_v1.views import describe
 from shmio.local.status import ProcessStatus, SourceStatus, status_of
 from shmio.messages import declaration_to_wire
+from shmio.model.injection import Running
 from shmio.segment import Block, Segment
-from shmio.segment.standing_injections import DeclaredState, StandingInjection
+from shmio.segment.standing_injections import StandingInjection
 from shmio.wire import shmio_v1_pb2 as wire
 
 PART_REGISTERS = 4096
@@ -51,7 +53,7 @@ def injection(block: Block, one: StandingInjection) -> wire.Injection:
     """Describe an injection that stands on a block."""
     return wire.Injection(
         source=block.source,
-        number=one.id,
+        number=one.number,
         direction=wire.DIRECTION_IN if one.direction == "in" else wire.DIRECTION_OUT,
         priority=one.priority,
         keep=one.keep,
@@ -63,7 +65,7 @@ def injection(block: Block, one: StandingInjection) -> wire.Injection:
     )
 
 
-def _running(running: DeclaredState) -> wire.Running:
+def _running(running: Running[Declaration]) -> wire.Running:
     """Describe the state of a declared injection."""
     declaration = running.declaration
     return wire.Running(

@@ -14,7 +14,7 @@ import numpy as np
 from shmio.endpoints.grpc.server.time_slices import time_sliced
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1.clock import clock
-from shmio.endpoints.grpc.shmio_v1.columns import KINDS, Column, DecodedImage, pack
+from shmio.endpoints.grpc.shmio_v1.columns import KINDS, DecodedImage, pack
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_ELEMENTS, MAX_REGISTERS
 from shmio.endpoints.grpc.shmio_v1.values import FIELDS, MAX_VALUES, index_of, plain
 from shmio.endpoints.grpc.shmio_v1.views import Selection
@@ -27,6 +27,7 @@ from shmio.layout.model import Register
 from shmio.layout.topic import find, holders, parse_topic, shorten
 from shmio.layout.values.codec import RegisterCodec, codec
 from shmio.logs import printable
+from shmio.model.values import Column
 from shmio.segment import Block, Segment
 from shmio.segment.model_channel import MAX_NAME_BYTES, ModelChannel, ModelRequest, model_ports
 from shmio.wire import shmio_v1_pb2 as wire

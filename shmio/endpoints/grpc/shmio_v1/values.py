@@ -7,13 +7,13 @@ from typing import Any, Final
 
 from shmio.endpoints.grpc.commands.topics import Topics
 from shmio.endpoints.grpc.server.time_slices import time_sliced
-from shmio.endpoints.grpc.shmio_v1.columns import Column
 from shmio.endpoints.grpc.shmio_v1.views import Selection
 from shmio.errors import CommandError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import shorten
 from shmio.layout.values.text import from_text, wire_type
 from shmio.messages import value_from_wire
+from shmio.model.values import Column
 from shmio.segment import EventKind
 from shmio.wire import shmio_v1_pb2 as wire
 

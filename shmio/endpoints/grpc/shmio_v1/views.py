@@ -9,10 +9,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from shmio.endpoints.grpc.shmio_v1.columns import Column, Columns, DecodedImage, column_of, merge, pack
+from shmio.endpoints.grpc.shmio_v1.columns import Columns, DecodedImage, column_of, merge, pack
 from shmio.endpoints.grpc.shmio_v1.write_updates import WriteUpdates
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.layout.model import Register
+from shmio.model.values import Column
 from shmio.segment import Block, Frame
 from shmio.wire import shmio_v1_pb2 as wire
 

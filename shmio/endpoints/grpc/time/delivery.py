@@ -12,7 +12,7 @@ from shmio.endpoints.grpc.streams.outboxes import Outboxes
 from shmio.endpoints.grpc.time.virtual_time import Moment, VirtualTime
 from shmio.errors import SegmentError
 from shmio.local.time_control import Step
-from shmio.segment.clock import ClockState
+from shmio.model.clock import Clock
 
 PATIENCE_S: Final = 3.0
 """Time that clients have to take a step's values, and again to take its marker.
@@ -112,7 +112,7 @@ class Delivery:
                 log.warning("step %d: %s", step.number, str(error))
 
 
-def before(state: ClockState) -> Moment:
+def before(state: Clock) -> Moment:
     """Return the moment that counts as delivered when time is first seen to be virtual.
 
     On a busy machine the first step may have ended already, and still has to be delivered.

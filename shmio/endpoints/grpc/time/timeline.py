@@ -15,8 +15,8 @@ from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.time_topics import TimeTopics
 from shmio.endpoints.grpc.time.virtual_time import Moment, TimeStatus, VirtualTime
 from shmio.local.time_control import Step
+from shmio.model.clock import Clock
 from shmio.segment import ProcessSlot, Segment
-from shmio.segment.clock import ClockState
 
 
 class Timeline:
@@ -119,7 +119,7 @@ class Timeline:
             if self._awaited:
                 self._clock.deliver(self._slot.index, step.number)
 
-    def look(self) -> ClockState:
+    def look(self) -> Clock:
         """Read the clock page and act on what has changed.
 
         This is also called periodically, because a player that dies causes no wake-up.
@@ -142,7 +142,7 @@ class Timeline:
             self._tell(status, state)
         return state
 
-    def _end(self, state: ClockState) -> None:
+    def _end(self, state: Clock) -> None:
         """Act on the release of time: it is real again."""
         self._delivery.end()
         self.time_topics.resume()
@@ -164,11 +164,11 @@ class Timeline:
         state = self._clock.read()
         self._tell(TimeStatus(step.time_ns, step.dt_ns, True, state.playing), state)
 
-    def _status(self, state: ClockState) -> TimeStatus:
+    def _status(self, state: Clock) -> TimeStatus:
         dt_ns = (self._play_dt_ns() if state.playing else None) or state.step_size_ns
         return TimeStatus(self._now().clock_ns, dt_ns, not self.ended, state.playing)
 
-    def _tell(self, status: TimeStatus, state: ClockState) -> None:
+    def _tell(self, status: TimeStatus, state: Clock) -> None:
         self._told = self._status(state)[1:]
         for watcher in self._watchers:
             watcher(status)

@@ -22,6 +22,8 @@ from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value, codec
 from shmio.local.reading import reading
 from shmio.local.writer import SourceWriter
+from shmio.model.clock import Clock
+from shmio.model.outcome import OutcomeKind
 from shmio.segment import (  # fmt: skip
     Attributes,
     BlockSpec,
@@ -36,7 +38,6 @@ from shmio.segment import (  # fmt: skip
     Segment,
     Write,
 )
-from shmio.segment.clock import ClockState
 from shmio.segment.standing_injections import declared_document
 from shmio.testing.cell import until
 
@@ -185,7 +186,7 @@ def test_between_two_times_consumers_see_what_the_operation_makes(make: Callable
 def test_times_are_the_instances_also_for_a_device_once_time_was_released(make: Callable[..., Rig]) -> None:
     rig = make(declaration("drift", "cell/speed", "offset", value=100, start_s=3600.03, end_s=3600.05))
     hour_ns = 3600 * 10**9
-    rig.segment.clock.write(ClockState(step=7, done=7, resumed_ns=hour_ns, offset_ns=hour_ns))
+    rig.segment.clock.write(Clock(step=7, done=7, resumed_ns=hour_ns, offset_ns=hour_ns))
     assert rig.follow("speed", RAMP[:6]) == [10, 20, 130, 140, 50, 60]
 
 
@@ -369,7 +370,7 @@ def test_what_is_written_reaches_the_device_altered(make: Callable[..., Rig]) ->
 def test_a_black_hole_takes_what_is_written(make: Callable[..., Rig]) -> None:
     rig = make(declaration("hole", "cell/lamps/3/in", "drop"))
     rig.poll()
-    assert rig.other.write({"lamps/3": True})[0].kind is EventKind.TAKEN
+    assert rig.other.write({"lamps/3": True})[0].kind is OutcomeKind.TAKEN
     rig.write({"lamps": [True] * 10})
     rig.poll()
     bits = {(write.offset, write.mask) for write in rig.written}
@@ -421,12 +422,12 @@ def test_a_delay_that_is_full_rejects_what_comes(make: Callable[..., Rig]) -> No
     rig = make(declaration("late", "cell/speed/in", "delay", delay_cycles=2))
     rig.poll()
     for value in range(MAX_HELD):
-        assert rig.other.write({"speed": value})[0].kind is EventKind.TAKEN
+        assert rig.other.write({"speed": value})[0].kind is OutcomeKind.TAKEN
     (outcome,) = rig.other.write({"speed": 1})
     assert (outcome.kind, outcome.text) == (
-        EventKind.REJECTED, f"the delay of injection late holds {MAX_HELD} values already",
+        OutcomeKind.REJECTED, f"the delay of injection late holds {MAX_HELD} values already",
     )  # fmt: skip
-    rig.client.lift(rig.block.standing.read()[0].id)
+    rig.client.lift(rig.block.standing.read()[0].number)
     rig.write({"speed": 1})
 
 
@@ -448,19 +449,19 @@ def test_one_that_a_client_declares_goes_when_it_is_over_or_its_client_is_gone(m
         assert event is not None
         lifted += [(event.injection, event.text)] if event.kind == EventKind.LIFTED else []
     assert lifted == [(over, "over"), (gone, "its client is gone")]
-    assert [standing.id for standing in rig.block.standing.read()] == [kept]
+    assert [standing.number for standing in rig.block.standing.read()] == [kept]
 
 
 def test_one_of_the_configuration_that_somebody_lifts_stays_lifted(make: Callable[..., Rig]) -> None:
     rig = make(declaration("stuck", "cell/speed", "set", value=-1))
     rig.poll({"speed": 5})
     (standing,) = rig.block.standing.read()
-    rig.client.lift(standing.id)
+    rig.client.lift(standing.number)
     rig.poll()
     assert rig.sees("speed") == 5
     assert [one.lifted for one in rig.block.standing.read()] == [True]
     with pytest.raises(CommandError, match="the injection stuck was lifted already"):
-        rig.client.lift(standing.id)
+        rig.client.lift(standing.number)
     rig.close()
     again = Rig(rig.segment)
     try:
@@ -500,7 +501,7 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     stay = declaration("stay", "cell/axis/1", "freeze")
     rig = make(stay, declaration("go", "cell/flags", "set", value=1), declaration("turn", "cell/speed", "set", value=1))
     rig.poll({"axis/1": 1})
-    before = {standing.name: standing.id for standing in rig.block.standing.read()}
+    before = {standing.name: standing.number for standing in rig.block.standing.read()}
     changed = [
         stay,
         declaration("turn", "cell/speed", "set", value=2),
@@ -511,7 +512,7 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     until(lambda: "new" in {standing.name for standing in rig.block.standing.read()}, "laid, the last thing it does")
     rig.poll({"axis/1": 2})
     assert (rig.sees("axis/1"), rig.sees("flags"), rig.sees("speed")) == (1, 0, 2)
-    after = {standing.name: standing.id for standing in rig.block.standing.read()}
+    after = {standing.name: standing.number for standing in rig.block.standing.read()}
     assert set(after) == {"stay", "turn", "new"}
     assert before["stay"] == after["stay"]
     assert before["turn"] != after["turn"]

@@ -19,6 +19,7 @@ from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value
 from shmio.local.reading import Reading, reading
 from shmio.local.writer import SourceWriter
+from shmio.model.outcome import OutcomeKind
 from shmio.segment import (  # fmt: skip
     Attributes,
     BlockSpec,
@@ -176,7 +177,7 @@ def test_events_tell_what_was_done(rig: Rig) -> None:
     assert json.loads(laid.data) == {
         "direction": "out", "priority": 3, "keep": False, "ranges": [list(standing.ranges[0])],
     }  # fmt: skip
-    assert (standing.id, standing.direction, standing.priority, standing.name) == (number, "out", 3, "drive test")
+    assert (standing.number, standing.direction, standing.priority, standing.name) == (number, "out", 3, "drive test")
     assert (standing.writer, standing.pid, standing.keep) == (4, 100, False)
     assert [register.path for register in LAYOUT.registers if standing.covers(register)] == ["speed"]
     rig.other.shadow(number, {"speed": 258})
@@ -208,14 +209,14 @@ def test_what_is_written_goes_to_the_injection_and_its_values_to_the_device(rig:
     number = rig.client.inject(["lamps/2", "speed"], direction=Direction.IN)
     outcomes = rig.other.write({"speed": 20, "axis/1": 3})
     assert [(outcome.kind, outcome.done) for outcome in outcomes] == [
-        (EventKind.TAKEN, True),
-        (EventKind.WRITTEN, True),
+        (OutcomeKind.TAKEN, True),
+        (OutcomeKind.WRITTEN, True),
     ]
     diverted = rig.event(EventKind.DIVERTED)
     assert (diverted.injection, diverted.writer, diverted.data) == (number, 5, b"\x14\0")
     rig.sees({"speed": 0, "axis/1": 3})
     (outcome,) = rig.client.shadow(number, {"speed": 21})
-    assert outcome.kind is EventKind.WRITTEN
+    assert outcome.kind is OutcomeKind.WRITTEN
     rig.sees({"speed": 21})
     accepted = rig.event(EventKind.ACCEPTED)
     while accepted.data != b"\x15\0":
@@ -226,7 +227,7 @@ def test_what_is_written_goes_to_the_injection_and_its_values_to_the_device(rig:
 def test_of_an_array_only_the_covered_bits_are_diverted(rig: Rig) -> None:
     number = rig.client.inject(["lamps/2"], direction=Direction.IN)
     (outcome,) = rig.other.write({"lamps": [True] * 10})
-    assert outcome.kind is EventKind.WRITTEN
+    assert outcome.kind is OutcomeKind.WRITTEN
     diverted = rig.event(EventKind.DIVERTED)
     assert (diverted.mask, diverted.injection) == (4, number)
     rig.sees({"lamps": [place != 2 for place in range(10)]})
@@ -238,10 +239,10 @@ def test_values_on_their_way_in_pass_the_inner_injections(rig: Rig) -> None:
     rig.other.write({"speed": 1})
     assert rig.event(EventKind.DIVERTED).injection == outer
     (outcome,) = rig.client.shadow(outer, {"speed": 2})
-    assert outcome.kind is EventKind.TAKEN
+    assert outcome.kind is OutcomeKind.TAKEN
     assert rig.event(EventKind.DIVERTED).injection == inner
     (outcome,) = rig.client.shadow(inner, {"speed": 3})
-    assert outcome.kind is EventKind.WRITTEN
+    assert outcome.kind is OutcomeKind.WRITTEN
     rig.sees({"speed": 3})
 
 
@@ -303,7 +304,7 @@ def test_what_cannot_be_is_refused(rig: Rig) -> None:
         rig.client.inject(["locked"], direction=Direction.IN)
     number = rig.client.inject(["speed"], name="test")
     (outcome,) = rig.client.shadow(number, {"axis/1": 1})
-    assert outcome.kind is EventKind.REJECTED
+    assert outcome.kind is OutcomeKind.REJECTED
     assert "not covered by the injection test" in outcome.text
     (outcome,) = rig.client.shadow(number + 1, {"speed": 1})
     assert f"there is no injection {number + 1}" in outcome.text
@@ -319,7 +320,7 @@ def test_what_the_segment_has_no_room_for_is_refused(rig: Rig) -> None:
     laid: list[int] = []
     with pytest.raises(CommandError, match="too much for the injections of one source"):
         laid.extend(rig.client.inject(["speed"], name=name) for _ in range(MAX_INJECTIONS))
-    assert [standing.id for standing in rig.block.standing.read()] == laid
+    assert [standing.number for standing in rig.block.standing.read()] == laid
     rig.client.lift(laid[0])
     rig.client.inject(["speed"], name=name)
 

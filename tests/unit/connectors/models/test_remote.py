@@ -17,7 +17,8 @@ from shmio.connectors.models.remote import Remote
 from shmio.errors import ConfigError, SegmentError, TimeError
 from shmio.local.time_control import Coordinator
 from shmio.local.writer import SourceWriter
-from shmio.segment import Attributes, BlockSpec, EventKind, Frame, ProcessSpec, Provenance, Quality, Segment
+from shmio.model.outcome import OutcomeKind
+from shmio.segment import Attributes, BlockSpec, Frame, ProcessSpec, Provenance, Quality, Segment
 from shmio.segment.model_channel import ModelChannel, ModelRequest
 from tests.unit.connectors.models.test_stepped import GUEST, LAYOUT, MS, PATIENCE_S, PERIOD_NS, Running, latest, summed
 
@@ -145,12 +146,12 @@ def test_a_model_elsewhere_computes_its_outputs_and_nothing_else(instance: str) 
         coordinator.step(20 * MS)
         assert struct.unpack(">III", latest(segment, "sim").raw) == (1, 0, 0)
         (outcome,) = source_writer.write({"given": 7})
-        assert outcome.kind is EventKind.WRITTEN
+        assert outcome.kind is OutcomeKind.WRITTEN
         assert struct.unpack(">III", latest(segment, "sim").raw) == (1, 0, 0), "shown from the next step on"
         coordinator.step(30 * MS)
         assert struct.unpack(">III", latest(segment, "sim").raw) == (9, 7, 0)
         (outcome,) = source_writer.write({"sum": 7})
-        assert outcome.kind is EventKind.REFUSED
+        assert outcome.kind is OutcomeKind.REFUSED
         told = "the model computes sum: it is an output, which nobody writes; shmio inject shows others"
         assert outcome.text == told
         assert [(ask.step, ask.time_ns, ask.dt_ns) for ask in model.asks] == [

@@ -23,6 +23,7 @@ from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
 from shmio.local.time_control import Coordinator
 from shmio.local.writer import SourceWriter
+from shmio.model.outcome import OutcomeKind
 from shmio.segment import (
     Attributes,
     BlockSpec,
@@ -351,7 +352,7 @@ def test_a_write_has_its_end_while_time_stands(instance: str) -> None:
         coordinator.step(10 * MS)
         events = segment.blocks["sim"].events.cursor()
         (outcome,) = source_writer.write({"given": 7})
-        assert outcome.kind is EventKind.WRITTEN
+        assert outcome.kind is OutcomeKind.WRITTEN
         told = [event for event in iter(events.poll, None) if event.kind == EventKind.WRITTEN]
         assert [(event.cycle, event.clock_ns) for event in told] == [(1, 10 * MS)], "events have the page's time"
         assert summed(latest(segment, "sim")) == 1, "a model shows what is written with its next step"
@@ -546,7 +547,7 @@ def test_a_memory_shows_at_once_what_is_written_with_the_time_that_stands(instan
         assert segment.blocks["panel"].assess(panel.next()) == (Quality.GOOD, "")
         for given in (1, 2, 3):
             (outcome,) = source_writer.write({"given": given})
-            assert outcome.kind is EventKind.WRITTEN
+            assert outcome.kind is OutcomeKind.WRITTEN
             frame = latest(segment, "panel")
             assert (frame.raw[7], frame.cycle, frame.clock_ns) == (given, 1, 3_600_000 * MS)
         coordinator.step()

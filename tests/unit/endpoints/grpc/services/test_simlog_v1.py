@@ -302,7 +302,7 @@ def test_somebody_else_may_lift_it_and_the_stream_says_so(segment: Segment) -> N
             originals = await laid(served, target, "s")
             (one,) = segment.blocks["cell"].standing.read()
             assert one.name.startswith("s of ipv4:127.0.0.1:")
-            await asyncio.to_thread(SourceWriter(segment.blocks["cell"], GUEST).lift, one.id)
+            await asyncio.to_thread(SourceWriter(segment.blocks["cell"], GUEST).lift, one.number)
             while (got := await _end(originals)) is None:
                 pass
             assert got == (Status.ABORTED, f"{target}: somebody has lifted it")

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from shmio.client.arrays import Values
 from shmio.client.table import Table
-from shmio.endpoints.grpc.shmio_v1.columns import KINDS, Column, Columns, merge, pack
+from shmio.endpoints.grpc.shmio_v1.columns import KINDS, Columns, merge, pack
 from shmio.endpoints.grpc.shmio_v1.views import describe
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
+from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.layout.values.test_frame_codec import LAYOUT
 
