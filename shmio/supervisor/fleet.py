@@ -120,16 +120,20 @@ class Fleet:
         A dead supervisor started it too late to be seen at the take-over. The loop does not wait
         for its end.
         """
-        pid = managed.slot.report.pid
-        if managed.child is None or pid in (0, managed.child.pid, managed.evicted_pid):
+        if managed.child is None:
+            return
+        spared = (0, managed.child.pid, managed.evicted_pid)
+        if managed.slot.report.pid in spared:
             return
         worker = stale_segment.holder(managed.slot, self._segment.shared)
-        if worker is not None:
+        if worker is None:
+            return
+        if worker.pid not in spared:  # the child may have taken the slot since the first look
             log.warning("%s is held by pid %d, which no supervisor knows: killed", managed.name, worker.pid)
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(worker.pidfd, signal.SIGKILL)
-            os.close(worker.pidfd)
-            managed.evicted_pid = pid
+            managed.evicted_pid = worker.pid
+        os.close(worker.pidfd)
 
     def apply(self, managed: ManagedProcess, event: Event, note: str = "") -> None:
         """Apply an event to a process, and carry out the resulting action."""

@@ -135,7 +135,7 @@ class Watch:
             self._seen_ns.setdefault(file, now_ns)  # names are no help: the clock they are of is set
         files = sorted(self._seen_ns, key=self._seen_ns.__getitem__)
         for file in files if ended else files[:-1]:
-            if file not in self._checked:
+            if file not in self._checked and file.stat().st_size:  # empty: its recorder was killed before it wrote
                 before_ns = self._checked[-1].stat().st_mtime_ns if self._checked else self._seen_ns[file]
                 self._check(file, self._seen_ns[file] - before_ns + slack_ns)
                 self._checked.append(file)

@@ -234,6 +234,8 @@ class Stepping(Run):
         cycles: defaultdict[str, defaultdict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
         missed: defaultdict[str, defaultdict[str, int]] = defaultdict(lambda: defaultdict(int))
         for file in (self._folder / "dumps").glob("*.mem"):
+            if not file.stat().st_size:
+                continue  # its recorder was killed before it wrote: the steps must be in the next one
             try:
                 with Reader(file) as reader:
                     survey(reader)
