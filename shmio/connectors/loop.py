@@ -11,19 +11,22 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Final, NamedTuple, Protocol, TypeVar
 
+from shmio.backoff import Backoff
 from shmio.connectors.base import Connector
 from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.declared_injections import Blocks
 from shmio.connectors.injection.processor import OwnerOf
 from shmio.connectors.output import Image, Output
-from shmio.connectors.schedule import Backoff, Schedule
+from shmio.connectors.schedule import Schedule
 from shmio.connectors.source_status import Counters, QualityLog
 from shmio.errors import ConnectorError
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
-STABLE_NS = 1_000_000_000
+RECONNECT: Final = Backoff(0.1, 2.0)
+"""Waits before the next attempt to connect."""
+STABLE_NS: Final = 1_000_000_000
 """A connection that has lasted longer than this resets the back-off."""
 
 _Result = TypeVar("_Result")
@@ -116,7 +119,7 @@ class SourceLoop:
             owner_of=owner_of,
             blocks=blocks,
         )
-        self._backoff = Backoff()
+        self._retries = 0
         self._connected_ns: int | None = None
         self._accepting = False
         self._under_way: deque[_Submitted] = deque()
@@ -212,7 +215,7 @@ class SourceLoop:
             self._accepting = True
             self.commands.open()
         if self._connected_ns is not None and self._clock.now_ns() - self._connected_ns > STABLE_NS:
-            self._backoff.reset()
+            self._retries = 0
 
     def _connect(self) -> None:
         self._call(self._connector.connect)
@@ -229,7 +232,8 @@ class SourceLoop:
         self._under_way.clear()
         self._connector.close()
         self._disconnected(cycle, reason)
-        stop = self._clock.wait_ns(round(self._backoff.next_s() * 1e9))
+        stop = self._clock.wait_ns(round(RECONNECT.wait_s(self._retries) * 1e9))
+        self._retries += 1
         self._schedule.restart()
         return not stop
 

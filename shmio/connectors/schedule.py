@@ -54,21 +54,3 @@ class Schedule:
     def restart(self) -> None:
         """Forget the last cycle: the time until the next one is an outage and not an overrun."""
         self._last = None
-
-
-class Backoff:
-    """Back-off between attempts to connect: doubles from ``first_s`` to ``most_s``."""
-
-    def __init__(self, first_s: float = 0.1, most_s: float = 2.0) -> None:
-        self._first_s = first_s
-        self._most_s = most_s
-        self._next_s = first_s
-
-    def next_s(self) -> float:
-        """Return the time to wait now, in s, and double the next one."""
-        wait_s, self._next_s = self._next_s, min(2 * self._next_s, self._most_s)
-        return wait_s
-
-    def reset(self) -> None:
-        """Start again with ``first_s``."""
-        self._next_s = self._first_s

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
+from shmio.backoff import Backoff
 from shmio.config import Recorder as Settings
 from shmio.errors import RecordingError
 from shmio.recorder.attached_files import AttachedFiles
@@ -17,9 +18,8 @@ from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import CLOSE_S, Counters, Recorder
 from shmio.recording.format.encoding import BlockPosition, Reason
 
-FIRST_WAIT_S: Final = 1.0
-MAX_WAIT_S: Final = 600.0
-"""Longest time between new files for a disk whose fsync keeps failing; the time doubles up to this."""
+RENEWAL: Final = Backoff(1.0, 600.0)
+"""Waits between new files for a disk whose fsync keeps failing."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -61,7 +61,7 @@ class RotatingRecorder:
         self._settings = settings
         self._by = by
         self._attachments = attachments
-        self._wait_s = FIRST_WAIT_S
+        self._renewals = 0
         self._again_s = 0.0
         self._ending: list[Recorder] = []
         """Recorders of earlier files that still wait for the disk."""
@@ -144,7 +144,7 @@ class RotatingRecorder:
         if doubtful is not None:
             return self._renew(doubtful)
         if self.recorder.output.synced:
-            self._wait_s = FIRST_WAIT_S
+            self._renewals = 0
         if self._due and time.monotonic() >= self._again_s:
             self._rotate()
         return False
@@ -168,7 +168,7 @@ class RotatingRecorder:
             self.recorder = self._begin(self.tap, old.places, {}, after=old.output)
         except RecordingError as error:
             log.error("%s; going on in %s", error, old.output.path)
-            self._again_s = time.monotonic() + MAX_WAIT_S
+            self._again_s = time.monotonic() + RENEWAL.most_s
             return
         old.end()
         self._ending.append(old)
@@ -177,8 +177,8 @@ class RotatingRecorder:
     def _renew(self, doubtful: Recorder) -> bool:
         if time.monotonic() < self._again_s:
             return False
-        self._again_s = time.monotonic() + self._wait_s
-        self._wait_s = min(2 * self._wait_s, MAX_WAIT_S)
+        self._again_s = time.monotonic() + RENEWAL.wait_s(self._renewals)
+        self._renewals += 1
         output = doubtful.output
         about = {"doubtful": output.path.name, "doubtful_from": str(output.synced)}
         tap, places = self.tap, None

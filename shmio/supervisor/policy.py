@@ -7,12 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
+from shmio.backoff import Backoff
 from shmio.segment import Quality
 from shmio.supervisor.states import GRAPH, Action, Event, State
 
 REFUSED_STATUS = 2
 """Exit status of a worker that can never work as configured."""
+RESTART: Final = Backoff(0.5, 10.0)
+"""Waits before the next start of a process, from its second crash on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +33,7 @@ class Limits:
     """From SIGKILL until a process that still exists counts as stuck."""
     stable_s: float = 5.0
     """A process that runs this long is stable: its crashes no longer count."""
-    backoff_first_s: float = 0.5
-    backoff_most_s: float = 10.0
+    backoff: Backoff = RESTART
     start_attempts: int = 3
     """Crashes of a process that never ran after which the start of the instance has failed."""
     settle_s: float = 3.0
@@ -126,11 +129,8 @@ def _allowed_s(state: State, action: Action | None, crashes: int, limits: Limits
 
 
 def backoff_s(crashes: int, limits: Limits) -> float:
-    """Return the wait before the next start in s: 0 after one crash, then doubling to the limit."""
-    if crashes <= 1:
-        return 0.0
-    doublings = min(crashes - 2, 32)  # beyond that a float could overflow
-    return float(min(limits.backoff_most_s, limits.backoff_first_s * 2**doublings))
+    """Return the wait before the next start, in s: 0 after the first crash."""
+    return limits.backoff.wait_s(crashes - 2) if crashes > 1 else 0.0
 
 
 def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits) -> Event | None:

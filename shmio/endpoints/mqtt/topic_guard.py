@@ -12,11 +12,12 @@ from collections.abc import Callable
 from itertools import islice
 from typing import Final, Protocol
 
+from shmio.backoff import Backoff
+
 AT_ONCE: Final = 200
 """Topics that are corrected together."""
-FIRST_PAUSE_S: Final = 0.1
-"""The first pause between corrections; it doubles while others go on."""
-MOST_PAUSE_S: Final = 5.0
+PAUSE: Final = Backoff(0.1, 5.0)
+"""Pauses between corrections; they grow while others go on."""
 CALM_PAUSES: Final = 4
 """After so many pauses without a correction, the pause is as short as at first."""
 CALM_S: Final = 60.0
@@ -25,8 +26,8 @@ MOST_WAITING: Final = 1000
 """Maximum number of topics to correct; beyond that, everything is published again."""
 MOST_HEARD: Final = 2000
 """Messages of others in a second that start a rest, in which none is corrected."""
-REST_S: Final = 10.0
-MOST_REST_S: Final = 320.0
+REST: Final = Backoff(10.0, 320.0)
+"""The rests; they grow while others go on."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -54,7 +55,8 @@ class TopicGuard:
         self._owner, self._now_s = owner, now_s
         self._waiting: dict[str, None] = {}
         self._everything = False
-        self._pause_s, self._rest_s = FIRST_PAUSE_S, REST_S
+        self._pauses = self._rests = 0
+        """So many in a row: the next one is longer."""
         self._due_s = self._until_s = self._second_s = 0.0
         self._count = 0
         self._resting = False
@@ -78,10 +80,11 @@ class TopicGuard:
             self._owner.unwatch()
             self._waiting.clear()
             if now_s >= self._until_s + CALM_S:
-                self._rest_s = REST_S
-            self._resting, self._everything, self._until_s = True, True, now_s + self._rest_s
-            log.warning("others publish too much on our topics: none of it is corrected for %g s", self._rest_s)
-            self._rest_s = min(2 * self._rest_s, MOST_REST_S)
+                self._rests = 0
+            rest_s = REST.wait_s(self._rests)
+            self._rests += 1
+            self._resting, self._everything, self._until_s = True, True, now_s + rest_s
+            log.warning("others publish too much on our topics: none of it is corrected for %g s", rest_s)
         elif topic not in self._waiting and len(self._waiting) >= MOST_WAITING:
             self._everything = True
         else:
@@ -99,11 +102,11 @@ class TopicGuard:
             return CALM_S
         if now_s < self._due_s:
             return self._due_s - now_s
-        if now_s >= self._due_s + CALM_PAUSES * self._pause_s:
-            self._pause_s = FIRST_PAUSE_S
+        if now_s >= self._due_s + CALM_PAUSES * PAUSE.wait_s(self._pauses):
+            self._pauses = 0
         self._correct()
-        self._due_s = now_s + self._pause_s
-        self._pause_s = min(2 * self._pause_s, MOST_PAUSE_S)
+        self._due_s = now_s + PAUSE.wait_s(self._pauses)
+        self._pauses += 1
         return self._due_s - now_s if self._waiting else CALM_S
 
     def _correct(self) -> None:

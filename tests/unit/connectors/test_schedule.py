@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.schedule import Backoff, Schedule
+from shmio.connectors.schedule import Schedule
 
 
 def test_cycles_are_due_at_multiples_of_the_period_from_the_start() -> None:
@@ -46,10 +46,3 @@ def test_every_cycle_is_run_or_counted_whatever_the_delays(start: int, period: i
             assert due.cycle - previous - 1 == due.skipped
         previous, skipped = due.cycle, skipped + due.skipped
         now = max(now, due.due_ns) + delay
-
-
-def test_backoff_doubles_to_its_cap_and_begins_again() -> None:
-    backoff = Backoff(0.1, 0.5)
-    assert [backoff.next_s() for _ in range(5)] == [0.1, 0.2, 0.4, 0.5, 0.5]
-    backoff.reset()
-    assert backoff.next_s() == 0.1

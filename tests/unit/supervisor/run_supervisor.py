@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from shmio import logs
+from shmio.backoff import Backoff
 from shmio.errors import ConfigError, ShmioError
 from shmio.layout.model import Layout, Register
 from shmio.plan.processes import Job, Plan
@@ -79,6 +80,8 @@ def send(pidfd: int, sign: int, really: Callable[[int, int], None] = signal.pidf
 ChildProcess.kill = kill  # type: ignore[method-assign,assignment]
 signal.pidfd_send_signal = send  # type: ignore[assignment]
 logs.setup(folder / "supervisor.log", "supervisor")
+if first_s := limits.pop("backoff_first_s", None):
+    limits["backoff"] = Backoff(first_s, 10.0)
 modules = dict.fromkeys(("source", "emulator", "grpc"), "fake_worker")
 
 

@@ -95,10 +95,6 @@ def test_the_first_crash_restarts_at_once_and_the_next_ones_back_off_to_a_limit(
     assert world.life.restarts == 9
 
 
-def test_backoff_never_gives_up_or_overflows() -> None:
-    assert policy.backoff_s(10**9, LIMITS) == LIMITS.backoff_most_s
-
-
 def test_running_stably_resets_the_backoff(world: World) -> None:
     started(world)
     for _ in range(3):

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from shmio.backoff import Backoff
 from shmio.config import Mqtt
 from shmio.config.mqtt.rules import brokers
 
-FIRST_WAIT_S: Final = 0.25
-MOST_WAIT_S: Final = 15.0
-OWN_WAIT_S: Final = 0.5
-"""Maximum wait for our own broker: it is on this host and is restarted at once."""
+RECONNECT: Final = Backoff(0.25, 15.0, jitter=0.5)
+"""Waits before the next attempt. Jitter: the bridges of a plant must not all reconnect at once."""
+RECONNECT_OWN: Final = Backoff(0.25, 0.5, jitter=0.5)
+"""The same for our own broker: it is on this host and is restarted at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +73,10 @@ class ReconnectPolicy:
 
     def wait_s(self) -> float:
         """Count a failure, and return how long to wait, in s: longer after each."""
-        most_s = OWN_WAIT_S if all(target.transport == "unix" for target in self._targets) else MOST_WAIT_S
-        wait_s: float = min(most_s, FIRST_WAIT_S * 2 ** min(self._failures // self.count, 16))
+        backoff = RECONNECT_OWN if all(target.transport == "unix" for target in self._targets) else RECONNECT
+        wait_s = backoff.wait_s(self._failures // self.count)
         self._failures += 1
-        # Random, so that the bridges of a plant do not all reconnect at once.
-        return wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret
+        return wait_s
 
     def reset_failures(self) -> None:
         """Reset the back-off."""

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from shmio.backoff import Backoff
 from shmio.config import Address, MqttTls, MqttTopic
 from shmio.segment import BlockWriter, Segment
 from shmio.testing.mosquitto import Mosquitto
@@ -25,8 +26,7 @@ AWAY = "nothing listens there"
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests do not wait for a bridge that has given up for a while."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.FIRST_WAIT_S", 0.02)
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.02, 0.1))
 
 
 def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mosquitto) -> None:

@@ -6,6 +6,7 @@ import threading
 
 import pytest
 
+from shmio.backoff import Backoff
 from shmio.config import MqttTopic
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, Segment
@@ -87,7 +88,7 @@ def test_a_source_that_is_removed_is_forgotten(segment: Segment, broker: Mosquit
 def test_what_is_removed_while_the_broker_is_away_is_forgotten_when_it_is_back(
     segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.1, 0.1))
     segment.writer("cell").publish(image(step=3), cycle=1)
     with (
         Segment.open(segment.instance, writable=True) as opened,

@@ -9,10 +9,9 @@ import pytest
 from shmio.endpoints.mqtt.topic_guard import (
     AT_ONCE,
     CALM_PAUSES,
-    FIRST_PAUSE_S,
     MOST_HEARD,
-    MOST_PAUSE_S,
-    REST_S,
+    PAUSE,
+    REST,
     TopicGuard,
 )
 from shmio.segment import Segment
@@ -56,7 +55,7 @@ def test_two_bridges_of_one_prefix_do_not_answer_each_other_for_ever(
             for _ in range(2):
                 listener.until("cell/step/out", b"7")
                 listener.until("cell/step/out", b"8")
-        one.until(lambda: one.bridge._guard._pause_s > FIRST_PAUSE_S)
+        one.until(lambda: one.bridge._guard._pauses > 1)
 
 
 class Owner:
@@ -90,14 +89,14 @@ def test_corrections_become_rarer_as_long_as_others_go_on() -> None:
         owner.now_s += 0.001
         owner.guard.turn()
     assert 20 < len(owner.corrected) < 40
-    assert owner.guard.turn() <= MOST_PAUSE_S
-    owner.now_s += MOST_PAUSE_S
+    assert owner.guard.turn() <= PAUSE.most_s
+    owner.now_s += PAUSE.most_s
     owner.guard.turn()
-    owner.now_s += (CALM_PAUSES + 1) * MOST_PAUSE_S
+    owner.now_s += (CALM_PAUSES + 1) * PAUSE.most_s
     for _ in range(2):
         owner.guard.report("status")
         owner.guard.turn()
-        owner.now_s += FIRST_PAUSE_S
+        owner.now_s += PAUSE.first_s
     assert owner.corrected[-2:] == ["status", "status"]
     assert len(owner.corrected) < 45
 
@@ -106,11 +105,11 @@ def test_many_topics_are_corrected_some_at_a_time_and_too_many_by_telling_all() 
     owner = Owner()
     for number in range(AT_ONCE + 1):
         owner.guard.report(f"t{number}")
-    assert owner.guard.turn() == pytest.approx(FIRST_PAUSE_S)
+    assert owner.guard.turn() == pytest.approx(PAUSE.first_s)
     assert len(owner.corrected) == AT_ONCE
     for number in range(1500):
         owner.guard.report(f"t{number}")
-    owner.now_s += FIRST_PAUSE_S
+    owner.now_s += PAUSE.first_s
     owner.guard.turn()
     assert (owner.all, len(owner.corrected)) == (1, AT_ONCE)
 
@@ -130,8 +129,8 @@ def test_a_flood_is_not_listened_to_and_then_everything_is_told_again() -> None:
         told = owner.all
         owner.guard.turn()
         assert owner.watching == 1
-        owner.now_s += MOST_PAUSE_S
+        owner.now_s += PAUSE.most_s
         owner.guard.turn()
         assert owner.all == told + 1
-    assert rests == [REST_S, 2 * REST_S, 4 * REST_S]
+    assert rests == [REST.first_s, 2 * REST.first_s, 4 * REST.first_s]
     assert not owner.corrected

@@ -11,6 +11,7 @@ import pytest
 from paho.mqtt.client import Client, MQTTv5
 from paho.mqtt.enums import CallbackAPIVersion
 
+from shmio.backoff import Backoff
 from shmio.config import Address
 from shmio.connectors.injection.layers import Owner
 from shmio.segment import Segment
@@ -29,8 +30,7 @@ IN_FLIGHT = 5
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.FIRST_WAIT_S", 0.02)
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.02, 0.1))
 
 
 def flood(address: Address, qos: int) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from shmio.backoff import Backoff
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.connection.connection import BrokerConnection
@@ -113,7 +114,7 @@ class Broker:
 
 def test_who_is_thrown_out_again_and_again_is_told_what_may_be_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two clients of one id, and a broker that does not say so."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.FIRST_WAIT_S", 0.0)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.0, 0.0))
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
         try:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from shmio.backoff import Backoff
 from shmio.config import Sparkplug
 from shmio.segment import Segment
 from shmio.testing.mosquitto import Mosquitto
@@ -22,8 +23,7 @@ WAITING = Sparkplug(group="plant", node="a50", primary_host="scada")
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.FIRST_WAIT_S", 0.02)
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.02, 0.1))
 
 
 def say(listener: Listener, payload: Any, topic: str = STATE) -> None:

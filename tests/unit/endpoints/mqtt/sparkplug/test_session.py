@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from shmio.backoff import Backoff
 from shmio.config import Address, Mqtt, MqttTopic, Sparkplug
 from shmio.connectors.injection.layers import Owner
 from shmio.endpoints.mqtt.bridge import Bridge
@@ -92,8 +93,7 @@ def node(segment: Segment, address: Address, **settings: Any) -> Iterator[Runnin
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.FIRST_WAIT_S", 0.02)
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.02, 0.1))
 
 
 def bd_seq(heard: Heard) -> int:
