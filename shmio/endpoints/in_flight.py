@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from shmio.local.writer import PATIENCE_S, RESTARTED, SILENT, PendingCommand
-from shmio.segment import DONE, ENDS, Event, EventKind
+from shmio.segment import Event, EventKind
 from shmio.segment.events import EVENT_DATA_SIZE
+from shmio.segment.pending_commands import CommandOutcomes, End
 
 MAX_OPEN: Final = 512
 """Bound of outstanding events: a quarter of the ring, so that none is overwritten unread."""
 
-End = tuple[EventKind, str]
-"""An item's outcome and its reason: one of ``ENDS``, or ACCEPTED if the command ends with that."""
 Done = Callable[[Sequence[End]], None]
 """Called once, with the outcome of each of a command's values."""
-
-
-def worst(ends: Sequence[End]) -> End:
-    """Return the first outcome that is not a success, or the first of all if there is none."""
-    return next((end for end in ends if end[0] not in DONE), ends[0])
 
 
 def in_words(end: End) -> str:
@@ -53,9 +47,9 @@ class InFlightCommand:
         until_ns: When waiting ends, by the monotonic clock.
         cost: The space it may need.
         values: For each value, the range of its items.
+        outcomes: The outcomes of the items.
         done: Called once, with the outcome of each value.
         accepted: Called once, if the source accepts the command.
-        until_accepted: Whether acceptance already ends the command.
 
     """
 
@@ -63,38 +57,24 @@ class InFlightCommand:
     until_ns: int
     cost: CommandCost
     values: Sequence[range]
+    outcomes: CommandOutcomes
     done: Done
     accepted: Callable[[], None] | None = None
-    until_accepted: bool = False
     taken: bool = False
     """Whether the source has taken the command out of the queue."""
     open_events: int = 0
     """Upper bound of the events that are still to come."""
-    _ends: dict[int, End] = field(default_factory=dict)
-
-    @property
-    def items(self) -> int:
-        """Number of the command's items."""
-        return self.values[-1].stop
 
     def hear(self, event: Event) -> bool:
         """Process one event; return whether all outcomes are known."""
         if not self.taken and event.kind == EventKind.ACCEPTED and self.accepted is not None:
             self.accepted()
         self.taken = True
-        if event.kind == EventKind.REJECTED:
-            self._ends = dict.fromkeys(range(self.items), (EventKind.REJECTED, event.text))
-        elif event.kind in ENDS or (self.until_accepted and event.kind == EventKind.ACCEPTED):
-            kind = EventKind(event.kind)
-            end = kind, event.text if kind is not EventKind.ACCEPTED else ""
-            for item in range(event.item, min(event.item + max(1, event.items), self.items)):
-                self._ends[item] = end
-        return len(self._ends) == self.items
+        return self.outcomes.follow(event)
 
     def finish(self, missing: str = "") -> None:
         """Report the outcomes. ``missing``: why some of them are unknown."""
-        unknown = EventKind.UNKNOWN, missing
-        self.done([worst([self._ends.get(item, unknown) for item in items]) for items in self.values])
+        self.done([self.outcomes.of(items, missing) for items in self.values])
 
 
 class InFlightTable:
@@ -125,10 +105,13 @@ class InFlightTable:
         *,
         until_accepted: bool = False,
     ) -> None:
-        """Add a command that was sent. Arguments as of :class:`InFlightCommand`."""
+        """Add a command that was sent.
+
+        Arguments as of :class:`InFlightCommand` and :class:`CommandOutcomes`.
+        """
         self._by_number[ticket.number] = InFlightCommand(
-            ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values], done, accepted,
-            until_accepted, open_events=cost.events,
+            ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values],
+            CommandOutcomes(len(ticket.paths), until_accepted=until_accepted), done, accepted, open_events=cost.events,
         )  # fmt: skip
         self.untaken_bytes += cost.record_bytes
         self.open_events += cost.events

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import TYPE_CHECKING, Final, NamedTuple, Unpack
+from typing import TYPE_CHECKING, Final, Unpack
 
 import msgspec
 
@@ -18,7 +18,8 @@ from shmio.layout.topic import find
 from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge
 from shmio.model.outcome import Outcome, OutcomeKind
 from shmio.segment.commands import MAX_NAME_BYTES, CommandKind, CommandSender, InjectionOptions
-from shmio.segment.events import DONE, ENDS, Event, EventKind
+from shmio.segment.events import DONE, Event, EventKind
+from shmio.segment.pending_commands import CommandOutcomes, End
 
 if TYPE_CHECKING:
     from shmio.segment.block import Block
@@ -35,14 +36,6 @@ _UNKNOWN: Final = "; it is not known whether the value was written"
 RESTARTED: Final = f"the source was restarted meanwhile{_UNKNOWN}"
 REPLACED: Final = f"{RETIRED}{_UNKNOWN}"
 SILENT: Final = f"the source gave no answer in time{_UNKNOWN}"
-
-
-class _End(NamedTuple):
-    """How a value, or another command, has ended."""
-
-    path: str
-    kind: EventKind
-    text: str
 
 
 @dataclass(slots=True)
@@ -219,9 +212,9 @@ class SourceWriter:
         self._expect(ticket, EventKind.LIFTED)
 
     def _expect(self, ticket: PendingCommand, kind: EventKind) -> None:
-        (end,) = self._ends(ticket)
-        if end.kind is not kind:
-            raise CommandError(f"{self.block.source}: {end.text}")
+        ((_, (end, reason)),) = self._ends(ticket)
+        if end is not kind:
+            raise CommandError(f"{self.block.source}: {reason}")
 
     def _encode(self, register: Register, path: str, value: object) -> list[Write]:
         try:
@@ -260,23 +253,14 @@ class SourceWriter:
 
     def outcomes(self, ticket: PendingCommand) -> list[Outcome]:
         """Wait until a command has ended; returns the outcome of each value, in the given order."""
-        return [Outcome(path, OutcomeKind[kind.name], text) for path, kind, text in self._ends(ticket)]
+        return [Outcome(path, OutcomeKind[kind.name], text) for path, (kind, text) in self._ends(ticket)]
 
-    def _ends(self, ticket: PendingCommand) -> list[_End]:
-        open_items = set(range(len(ticket.paths)))
-        ends: dict[int, Event] = {}
-        while open_items and (event := self._next(ticket)) is not None:
-            if event.kind == EventKind.REJECTED:
-                return [_End(path, EventKind.REJECTED, event.text) for path in dict.fromkeys(ticket.paths)]
-            if event.kind in ENDS:
-                ended = open_items.intersection(range(event.item, event.item + event.items))
-                open_items -= ended
-                ends |= dict.fromkeys(ended, event)
-        found = []
-        for path, items in ticket.values:
-            told = [self._end(ticket, place, path, ends) for place in items]
-            found.append(next((end for end in told if end.kind not in DONE), told[0]))
-        return found
+    def _ends(self, ticket: PendingCommand) -> list[tuple[str, End]]:
+        outcomes = CommandOutcomes(len(ticket.paths))
+        while (event := self._next(ticket)) is not None and not outcomes.follow(event):
+            pass
+        missing = "" if event else self._silence(ticket)
+        return [(path, outcomes.of(items, missing)) for path, items in ticket.values]
 
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Send values as one command, and wait for their outcomes; raises as :meth:`submit`."""
@@ -307,12 +291,6 @@ class SourceWriter:
                 # The new process reports commands that the old one had not taken; the others stay unknown.
                 ticket.until_ns = min(ticket.until_ns, time.monotonic_ns() + round(PATIENCE_S * 1e9))
         return None
-
-    def _end(self, ticket: PendingCommand, place: int, path: str, ends: Mapping[int, Event]) -> _End:
-        end = ends.get(place)
-        if end is None:
-            return _End(path, EventKind.UNKNOWN, self._silence(ticket))
-        return _End(path, EventKind(end.kind), end.text)
 
     def _silence(self, ticket: PendingCommand) -> str:
         if self.block.retired:

@@ -121,7 +121,7 @@ class Explainer:
             if event.kind == EventKind.ACCEPTED:
                 self._remember(event, places)
             return places
-        key = event.incarnation, event.writer, event.command
+        key = event.command_key
         accepted = self._under_way.get(key, {})
         found: tuple[Place, ...] = ()
         for item in range(event.item, event.item + min(event.items, MAX_REMEMBERED)):
@@ -133,7 +133,7 @@ class Explainer:
     def _remember(self, event: Event, places: tuple[Place, ...]) -> None:
         if len(self._under_way) >= MAX_REMEMBERED:
             self._under_way.pop(next(iter(self._under_way)))
-        items = self._under_way.setdefault((event.incarnation, event.writer, event.command), {})
+        items = self._under_way.setdefault(event.command_key, {})
         if len(items) < MAX_REMEMBERED:
             items[event.item] = items.get(event.item, ()) + places
 

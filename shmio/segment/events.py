@@ -133,6 +133,11 @@ class Event(NamedTuple):
     text: str
     injection: int = 0
 
+    @property
+    def command_key(self) -> tuple[int, int, int]:
+        """Identifies the command among all of the block: the source's process, the writer, and the number."""
+        return self.incarnation, self.writer, self.command
+
 
 class Record(NamedTuple):
     """The content of an event, chosen by its writer."""

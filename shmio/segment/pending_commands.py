@@ -1,8 +1,8 @@
-"""Reassemble commands from their events: what a command wrote, or what went to an injection."""
+"""Reassemble commands from their events: what a command wrote, what went to an injection, and how it ended."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from shmio.layout.model import Layout
@@ -11,7 +11,7 @@ from shmio.layout.topic import find_each
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import Write
 from shmio.layout.values.write import apply as write_to
-from shmio.segment.events import Event, EventKind
+from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 
 class CommandWrites(NamedTuple):
@@ -23,8 +23,8 @@ class CommandWrites(NamedTuple):
     writes: tuple[Write, ...]
 
 
-_Key = tuple[int, int, int]
-_NOBODY: Final = (0, 0, 0)
+NO_COMMAND: Final = (0, 0, 0)
+"""The key of no command; see ``Event.command_key``."""
 
 
 class CommandAssembler:
@@ -37,12 +37,12 @@ class CommandAssembler:
 
     def __init__(self, kind: EventKind = EventKind.DIVERTED) -> None:
         self._kind = kind
-        self._command: _Key = _NOBODY
+        self._command = NO_COMMAND
         self._parts: dict[int, list[Event]] = {}
 
     def follow(self, event: Event) -> list[CommandWrites]:
         """Process the next event; returns the commands that it completes."""
-        command = event.incarnation, event.writer, event.command
+        command = event.command_key
         if event.kind != self._kind:
             return self._whole() if command == self._command or event.kind == EventKind.STARTED else []
         whole = [] if command == self._command else self._whole()
@@ -57,8 +57,42 @@ class CommandAssembler:
             CommandWrites(injection, parts[-1], tuple(Write(part.offset, part.mask, part.data) for part in parts))
             for injection, parts in self._parts.items()
         ]
-        self._command, self._parts = _NOBODY, {}
+        self._command, self._parts = NO_COMMAND, {}
         return whole
+
+
+End = tuple[EventKind, str]
+"""An item's outcome and its reason: one of ``ENDS``, or ACCEPTED if the command ends with that."""
+
+
+def worst(ends: Sequence[End]) -> End:
+    """Return the first outcome that is not a success, or the first of all if there is none."""
+    return next((end for end in ends if end[0] not in DONE), ends[0])
+
+
+class CommandOutcomes:
+    """Collects the outcomes of one command's items."""
+
+    def __init__(self, items: int, *, until_accepted: bool = False) -> None:
+        """``until_accepted``: whether acceptance already ends an item."""
+        self._items = items
+        self._until_accepted = until_accepted
+        self._ends: dict[int, End] = {}
+
+    def follow(self, event: Event) -> bool:
+        """Process the command's next event; return whether all outcomes are known."""
+        if event.kind == EventKind.REJECTED:
+            self._ends = dict.fromkeys(range(self._items), (EventKind.REJECTED, event.text))
+        elif event.kind in ENDS or (self._until_accepted and event.kind == EventKind.ACCEPTED):
+            kind = EventKind(event.kind)
+            end = kind, event.text if kind is not EventKind.ACCEPTED else ""
+            for item in range(event.item, min(event.item + max(1, event.items), self._items)):
+                self._ends[item] = end
+        return len(self._ends) == self._items
+
+    def of(self, items: Iterable[int], missing: str) -> End:
+        """Return the outcome of a value, which has these items. ``missing``: why one may be unknown."""
+        return worst([self._ends.get(item, (EventKind.UNKNOWN, missing)) for item in items])
 
 
 def apply(image: bytearray, writes: Iterable[Write]) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, End, InFlightTable, worst
+from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, InFlightTable
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.values.write import sizes
 from shmio.local.writer import REPLACED, RETIRED, SourceWriter
 from shmio.segment import DONE, Block, EventKind
+from shmio.segment.pending_commands import End, worst
 
 Done = Callable[[EventKind, str], None]
 """Called once for each command, with its outcome and the reason."""

@@ -16,7 +16,7 @@ from shmio.endpoints.grpc.commands.event_follower import EventFollower
 from shmio.endpoints.grpc.commands.followers import InjectionFollower, InjectionFollowers
 from shmio.endpoints.grpc.commands.write_subscriptions import WriteSubscriptions
 from shmio.endpoints.grpc.streams.wakeups import WakeUps
-from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, Done, End, InFlightTable
+from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, Done, InFlightTable
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
@@ -24,6 +24,7 @@ from shmio.layout.values.write import Write, merge, sizes
 from shmio.local.writer import RETIRED, PendingCommand, SourceWriter
 from shmio.segment import Block, Event, EventKind
 from shmio.segment.commands import InjectionOptions
+from shmio.segment.pending_commands import End
 
 RETRY_S: Final = 0.25
 """Pause before a source that has not lifted an injection is asked again."""

@@ -16,10 +16,11 @@ from shmio.endpoints.grpc.commands.path_kind import Shape, shape
 from shmio.endpoints.grpc.commands.topics import Topics
 from shmio.endpoints.grpc.injection.injections import ShadowKind, Shadows
 from shmio.endpoints.grpc.server.rejected_calls import Refusals
-from shmio.endpoints.in_flight import Done, End, in_words, worst
+from shmio.endpoints.in_flight import Done, in_words
 from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind
+from shmio.segment.pending_commands import End, worst
 
 TURNS: Final = 3
 """Turns that are awaited, as one of gRPC's threads may be delayed with what it received."""

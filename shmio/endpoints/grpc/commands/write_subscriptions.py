@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sized
-from typing import Final, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from shmio.endpoints.grpc.commands.pending_image import PendingImage
 from shmio.endpoints.grpc.streams.subject import Subject
 from shmio.layout.values.write import covering
 from shmio.segment import Block, Event, EventKind
+from shmio.segment.pending_commands import NO_COMMAND
 
 
 class Listener(Protocol):
@@ -43,9 +44,6 @@ class _Written(NamedTuple):
     image: bytes
 
 
-_NOBODY: Final = (0, 0, 0)
-
-
 class WriteSubscriptions:
     """Makes messages of all writers' accepted writes, in the order of acceptance.
 
@@ -61,7 +59,7 @@ class WriteSubscriptions:
         self._channels: dict[Subject, InChannel] = {}
         self._table: tuple[InChannel, ...] = ()
         self._pending_image = PendingImage(block)
-        self._command = _NOBODY  # accepted last; unknown at first and after a gap
+        self._command = NO_COMMAND  # accepted last; unknown at first and after a gap
         self._whole = False  # whether all its parts so far were applied
         self._partly: dict[InChannel, Event] = {}  # channels that it has written in part
 
@@ -94,13 +92,13 @@ class WriteSubscriptions:
 
     def skip(self) -> None:
         """Forget the present command, because events were missed."""
-        self._command, self._whole = _NOBODY, False
+        self._command, self._whole = NO_COMMAND, False
         self._pending_image.forget()
         self._partly.clear()
 
     def follow(self, event: Event) -> list[Message]:
         """Process an event and return the messages to deliver."""
-        command = _command(event)
+        command = event.command_key
         if event.kind != EventKind.ACCEPTED:
             # Outcomes of earlier commands may come between the parts of this one.
             return self._rest() if command == self._command or event.kind == EventKind.STARTED else []
@@ -108,7 +106,7 @@ class WriteSubscriptions:
         table = self._table
         if command != self._command:
             messages = self._rest()
-            self._whole = bool(table) and (self._command != _NOBODY or self._begins(event))
+            self._whole = bool(table) and (self._command != NO_COMMAND or self._begins(event))
             self._command = command
             if self._whole:
                 self._pending_image.begin(event.frame)
@@ -130,7 +128,7 @@ class WriteSubscriptions:
             if before is None:
                 return False
             if before.kind == EventKind.ACCEPTED:
-                return _command(before) != _command(event)
+                return before.command_key != event.command_key
         return True
 
     def _touch(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
@@ -157,7 +155,3 @@ class WriteSubscriptions:
         message = channel.encode(_Written(*self._stamp(event), bytes(self._pending_image.image)))
         if message is not None:
             messages.append((channel, message))
-
-
-def _command(event: Event) -> tuple[int, int, int]:
-    return event.incarnation, event.writer, event.command

@@ -15,14 +15,14 @@ from shmio.endpoints.grpc.injection.injection_base import InjectionBase
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import EventLane, Finish, Outbox, StateLane
 from shmio.endpoints.grpc.streams.subject import Encode, SourceImage, Subject
-from shmio.endpoints.in_flight import Done, End, worst
+from shmio.endpoints.in_flight import Done
 from shmio.errors import CommandError, PathError
 from shmio.layout.topic import Topic, find
 from shmio.layout.values.write import covering, encode
 from shmio.local.writer import RETIRED
 from shmio.segment import DONE, Direction, EventKind
 from shmio.segment.changed_registers import ChangeScan
-from shmio.segment.pending_commands import CommandWrites, apply
+from shmio.segment.pending_commands import CommandWrites, End, apply, worst
 
 Leave = Callable[[], None]
 

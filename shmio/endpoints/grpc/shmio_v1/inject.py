@@ -20,13 +20,12 @@ from shmio.endpoints.grpc.shmio_v1.views import VALUES, head
 from shmio.endpoints.grpc.shmio_v1.write_updates import head_of
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.streams.wakeups import WakeUps
-from shmio.endpoints.in_flight import End, worst
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.layout.values.write import Write, covering, merge
 from shmio.segment import Direction, EventKind, Frame
 from shmio.segment.commands import MAX_NAME_BYTES
-from shmio.segment.pending_commands import CommandWrites, apply
+from shmio.segment.pending_commands import CommandWrites, End, apply, worst
 from shmio.wire import shmio_v1_pb2 as wire
 
 _RANGES: Final = wire.Table.DESCRIPTOR.fields_by_name["ranges"].number

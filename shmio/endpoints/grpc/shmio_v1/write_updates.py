@@ -16,11 +16,10 @@ from shmio.layout.model import Register
 from shmio.layout.values.write import covering
 from shmio.segment import Block, Event
 from shmio.segment.events import EVENT_DATA_SIZE
-from shmio.segment.pending_commands import apply
+from shmio.segment.pending_commands import NO_COMMAND, apply
 from shmio.wire import shmio_v1_pb2 as wire
 
 _VALUES: Final = wire.Update.DESCRIPTOR.fields_by_name["values"].number
-_NOBODY: Final = (0, 0, 0)
 
 
 def head_of(table: int, event: Event) -> bytes:
@@ -46,7 +45,7 @@ class WriteUpdates:
         self._columns = columns
         self._cover = np.frombuffer(covering(registers, block.layout.size), np.uint8)
         self._pending_image = PendingImage(block)
-        self._command = _NOBODY
+        self._command = NO_COMMAND
         self._event = 0
         self._update = b""
 
@@ -61,9 +60,8 @@ class WriteUpdates:
         return self._update
 
     def _make(self, event: Event) -> bytes:
-        command = event.incarnation, event.writer, event.command
-        if command != self._command:
-            self._command = command
+        if event.command_key != self._command:
+            self._command = event.command_key
             self._pending_image.begin(event.frame)
         self._pending_image.put(event)
         image, mask = self._pending_image.image, self._pending_image.mask
