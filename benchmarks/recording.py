@@ -29,8 +29,8 @@ from shmio.emulators.programs import A50
 from shmio.layout.model import Layout
 from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import CHUNK_S
-from shmio.recorder.writer import Writer
 from shmio.recording.format.encoding import FRAME, differ, encode_frame
+from shmio.recording.writer import Writer
 from shmio.segment import Block, BlockSpec, BlockWriter, Frame, ProcessSpec, Provenance, Quality, Segment
 from shmio.segment.processes import Activity
 

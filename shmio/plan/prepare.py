@@ -30,7 +30,7 @@ from shmio.plan.processes import Plan, make_plan
 from shmio.plan.recordings import Recordings
 from shmio.plan.replay import replayed
 from shmio.plan.sources import check_sources, note_options
-from shmio.recorder.selection import Selection
+from shmio.recording.selection import Selection
 
 EMULATOR_KINDS = ("s7",)
 NONFINITE = ("REAL", "LREAL")

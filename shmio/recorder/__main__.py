@@ -14,9 +14,9 @@ from shmio.recorder.housekeeping import Housekeeper
 from shmio.recorder.instance_follower import InstanceFollower, StartPositions
 from shmio.recorder.predecessor import last_positions, trigger_interrupted
 from shmio.recorder.rotation import RotatingRecorder
-from shmio.recorder.selection import Selection
 from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.format.encoding import SUPERVISED, Reason
+from shmio.recording.selection import Selection
 from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 

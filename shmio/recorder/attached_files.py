@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from shmio.config import load
 from shmio.errors import ConfigError
-from shmio.recorder.writer import TEXT, TOML
+from shmio.recording.writer import TEXT, TOML
 
 MAX_FILE_BYTES: Final = 16 << 20
 

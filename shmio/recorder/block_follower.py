@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from shmio.recorder.selection import RecordedRegisters
 from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, Reason, StepMark
+from shmio.recording.selection import RecordedRegisters
 from shmio.segment import Block, Cursor, Event, Frame
 
 Item = TypeVar("Item", bound=Frame | Event)

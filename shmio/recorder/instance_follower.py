@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 
 from shmio.model.clock import Clock
 from shmio.recorder.block_follower import BlockEntry, BlockFollower, InstanceEntry
-from shmio.recorder.selection import Selection
 from shmio.recording.format.encoding import BlockPosition, ProcessChange, ProcessEvent, Reason, StepMark
+from shmio.recording.selection import Selection
 from shmio.segment import Block, Segment
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.processes import Phase, ProcessSlot

@@ -14,8 +14,8 @@ from shmio.recorder.attached_files import AttachedFile, AttachedFiles, no_attach
 from shmio.recorder.block_follower import BlockEntry, BlockFollower, InstanceEntry
 from shmio.recorder.instance_follower import TURN_S, InstanceFollower
 from shmio.recorder.output import Output
-from shmio.recorder.writer import JSON, Channels, Writer
 from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, Reason
+from shmio.recording.writer import JSON, Channels, Writer
 from shmio.segment import Event, Frame
 
 

@@ -1,1 +1,1 @@
-"""Read recordings, and their format (docs/reference/dump-format.md). `shmio.recorder` writes them."""
+"""Recordings (docs/reference/dump-format.md): read, write, rewrite, compare and export them."""

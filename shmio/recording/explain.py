@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Callable, Iterable
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -207,3 +208,45 @@ def by(writer: int) -> str:
     if writer == NO_WRITER:
         return ""
     return _ROLES.get(writer, f"program {writer + 1}" if writer < GUEST_SLOTS else f"writer {writer}")
+
+
+ABOUT: Final = ("path", "value", "direction", "by")
+"""Columns of what an event is about, in tables."""
+
+
+def kind_of(event: Event) -> str:
+    """Return the name of an event's kind, also of a kind that this version does not know."""
+    try:
+        return str(EventKind(event.kind))
+    except ValueError:  # of a later version
+        return f"kind {event.kind}"
+
+
+def object_of(event: Event, explained: Explained) -> dict[str, Any]:
+    """Return what an event is about as an object for JSON, with ``data`` in hexadecimal digits."""
+    places = explained.places
+    return {
+        "by": explained.by,
+        "direction": explained.direction,
+        "paths": [place.path for place in places],
+        "values": {place.path: place.plain for place in places if place.valued},
+        "laid": explained.laid,
+        "injection": event.injection,
+        **{name: getattr(event, name) for name in ("command", "item", "items", "offset", "mask", "size", "text")},
+        "data": event.data.hex(),
+    }
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def cells_of(explained: Explained, dumps: Callable[[Any], str] = _json) -> tuple[str, ...]:
+    """Return what an event is about as cells of a table, under ABOUT.
+
+    The values of several registers are one JSON object, encoded by ``dumps``.
+    """
+    places = explained.places
+    valued = [place for place in places if place.valued]
+    value = dumps({place.path: place.plain for place in valued}) if valued[1:] else "".join(p.text for p in valued)
+    return ", ".join(place.path for place in places), value, explained.direction, explained.by

@@ -10,12 +10,12 @@ from typing import Any
 import msgspec
 
 from shmio.cli.recordings.damage_report import DamageReport
-from shmio.cli.recordings.rewriting import new_file
 from shmio.cli.run import say
 from shmio.config.declaration import check_declarations
 from shmio.errors import ConfigError, RecordingError
 from shmio.logs import printable
 from shmio.recording.campaign import derive
+from shmio.recording.rewriting import new_file
 
 
 def execute(arguments: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from shmio.cli.recordings.damage_report import DamageReport
 from shmio.cli.recordings.each import not_closed
 from shmio.cli.recordings.printers import Csv, JsonLines, Printer, Table, View
 from shmio.cli.recordings.progress import Progress
-from shmio.cli.recordings.times import span, time_range
+from shmio.cli.recordings.times import time_range
 from shmio.cli.run import room
 from shmio.errors import PathError, RecordingError
 from shmio.layout.glob import named
@@ -24,6 +24,7 @@ from shmio.recording.format.channels import Channel
 from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
 from shmio.recording.reading.reader import Message, Reader
 from shmio.recording.reading.survey import Survey, survey
+from shmio.recording.times import span
 from shmio.segment import Event, Frame
 
 

@@ -6,10 +6,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.recordings.times import lost
 from shmio.logs import printable
 from shmio.recording.dump import Dump, open_dump
 from shmio.recording.format.damage import Damage
+from shmio.recording.times import lost
 
 
 class DamageReport:

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from typing import Any
 
 from shmio.cli.recordings.progress import Progress
-from shmio.cli.recordings.times import iso, local
 from shmio.cli.run import dumps
 from shmio.errors import RecordingError
 from shmio.layout.values.codec import Value
 from shmio.logs import printable
 from shmio.recording.compare import Comparison, Difference, Side, SourceDifference, compare
 from shmio.recording.dump import open_dump
+from shmio.recording.times import iso, local
 
 MAX_SHOWN = 50
 """Registers and elements, and things of the first difference, that are printed; with --json all."""

@@ -11,11 +11,11 @@ from typing import Any
 import msgspec
 
 from shmio.cli.recordings.each import each, ended
-from shmio.cli.recordings.times import iso, local
 from shmio.errors import RecordingError
 from shmio.recording.format.encoding import EVENT, FRAME, SUPERVISED
 from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import Survey, Track, survey
+from shmio.recording.times import iso, local
 
 
 def execute(arguments: argparse.Namespace) -> int:

@@ -11,16 +11,16 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from shmio.cli.readings import shown
-from shmio.cli.recordings.times import iso, local
 from shmio.cli.run import dumps
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import codec
 from shmio.layout.values.text import json_value, to_text
 from shmio.logs import printable
 from shmio.recording.columns import heading
-from shmio.recording.explain import Explained
+from shmio.recording.explain import ABOUT, Explained, cells_of, kind_of, object_of
 from shmio.recording.format.channels import Channel
 from shmio.recording.format.encoding import Gap, ProcessChange, StepMark
+from shmio.recording.times import iso, local
 from shmio.segment import Event, EventKind, Frame, Quality
 from shmio.segment.changed_registers import ChangeScan
 
@@ -64,41 +64,8 @@ class Printer(Protocol):
         """What has happened to a process."""
 
 
-def kind_of(event: Event) -> str:
-    """What an event is called."""
-    try:
-        return str(EventKind(event.kind))
-    except ValueError:  # of a later version
-        return f"kind {event.kind}"
-
-
-ABOUT: Final = ("path", "value", "direction", "by")
-"""Columns of what an event is about, in tables."""
 MAX_PLACES: Final = 4
 """So many registers of one event are printed for people."""
-
-
-def object_of(event: Event, explained: Explained) -> dict[str, Any]:
-    """What an event is about, as JSON has it; ``data`` in hexadecimal digits."""
-    places = explained.places
-    return {
-        "by": explained.by,
-        "direction": explained.direction,
-        "paths": [place.path for place in places],
-        "values": {place.path: place.plain for place in places if place.valued},
-        "laid": explained.laid,
-        "injection": event.injection,
-        **{name: getattr(event, name) for name in ("command", "item", "items", "offset", "mask", "size", "text")},
-        "data": event.data.hex(),
-    }
-
-
-def cells_of(explained: Explained) -> tuple[str, ...]:
-    """What an event is about, as tables have it under ABOUT: of several registers the values are a JSON object."""
-    places = explained.places
-    valued = [place for place in places if place.valued]
-    value = dumps({place.path: place.plain for place in valued}) if valued[1:] else "".join(p.text for p in valued)
-    return ", ".join(place.path for place in places), value, explained.direction, explained.by
 
 
 def _where(event: Event, explained: Explained, room: int | None) -> str:
@@ -262,7 +229,7 @@ class Csv:
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
         """``what`` is its kind."""
         row = time_ns, source, kind_of(event), event.number, str(event.quality), event.text
-        return self._row(*row, about=cells_of(explained))
+        return self._row(*row, about=cells_of(explained, dumps))
 
     def gap(self, time_ns: int, gap: Gap) -> str:
         """``number`` is the first that is missing."""

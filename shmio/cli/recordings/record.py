@@ -19,8 +19,8 @@ from shmio.errors import ControlError, PathError, RecordingError
 from shmio.recorder.attached_files import AttachedFiles, ConfigFiles, no_attachments
 from shmio.recorder.instance_follower import InstanceFollower, StartPositions
 from shmio.recorder.rotation import RotatingRecorder
-from shmio.recorder.selection import Selection
 from shmio.recorder.triggered import TriggeredRecorder
+from shmio.recording.selection import Selection
 from shmio.segment import Segment
 from shmio.supervisor import control
 

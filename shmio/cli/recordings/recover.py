@@ -7,11 +7,11 @@ from pathlib import Path
 
 from shmio.cli.recordings.each import not_closed
 from shmio.cli.recordings.rewriting import rewrite, verified
-from shmio.cli.recordings.times import lost
 from shmio.cli.run import say
 from shmio.errors import RecordingError
 from shmio.recording.dump import open_dump
 from shmio.recording.format.damage import Damage
+from shmio.recording.times import lost
 
 MAX_TOLD = 1000
 

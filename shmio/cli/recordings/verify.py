@@ -8,9 +8,9 @@ from typing import Any
 
 from shmio.cli.recordings.each import each, ended
 from shmio.cli.recordings.progress import Progress
-from shmio.cli.recordings.times import lost
 from shmio.recording.check import check
 from shmio.recording.reading.reader import Reader
+from shmio.recording.times import lost
 
 
 def execute(arguments: argparse.Namespace) -> int:

@@ -17,8 +17,8 @@ from mcap.opcode import Opcode
 
 from shmio.cli.dump import main
 from shmio.recorder.instance_follower import StartPositions
-from shmio.recorder.selection import Selection
 from shmio.recording.reading.reader import Reader
+from shmio.recording.selection import Selection
 from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.testing.cell import until
 from tests.unit.recorder.harness import OTHER, RING, numbers, publish, recorder, spec

@@ -12,10 +12,10 @@ from shmio.layout.model import Layout, Register
 from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
 from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
-from shmio.recorder.selection import Selection
 from shmio.recording.format.encoding import Gap, ProcessChange
 from shmio.recording.reading.reader import Message, Reader
 from shmio.recording.reading.survey import survey
+from shmio.recording.selection import Selection
 from shmio.segment import BlockSpec, BlockWriter, Event, Frame, Segment
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))

@@ -17,9 +17,9 @@ from shmio.recorder.attached_files import AttachedFile
 from shmio.recorder.instance_follower import InstanceFollower, StartPositions
 from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
-from shmio.recorder.selection import Selection
 from shmio.recording.format.encoding import FRAME_V2, Reason, decode_event, decode_frame, restore
 from shmio.recording.reading.reader import Reader
+from shmio.recording.selection import Selection
 from shmio.segment import Event, EventKind, Frame, Provenance, Quality, Record, Segment
 from tests.unit.recorder.harness import OTHER, RING, gaps, numbers, publish, read, recorder, spec
 

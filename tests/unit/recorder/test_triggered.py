@@ -16,10 +16,10 @@ from shmio.errors import ConfigError
 from shmio.recorder import output as output_module
 from shmio.recorder.attached_files import no_attachments
 from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
-from shmio.recorder.selection import Selection
 from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.check import check
 from shmio.recording.reading.reader import Reader
+from shmio.recording.selection import Selection
 from shmio.segment import BlockWriter, Event, EventKind, Origin, Quality, Record, Segment, Stamp
 from shmio.testing.cell import kill, until
 from tests.unit.recorder.harness import OTHER, RING, Process, gaps, numbers, publish, spec

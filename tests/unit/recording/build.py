@@ -11,8 +11,8 @@ from typing import Any, cast
 
 from shmio.layout.model import Layout, Register
 from shmio.recorder.output import Output
-from shmio.recorder.writer import Channels, Writer
 from shmio.recording.format.encoding import Gap, ProcessChange, ProcessEvent, Reason, StepMark
+from shmio.recording.writer import Channels, Writer
 from shmio.segment import Block, Event, EventKind, Frame, Provenance, Quality, Record
 
 START_NS = 1_700_000_000_000_000_000

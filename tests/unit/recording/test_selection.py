@@ -10,9 +10,9 @@ import pytest
 
 from shmio.cli.dump import main
 from shmio.layout.model import Layout, Register
-from shmio.recorder.selection import Selection
 from shmio.recording.check import check
 from shmio.recording.reading.reader import Reader
+from shmio.recording.selection import Selection
 from shmio.segment import BlockSpec, Frame, ProcessSpec, Segment
 from tests.unit.recorder.harness import numbers, publish, read, recorder
 

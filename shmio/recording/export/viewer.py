@@ -1,10 +1,10 @@
-"""MCAP with values as JSON and their schema, for general viewers: Foxglove, PlotJuggler."""
+"""Export as MCAP with values as JSON, for general viewers such as Foxglove and PlotJuggler."""
 
 from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import IO, Any, Final, NamedTuple
 
 import msgspec
@@ -13,12 +13,10 @@ import numpy.typing as npt
 from mcap.writer import Writer
 
 from shmio import __version__
-from shmio.cli.recordings.printers import kind_of, object_of
-from shmio.cli.recordings.progress import Progress
 from shmio.layout.model import Register
 from shmio.recording.columns import Columns, heading
 from shmio.recording.dump import Dump
-from shmio.recording.explain import Explainer
+from shmio.recording.explain import Explainer, kind_of, object_of
 from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.names import Chosen
 from shmio.recording.pieces import pieces
@@ -43,9 +41,29 @@ class _Row(NamedTuple):
 
 
 def export_mcap(
-    dump: Dump, chosen: Chosen, stream: IO[bytes], from_ns: int, to_ns: int, *, raw: bool, progress: Progress
+    dump: Dump,
+    chosen: Chosen,
+    stream: IO[bytes],
+    from_ns: int,
+    to_ns: int,
+    *,
+    raw: bool,
+    progress: Callable[[int], None],
 ) -> int:
-    """Write a message for each frame to the topic ``/<source>``, for each event to ``/<source>/events``; how many."""
+    """Write a message for each frame to the topic ``/<source>``, for each event to ``/<source>/events``.
+
+    Args:
+        dump: The recording.
+        chosen: The registers to export, by block.
+        stream: The new file.
+        from_ns: Start of the range.
+        to_ns: End of the range.
+        raw: Whether to export what the source delivered, without injections.
+        progress: Called with the ns of the recording that are done.
+
+    Returns:
+        The number of messages.
+    """
     writer = Writer(stream)
     writer.start("", f"shmio {__version__}")
     sources = list(dict.fromkeys(block.source for block in chosen))
@@ -54,7 +72,7 @@ def export_mcap(
     count = 0
     for row in heapq.merge(*streams, key=lambda row: row.log_ns):
         writer.add_message(row.channel, row.log_ns, row.data, row.publish_ns)
-        progress.at(row.log_ns - dump.begin_ns)
+        progress(row.log_ns - dump.begin_ns)
         count += 1
     writer.finish()
     return count

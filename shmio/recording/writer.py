@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import IO, Final, cast
+from typing import IO, Final, Protocol, cast
 
 import mcap.writer
 
 from shmio import __version__
 from shmio.layout.model import Layout
-from shmio.recorder.output import Output
 from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.format.encoding import (
     ABOUT,
@@ -46,6 +45,19 @@ TOML: Final = "application/toml"
 TEXT: Final = "text/plain"
 
 
+class Output(Protocol):
+    """Where a recording is written to: the recorder's output, or any binary file."""
+
+    def write(self, data: bytes, /) -> object:
+        """Append data."""
+
+    def tell(self) -> int:
+        """Return the number of bytes written so far."""
+
+    def flush(self) -> None:
+        """Pass everything on."""
+
+
 @dataclass(frozen=True, slots=True)
 class Channels:
     """The channel numbers of a block."""
@@ -55,10 +67,10 @@ class Channels:
 
 
 class Writer:
-    """Writes one recording, from one thread. With an :class:`Output` nothing here waits for the disk."""
+    """Writes one recording, from one thread."""
 
-    def __init__(self, output: Output | IO[bytes], about: Mapping[str, str]) -> None:
-        """Start the recording. ``output``: an output or any binary file; ``about``: metadata of the instance."""
+    def __init__(self, output: Output, about: Mapping[str, str]) -> None:
+        """Start the recording. ``about``: metadata of the instance."""
         self._output = output
         self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._mcap.start(PROFILE, f"shmio {__version__}")

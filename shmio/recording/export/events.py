@@ -1,20 +1,18 @@
-"""Tables of events: CSV and Parquet."""
+"""Export events as a table: CSV or Parquet."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from itertools import islice
 from typing import IO, Any, Final
 
-from shmio.cli.recordings.printers import cells_of, kind_of
-from shmio.cli.recordings.progress import Progress
-from shmio.cli.recordings.times import iso
 from shmio.recording.dump import Dump
-from shmio.recording.explain import Explainer
+from shmio.recording.explain import Explainer, cells_of, kind_of
 from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.libraries import ANALYSIS, library
+from shmio.recording.times import iso
 
 NUMBERS: Final = ("frame", "cycle", "injection", "command", "item", "items", "offset", "mask", "size")
 COLUMNS: Final = (
@@ -24,17 +22,39 @@ BATCH: Final = 4096
 
 
 def export_events(
-    dump: Dump, sources: Collection[str], stream: IO[bytes], form: str, from_ns: int, to_ns: int, progress: Progress
+    dump: Dump,
+    sources: Collection[str],
+    stream: IO[bytes],
+    form: str,
+    from_ns: int,
+    to_ns: int,
+    progress: Callable[[int], None],
 ) -> int:
-    """Write a row for each event of these sources; how many. MissingLibraryError."""
+    """Write a row for each event of these sources.
+
+    Args:
+        dump: The recording.
+        sources: Names of sources.
+        stream: The new file.
+        form: ``csv`` or ``parquet``.
+        from_ns: Start of the range.
+        to_ns: End of the range.
+        progress: Called with the ns of the recording that are done.
+
+    Returns:
+        The number of rows.
+
+    Raises:
+        MissingLibraryError: pyarrow is not installed.
+    """
     rows = _rows(dump, sources, from_ns, to_ns, progress)
     return _parquet(stream, rows) if form == "parquet" else _csv(stream, rows)
 
 
 def _rows(
-    dump: Dump, sources: Collection[str], from_ns: int, to_ns: int, progress: Progress
+    dump: Dump, sources: Collection[str], from_ns: int, to_ns: int, progress: Callable[[int], None]
 ) -> Iterator[tuple[Any, ...]]:
-    """In the order of COLUMNS; the time in ns."""
+    """Yield the rows in the order of COLUMNS, with the time in ns."""
     explainers: dict[DumpBlock, Explainer] = {}
     for time_ns, block, event in dump.events(sources, from_ns, to_ns):
         if block is None:
@@ -44,7 +64,7 @@ def _rows(
         about = cells_of(explainers[block].explain(event))
         head = time_ns, block.source, event.number, kind_of(event), str(event.quality)
         yield *head, *about, event.text, *(getattr(event, name) for name in NUMBERS), event.data.hex()
-        progress.at(time_ns - dump.begin_ns)
+        progress(time_ns - dump.begin_ns)
 
 
 def _csv(stream: IO[bytes], rows: Iterator[tuple[Any, ...]]) -> int:

@@ -1,0 +1,1 @@
+"""Export recordings for other programs: tables, and MCAP with JSON for viewers."""

@@ -1,0 +1,289 @@
+"""Make new recordings out of others: parts of them, several as one, or what is whole of a damaged one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Final
+
+import numpy as np
+
+from shmio import __version__
+from shmio.errors import RecordingError
+from shmio.layout.model import Register
+from shmio.layout.topic import holder
+from shmio.layout.values.write import covering
+from shmio.recording.dump import Dump
+from shmio.recording.format.blocks import DumpBlock
+from shmio.recording.format.encoding import Gap, ProcessChange, Reason, StepMark
+from shmio.recording.format.entries import Entry
+from shmio.recording.reading.part import MAX_NS
+from shmio.recording.reading.reader import Item
+from shmio.recording.selection import RecordedRegisters
+from shmio.recording.times import span
+from shmio.recording.writer import JSON, TEXT, TOML, Channels, Writer
+from shmio.segment import Event, Frame
+
+MAX_ATTACHMENT_BYTES: Final = 16 << 20
+FLUSH_BYTES: Final = 4 << 20
+
+_TYPES: Final = {".json": JSON, ".toml": TOML}
+
+
+class _Track:
+    """A block in the new file: its channels, and its last frame and event."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.channels: Channels | None = None
+        self.waiting: list[Entry[Item]] = []
+        """Gaps before the first frame or event."""
+        self.last: dict[str, int] = {}
+        self.last_ns = 0
+
+
+class Rewriter:
+    """Writes entries to a new file as a recorder does: each number of a block is there, or in a gap."""
+
+    def __init__(self, stream: IO[bytes], dump: Dump, made: str, *, whole: bool) -> None:
+        """Arguments as of :func:`rewrite`."""
+        self._whole = whole
+        about = {**dump.about, "made_by": made, "made_version": __version__}
+        self._writer = Writer(stream, about)
+        self._dump = dump
+        self._tracks: dict[DumpBlock, _Track] = {}
+        self._layouts: set[bytes] = set()
+        self.counts: dict[str, int] = {"frames": 0, "events": 0}
+        self.damaged = 0
+        """Number of frames and events that could not be read. The new file has gaps for them."""
+
+    def attach(self) -> None:
+        """Copy the undamaged attachments, except layouts, which come with their blocks."""
+        seen: set[str] = set()
+        for reader in self._dump.readers:
+            for name in reader.attachments:
+                if name in seen or name.startswith("layouts/"):
+                    continue
+                with suppress(RecordingError):
+                    data = reader.attachment(name, MAX_ATTACHMENT_BYTES)
+                    self._writer.attach(name, _TYPES.get(Path(name).suffix, TEXT), data, self._dump.begin_ns)
+                    seen.add(name)
+
+    def add(self, entry: Entry[Item]) -> None:
+        """Add the next entry, in order."""
+        if isinstance(entry.item, StepMark):
+            self._writer.step(entry.item, entry.time_ns)
+        elif isinstance(entry.item, ProcessChange):
+            self._writer.process(entry.item, entry.time_ns)
+        elif entry.block is not None:
+            self._of_block(entry.block, entry)
+
+    def _of_block(self, block: DumpBlock, entry: Entry[Item]) -> None:
+        track = self._tracks.setdefault(block, _Track())
+        item = entry.item
+        if track.channels is None:
+            track.waiting.append(entry)
+            if not isinstance(item, Gap):
+                self._begin(block, track)
+            return
+        if isinstance(item, Frame):
+            self._follow(block, track, "frames", item.number, item.number, entry.time_ns)
+            self._writer.frame(track.channels, item, entry.time_ns)
+            self.counts["frames"] += 1
+        elif isinstance(item, Event):
+            self._follow(block, track, "events", item.number, item.number, entry.time_ns)
+            self._writer.event(track.channels, item, entry.time_ns)
+            self.counts["events"] += 1
+        elif isinstance(item, Gap):
+            self._follow(block, track, item.what, item.first, item.last, entry.time_ns)
+            self._gap(track, item, entry.time_ns)
+        track.last_ns = entry.time_ns
+
+    def _begin(self, block: DumpBlock, track: _Track) -> None:
+        """Open a block at its first frame or event, which names the event or frame before it."""
+        waiting, track.waiting = track.waiting, []
+        first = waiting[-1].item
+        after = {what: block.after.get(what, 0) for what in ("frames", "events")}
+        if isinstance(first, Frame):
+            after = {"frames": first.number - 1, "events": first.event}
+        elif isinstance(first, Event):
+            after = {"frames": first.frame, "events": first.number - 1}
+        for entry in reversed(waiting):
+            if isinstance(entry.item, Gap):
+                after[entry.item.what] = entry.item.first - 1
+        track.last = dict(after)
+        if self._whole:
+            track.last = {what: min(number, block.after.get(what, number)) for what, number in after.items()}
+        if block.layout.hash not in self._layouts:
+            self._layouts.add(block.layout.hash)
+            name = f"layouts/{block.layout.hash.hex()}.json"
+            self._writer.attach(name, JSON, block.layout.to_json(), waiting[0].time_ns)
+        track.number = len([one for one in self._tracks.values() if one.channels]) + 1
+        track.channels = self._writer.open_block(
+            block, track.number, track.last["frames"], track.last["events"], of=block.of
+        )
+        for entry in waiting:
+            self._of_block(block, entry)
+
+    def _follow(self, block: DumpBlock, track: _Track, what: str, first: int, last: int, time_ns: int) -> None:
+        missing = first - track.last[what] - 1
+        if missing > 0:
+            place = block.source, track.number, what
+            gap = Gap(*place, track.last[what] + 1, first - 1, missing, Reason.DAMAGED, track.last_ns, time_ns)
+            self.damaged += missing
+            self._writer.gap(gap, time_ns)
+        track.last[what] = last
+
+    def _gap(self, track: _Track, gap: Gap, time_ns: int) -> None:
+        gap = Gap(gap.source, track.number, gap.what, gap.first, gap.last, gap.count, gap.reason, gap.after_ns, time_ns)
+        self._writer.gap(gap, time_ns)
+
+    def finish(self) -> None:
+        """Write index and footer."""
+        for block, track in self._tracks.items():
+            if track.waiting:  # nothing but gaps
+                self._begin(block, track)
+        self._writer.finish()
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[IO[bytes]]:
+    """Create a file that only this user may read; on an error remove it again.
+
+    Raises:
+        RecordingError: The file exists already.
+        OSError: It cannot be written; the error has the file's name.
+    """
+    try:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except FileExistsError:
+        raise RecordingError(f"{path} is there already: nothing is ever overwritten") from None
+    try:
+        with os.fdopen(fd, "wb", buffering=FLUSH_BYTES) as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+    except BaseException as error:
+        with suppress(OSError):
+            path.unlink()
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+def rewrite(
+    dump: Dump,
+    path: Path,
+    made: str,
+    entries: Iterable[Entry[Item]],
+    *,
+    whole: bool = True,
+    progress: Callable[[int], None] = lambda _: None,
+) -> Rewriter:
+    """Write entries of a dump to a new file.
+
+    Args:
+        dump: The recording, with its attachments and metadata.
+        path: The new file.
+        made: What makes it, for its metadata.
+        entries: The entries, in order: ``dump.items()``, or those of :func:`part`.
+        whole: Whether what is missing at the beginning of a block was damaged; else it is not wanted.
+        progress: Called with the ns of the recording that are done.
+
+    Returns:
+        What was written.
+
+    Raises:
+        RecordingError: The file exists already. After this or the next error no new file is left.
+        OSError: The file cannot be written.
+    """
+    with new_file(path) as stream:
+        work = Rewriter(stream, dump, made, whole=whole)
+        work.attach()
+        for entry in entries:
+            work.add(entry)
+            progress(entry.time_ns - dump.begin_ns)
+        work.finish()
+    return work
+
+
+def part(
+    dump: Dump,
+    from_ns: int = 0,
+    to_ns: int = MAX_NS,
+    sources: Collection[str] | None = None,
+    registers: Sequence[str] = (),
+) -> Iterator[Entry[Item]]:
+    """Return a part of a recording: a time, some sources, some registers.
+
+    Args:
+        dump: The recording.
+        from_ns: Start of the range.
+        to_ns: End of the range.
+        sources: Names of sources; None: all.
+        registers: Paths of registers, of which an element stands for its array; none: all. The
+            other bytes of a frame are zero.
+
+    Returns:
+        The entries, for :func:`rewrite` with ``whole=False``.
+
+    Raises:
+        PathError: There is no such source or register.
+        RecordingError: Nothing is recorded in that time.
+    """
+    return _part(dump, from_ns, to_ns, sources, _Parts(dump, registers) if registers else None)
+
+
+def _part(
+    dump: Dump, from_ns: int, to_ns: int, sources: Collection[str] | None, parts: _Parts | None
+) -> Iterator[Entry[Item]]:
+    if parts is not None:
+        sources = parts.sources if sources is None else [source for source in parts.sources if source in sources]
+    anything = False
+    for entry in dump.items(sources, from_ns, to_ns):
+        anything = True
+        if parts is None:
+            yield entry
+        elif (kept := parts.of(entry)) is not None:
+            yield kept
+    if not anything and not dump.begin_ns:
+        raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
+    if not anything:
+        raise RecordingError(f"nothing of {dump.files[0]} is in that time; it goes {span(dump.begin_ns, dump.end_ns)}")
+
+
+class _Parts:
+    """Blocks of a dump with some of their registers; all other bytes are zero."""
+
+    def __init__(self, dump: Dump, paths: Sequence[str]) -> None:
+        """An element stands for its array. PathError: there is no such register."""
+        self._parts = {block: _reduced(block, registers) for block, registers in dump.select(paths).items()}
+
+    @property
+    def sources(self) -> list[str]:
+        """The sources of these registers."""
+        return list(dict.fromkeys(block.source for block in self._parts))
+
+    def of(self, entry: Entry[Item]) -> Entry[Item] | None:
+        """Return an entry with only these registers; None if its block has none of them."""
+        if entry.block is None:
+            return entry
+        if entry.block not in self._parts:
+            return None
+        block, kept = self._parts[entry.block]
+        item = entry.item
+        return Entry(entry.time_ns, block, kept.keep(item) if isinstance(item, Frame) else item)
+
+
+def _reduced(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, RecordedRegisters]:
+    """Return a block with only these registers, and what reduces its frames."""
+    paths = {holder(block.layout, register) for register in registers}
+    whole = tuple(register for register in block.layout.registers if register.path in paths)
+    layout = replace(block.layout, registers=whole)
+    part = RecordedRegisters(layout, np.frombuffer(covering(whole, layout.size), np.uint8))
+    digest = layout.hash.hex()
+    of = "" if digest == block.layout_hash else block.of or block.layout_hash
+    return replace(block, layout=layout, layout_hash=digest, of=of), part
