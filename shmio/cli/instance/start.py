@@ -14,17 +14,15 @@ from typing import Any
 import msgspec
 
 from shmio import logs
-from shmio.cli.instance import logdir
 from shmio.cli.instance.up import Configured, Failed, Started, StartMessage, headline
 from shmio.cli.run import say
-from shmio.errors import AlreadyRunningError, EndpointError, ShmioError
+from shmio.errors import ShmioError
 from shmio.logs import printable
-from shmio.plan.ports import check_ports
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import BROKER, Job, Plan
-from shmio.segment import Segment, State, instances, stale_segment
-from shmio.segment.segment import refuse_second
+from shmio.segment import State, instances
 from shmio.supervisor.main import Supervisor
+from shmio.supervisor.start import check_startable, hold_log_folder
 
 
 def foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
@@ -33,7 +31,7 @@ def foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
     plan = prepared.plan
     for warning in plan.warnings:
         say(warning, sys.stderr)
-    _refuse(plan)
+    check_startable(plan)
     left_over = plan.instance in instances()
     say(headline(plan.instance, plan.mode, None if left_over else plan.segment_bytes, plan.log_dir))
     for line in _processes(prepared):
@@ -41,7 +39,7 @@ def foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
     say("Ctrl-C stops it, and so does closing the terminal")
     console = logging.StreamHandler(sys.stderr)
     console.setFormatter(_Console())
-    with logdir.held(plan.log_dir, plan.instance):
+    with hold_log_folder(plan.log_dir, plan.instance):
         logs.setup(_log_file(plan), "supervisor")
         logging.getLogger("shmio.supervisor").addHandler(console)
         Supervisor(plan, replan=_replan(plan, keys)).run()
@@ -67,14 +65,14 @@ def detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int
         prepared = prepare(file, mode, keys)
         plan = prepared.plan
         tell(Configured(printable(str(_log_file(plan))), tuple(map(printable, plan.warnings))))
-        _refuse(plan)
+        check_startable(plan)
 
         def on_state(state: State) -> None:
             if state is not State.STOPPING:
                 history, processes = ([*map(printable, lines)] for lines in (supervisor.history, _processes(prepared)))
                 tell(Started(plan.instance, history, processes))
 
-        with logdir.held(plan.log_dir, plan.instance):
+        with hold_log_folder(plan.log_dir, plan.instance):
             logs.setup(_log_file(plan), "supervisor", streams=True)
             with _log_file(plan).open("ab") as log:
                 for stream in (sys.stdout, sys.stderr):
@@ -93,33 +91,6 @@ def detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int
 
 def _log_file(plan: Plan) -> Path:
     return plan.log_dir / "supervisor.log"
-
-
-def _refuse(plan: Plan) -> None:
-    """AlreadyRunningError; EndpointError when a port is taken, which those that a dead supervisor left may well be."""
-    _refuse_second(plan)
-    if not stale_segment.living(plan.instance):
-        try:
-            check_ports(plan)
-        except EndpointError:
-            _refuse_second(plan)  # one that began meanwhile may have them
-            raise
-
-
-def _refuse_second(plan: Plan) -> None:
-    try:
-        refuse_second(plan.instance)
-    except AlreadyRunningError as error:
-        raise AlreadyRunningError(f"{error}{_whose(plan)}") from None
-
-
-def _whose(plan: Plan) -> str:
-    """From which file the running instance of this name was started, and what to do about it."""
-    down = f"shmio-supervisor down --instance {plan.instance} stops it"
-    with suppress(ShmioError), Segment.open(plan.instance) as segment:
-        if segment.config not in (None, plan.config_file):
-            return f", started from {segment.config}: {down}; or give this one another instance.name"
-    return f"; {down}"
 
 
 def _replan(plan: Plan, keys: Mapping[str, Any]) -> Callable[[], Plan]:

@@ -1,0 +1,86 @@
+"""What must hold before an instance starts: it is not running, and its ports and log folder are free."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from shmio.errors import AlreadyRunningError, ConfigError, EndpointError, ShmioError
+from shmio.plan.ports import check_ports
+from shmio.plan.processes import Plan
+from shmio.segment import Segment, stale_segment
+from shmio.segment.segment import refuse_second
+
+LOCK_NAME: Final = ".instance"
+
+
+def check_startable(plan: Plan) -> None:
+    """Check that nothing is in the way of an instance.
+
+    After a supervisor that died, its processes may still have the ports; they are taken over.
+
+    Raises:
+        AlreadyRunningError: The instance is running; the message says how to stop it.
+        EndpointError: A port is in use.
+
+    """
+    _refuse_second(plan)
+    if not stale_segment.living(plan.instance):
+        try:
+            check_ports(plan)
+        except EndpointError:
+            _refuse_second(plan)  # one that began meanwhile may have them
+            raise
+
+
+def _refuse_second(plan: Plan) -> None:
+    try:
+        refuse_second(plan.instance)
+    except AlreadyRunningError as error:
+        raise AlreadyRunningError(f"{error}{_whose(plan)}") from None
+
+
+def _whose(plan: Plan) -> str:
+    """Return the end of a message: from which file the running instance was started, and what to do."""
+    down = f"shmio-supervisor down --instance {plan.instance} stops it"
+    with suppress(ShmioError), Segment.open(plan.instance) as segment:
+        if segment.config not in (None, plan.config_file):
+            return f", started from {segment.config}: {down}; or give this one another instance.name"
+    return f"; {down}"
+
+
+@contextmanager
+def hold_log_folder(folder: Path, instance: str) -> Iterator[None]:
+    """Create an instance's folder for log files, and hold it.
+
+    A folder belongs to one instance, because the files of another would have the same names.
+
+    Raises:
+        ConfigError: Another instance holds the folder, or it cannot be written.
+        AlreadyRunningError: The instance itself holds it.
+
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # It is truncated: not what a link put there by somebody leads to.
+        fd = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        raise ConfigError(f"instance.log_dir: cannot write {folder / LOCK_NAME}: {error.strerror}") from None
+    with os.fdopen(fd, "r+", encoding="utf-8", errors="replace") as file:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            if (other := file.read(64).strip()) == instance:
+                raise AlreadyRunningError(f"instance {instance!r} is already running, or just starting") from None
+            raise ConfigError(
+                f"instance.log_dir: instance {other!r} writes its logs to {folder}: give each instance a folder of "
+                "its own"
+            ) from None
+        line = f"{instance}\n".encode()
+        os.pwrite(fd, line, 0)  # before what was there is cut off: who looks meanwhile sees a name
+        os.ftruncate(fd, len(line))
+        yield
