@@ -28,7 +28,7 @@ class BlockRead:
         self._chunk = chunk
         starts = range(0, size, chunk)
         self._requests = bytearray().join(
-            pdu.read_request(db_number, start, min(chunk, size - start)) for start in starts
+            pdu.read_request(0, [pdu.address(db_number, 8 * start, min(chunk, size - start))]) for start in starts
         )
         self._requests_view = memoryview(self._requests)
         self._block = bytearray(size)

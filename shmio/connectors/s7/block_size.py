@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import struct
 
-from snap7.datatypes import S7Area
-from snap7.s7protocol import S7Protocol
-
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.explain import ITEM_OK
 from shmio.errors import ConnectorError
@@ -44,10 +41,7 @@ class SizeProbe:
     def take(self, count: int, first: int) -> bytes:
         """Return the request."""
         self.sent = count
-        encoder = S7Protocol()
-        encoder.sequence = (first - 1) & 0xFFFF
-        items = [(int(S7Area.DB), self._db_number, at, 1) for at in self._tried]
-        return pdu.data_frame(encoder.build_multi_read_request(items))
+        return pdu.read_request(first & 0xFFFF, [pdu.address(self._db_number, 8 * at, 1) for at in self._tried])
 
     def accept(self, index: int, frame: memoryview) -> None:  # noqa: ARG002 - there is one request
         """Take the answer; ConnectorError if it does not match these items."""
@@ -66,7 +60,7 @@ def parse_readable(frame: memoryview, count: int) -> list[bool]:
     RefusedError if the whole job was refused.
     """
     pdu.check_answer(frame)
-    if bytes(frame[pdu.HEADER_END : pdu.HEADER_END + 2]) != bytes((4, count)):
+    if bytes(frame[pdu.HEADER_END : pdu.HEADER_END + 2]) != bytes((pdu.READ, count)):
         raise ConnectorError(f"not an answer to a read of {count} items")
     readable = []
     at = pdu.HEADER_END + 2

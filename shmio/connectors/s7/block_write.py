@@ -13,9 +13,6 @@ from bisect import bisect_right, insort
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from snap7.datatypes import S7Area, S7WordLen
-from snap7.s7protocol import S7Protocol
-
 from shmio.connectors.base import Lost
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_write
@@ -25,13 +22,13 @@ from shmio.layout.values.write import Write
 MAX_ITEMS = 20  # per job; all known controllers take as many
 JOB_OVERHEAD = 12  # of a request within its PDU: header 10, parameters 2
 ITEM_OVERHEAD = 16  # address 12, head of the value 4
-_WRITE = 0x05
-_ONE_ITEM = slice(12, 24)  # the address in python-snap7's request for one item, of which the rest is the value
+_VALUE = struct.Struct(">BBH")  # reserved, transport size, length
+_VALUE_BIT, _VALUE_BITS = 0x03, 0x04  # transport sizes: a single bit; bytes, whose length counts bits
 
 
 def byte_item(db_number: int, start: int, data: bytes) -> tuple[bytes, bytes]:
     """Encode the address and value of bytes."""
-    return _split(S7Protocol().build_write_request(S7Area.DB, db_number, start, S7WordLen.BYTE, data))
+    return pdu.address(db_number, 8 * start, len(data)), _VALUE.pack(0, _VALUE_BITS, 8 * len(data)) + data
 
 
 def bit_item(db_number: int, start: int, bit: int, value: bool) -> tuple[bytes, bytes]:
@@ -39,30 +36,21 @@ def bit_item(db_number: int, start: int, bit: int, value: bool) -> tuple[bytes, 
 
     The write leaves the other bits of its byte alone.
     """
-    place = 8 * start + bit
-    return _split(S7Protocol().build_write_request(S7Area.DB, db_number, place, S7WordLen.BIT, bytes((value,))))
-
-
-def _split(request: bytes) -> tuple[bytes, bytes]:
-    address, value = request[_ONE_ITEM], request[_ONE_ITEM.stop :]
-    if address[:3] != b"\x12\x0a\x10" or request[10:12] != b"\x05\x01":
-        raise AssertionError("python-snap7 encodes write requests in another way than shmio knows")
-    return address, value
+    return pdu.address(db_number, 8 * start + bit, 1, pdu.TYPE_BIT), _VALUE.pack(0, _VALUE_BIT, 1) + bytes((value,))
 
 
 def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes:
     """Build a job that writes these items from ``byte_item`` and ``bit_item``."""
-    parameters = bytes((_WRITE, len(items))) + b"".join(address for address, _ in items)
+    parameters = bytes((pdu.WRITE, len(items))) + b"".join(address for address, _ in items)
     values = b"".join(value + b"\0" * (len(value) & 1) for _, value in items[:-1]) + items[-1][1]
-    header = struct.pack(">BBHHHH", 0x32, 1, 0, reference, len(parameters), len(values))
-    return pdu.data_frame(header + parameters + values)
+    return pdu.request(reference, parameters, values)
 
 
 def parse_write_answer(frame: memoryview, count: int) -> bytes:
     """Return the codes of ``count`` written items; RefusedError if the whole job was refused."""
     data_length = pdu.check_answer(frame)
     codes = frame[pdu.HEADER_END + 2 :]
-    if len(frame) < pdu.HEADER_END + 2 or len(codes) != data_length or frame[pdu.HEADER_END] != _WRITE:
+    if len(frame) < pdu.HEADER_END + 2 or len(codes) != data_length or frame[pdu.HEADER_END] != pdu.WRITE:
         raise ConnectorError("not an answer to a write")
     if frame[pdu.HEADER_END + 1] != count or data_length != count:
         raise ConnectorError(f"answer with {data_length} return codes, {count} items were written")

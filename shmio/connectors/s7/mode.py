@@ -10,8 +10,6 @@ from __future__ import annotations
 import logging
 import struct
 
-from snap7.s7protocol import S7Protocol
-
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.explain import ITEM_OK, RefusedError
 from shmio.errors import ConnectorError
@@ -19,7 +17,7 @@ from shmio.errors import ConnectorError
 INTERVAL_NS = 1_000_000_000
 _PATIENCE = 2  # connections that may end during a query before it is given up
 _SZL = 0x0424
-_USERDATA = 7
+_ASK = bytes.fromhex("000112 04 11 44 01 00")  # three bytes head, four follow, a request, of the group SZL, "read SZL"
 _PARAMETERS = b"\x00\x01\x12\x08\x12\x84\x01"  # three bytes head, eight follow, an answer, of the group SZL, "read SZL"
 _PARAMETERS_SIZE = 12
 _DATA = struct.Struct(">BBH HH HH")  # return code, transport size, length; SZL and index; size and number of records
@@ -75,9 +73,8 @@ class ModeQuery:
     def take(self, count: int, first: int) -> bytes:
         """Return the request."""
         self.sent = count
-        encoder = S7Protocol()
-        encoder.sequence = (first - 1) & 0xFFFF
-        return pdu.data_frame(encoder.build_read_szl_request(_SZL, 0))
+        data = struct.pack(">BBHHH", ITEM_OK, 0x09, 4, _SZL, 0)  # four bytes: SZL and index
+        return pdu.request(first & 0xFFFF, _ASK, data, pdu.USERDATA)
 
     def accept(self, index: int, frame: memoryview) -> None:  # noqa: ARG002 - there is one request
         """Take the answer; ConnectorError if it does not match."""
@@ -118,7 +115,7 @@ def parse_mode_answer(frame: memoryview) -> int | None:
 
     """
     kind, parameters_size, data_size = pdu.check_envelope(frame)
-    if kind != _USERDATA:
+    if kind != pdu.USERDATA:
         try:
             pdu.check_answer(frame)
         except RefusedError:

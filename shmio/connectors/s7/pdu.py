@@ -1,13 +1,14 @@
-"""Encodes and parses S7 over ISO-on-TCP: frames, sessions, reads of one item. No I/O.
+"""Encodes and parses S7 over ISO-on-TCP: frames, sessions, jobs, reads of one item. No I/O.
 
 A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole), ISO
 8073 class 0 (COTP: CR and CC open, DT carries data), and the S7 job (ROSCTR 1). A controller
 answers with Ack-Data (3), or with a bare Ack (2) that holds an error. S7 has no public standard;
 names follow Wireshark's dissector.
 
-Requests come from python-snap7's encoders. Its parsers are not used: they are many times slower
-than one ``struct`` call per frame, and do not compare an answer with its request. Its connection is
-not used either: each piece has a time-out of its own, so a peer that drips bytes is never late.
+The client of python-snap7 is not used. Its parsers are many times slower than one ``struct`` call
+per frame, and do not compare an answer with its request. Its encoders have no write of several
+items. In its connection each piece has a time-out of its own, so a peer that drips bytes is never
+late.
 
 Every parser here raises only ConnectorError, whatever bytes it is given.
 """
@@ -15,10 +16,8 @@ Every parser here raises only ConnectorError, whatever bytes it is given.
 from __future__ import annotations
 
 import struct
-from typing import NamedTuple
-
-from snap7.datatypes import S7Area, S7WordLen
-from snap7.s7protocol import S7Protocol
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_error
 from shmio.errors import ConnectorError
@@ -37,6 +36,8 @@ _TPDU_SIZE_CODE = 0x0A  # 2 ** 10
 
 _TPKT = struct.Struct(">BxH")
 _HEADER = struct.Struct(">4x 3s BB2x2xHH")  # what all S7 PDUs share
+_REQUEST = struct.Struct(">BBHHHH")  # protocol, ROSCTR, reserved, reference, length of parameters, length of data
+_ADDRESS = struct.Struct(">BBBBHHI")  # 18, 10, S7-Any; type, count, block; area and place in bits
 _ITEM = struct.Struct(">BB BBH")
 _USUAL = struct.Struct(">4x 5s2x2x HHH 4sH")  # an answer to a read, cut so that what is always the same is in one piece
 _USUAL_HEAD, _USUAL_ITEM = b"\x02\xf0\x80\x32\x03", b"\x04\x01\xff\x04"
@@ -46,7 +47,11 @@ _ITEM_END = 25
 _COTP_DATA = b"\x02\xf0\x80"  # header length, DT, end of the message
 _COTP_CR, _COTP_CC, _COTP_DR, _COTP_DT = 0xE0, 0xD0, 0x80, 0xF0
 _ACK, _ACK_DATA = 2, 3
-_READ, _SETUP = 0x04, 0xF0
+READ, WRITE, _SETUP = 0x04, 0x05, 0xF0
+JOB, USERDATA = 1, 7
+"""ROSCTR of requests."""
+_DATA_BLOCK: Final = 0x84
+TYPE_BIT, TYPE_BYTE = 1, 2
 _BITS, _OCTETS = 0x04, 0x09  # transport sizes: whether an item's length counts bits or bytes
 
 
@@ -84,9 +89,15 @@ def frame_length(inbox: memoryview, start: int, longest: int) -> int:
     return int(length)
 
 
-def data_frame(pdu: bytes) -> bytes:
-    """Wrap an S7 PDU that fits one TPDU."""
-    return _frame(_COTP_DATA + pdu)
+def request(reference: int, parameters: bytes, data: bytes = b"", rosctr: int = JOB) -> bytes:
+    """Build a request with a PDU reference of 16 bits."""
+    header = _REQUEST.pack(0x32, rosctr, 0, reference, len(parameters), len(data))
+    return _frame(_COTP_DATA + header + parameters + data)
+
+
+def address(db_number: int, place: int, count: int, kind: int = TYPE_BYTE) -> bytes:
+    """Encode the address of ``count`` bytes, or of a bit, in a data block. ``place`` is in bits."""
+    return _ADDRESS.pack(0x12, 10, 0x10, kind, count, db_number, _DATA_BLOCK << 24 | place)
 
 
 def _frame(payload: bytes) -> bytes:
@@ -184,9 +195,7 @@ def parse_connect_confirm(frame: memoryview) -> int:
 
 def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
     """Build "setup communication", which asks for parallel jobs and a PDU size in bytes."""
-    encoder = S7Protocol()
-    encoder.sequence = (reference - 1) & 0xFFFF
-    return data_frame(encoder.build_setup_communication_request(jobs, jobs, pdu_size))
+    return request(reference, struct.pack(">BBHHH", _SETUP, 0, jobs, jobs, pdu_size))
 
 
 def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Session:
@@ -205,12 +214,9 @@ def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Ses
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read_request(db_number: int, start: int, size: int) -> bytes:
-    """Build a read of ``size`` bytes at byte ``start``. The caller fills in the PDU reference."""
-    frame = data_frame(S7Protocol().build_read_request(S7Area.DB, db_number, start, S7WordLen.BYTE, size))
-    if len(frame) != READ_REQUEST_SIZE:
-        raise AssertionError("python-snap7 encodes read requests in another way than shmio knows")
-    return frame
+def read_request(reference: int, items: Sequence[bytes]) -> bytes:
+    """Build a read of the items at these addresses."""
+    return request(reference, bytes((READ, len(items))) + b"".join(items))
 
 
 def parse_read_answer(frame: memoryview) -> ReadAnswer:
@@ -236,7 +242,7 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
     data_length = check_answer(frame)
     if len(frame) < HEADER_END + 3:
         raise ConnectorError(f"answer of {len(frame)} bytes is too short for a read")
-    if frame[HEADER_END] != _READ or frame[HEADER_END + 1] != 1 or data_length != len(frame) - HEADER_END - 2:
+    if frame[HEADER_END] != READ or frame[HEADER_END + 1] != 1 or data_length != len(frame) - HEADER_END - 2:
         raise ConnectorError("not an answer to a read of one item")
     code = frame[HEADER_END + 2]
     if code != ITEM_OK:

@@ -35,10 +35,10 @@ def test_setup_request() -> None:
 
 
 def test_read_request() -> None:
-    request = bytearray(pdu.read_request(201, 462, 462))
-    request[pdu.REFERENCE_OFFSET : pdu.REFERENCE_OFFSET + 2] = b"\x00\x00"
-    wanted = "0300001f 02f080 32 01 0000 0000 000e 0000 04 01 12 0a 10 02 01ce 00c9 84 000e70"
+    request = pdu.read_request(7, [pdu.address(201, 8 * 462, 462)])
+    wanted = "0300001f 02f080 32 01 0000 0007 000e 0000 04 01 12 0a 10 02 01ce 00c9 84 000e70"
     assert request == bytes.fromhex(wanted)
+    assert len(request) == pdu.READ_REQUEST_SIZE
 
 
 def test_reads_an_answer() -> None:

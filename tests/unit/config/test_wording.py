@@ -1,0 +1,65 @@
+"""What ``explain`` reads in the errors of msgspec, whose words are no promise of that library."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+import pytest
+
+from shmio.config.model import NAME_PATTERN, NAME_RULE
+from shmio.config.wording import explain
+
+
+class Item(msgspec.Struct):
+    size: int
+
+
+class Sample(msgspec.Struct, forbid_unknown_fields=True):
+    name: Annotated[str, msgspec.Meta(pattern=NAME_PATTERN)] = "x"
+    text: Annotated[str, msgspec.Meta(min_length=1)] = "x"
+    several: Annotated[list[Item], msgspec.Meta(min_length=1)] | None = None
+    clock: Literal["wall", "stepped"] = "wall"
+    number: int | float | None = None
+
+
+@pytest.mark.parametrize(
+    ("value", "words", "wanted"),
+    [
+        (
+            {"several": [{"size": 1}, {}]},
+            "Object missing required field `size` - at `$.several[1]`",
+            "several[1].size: this key is needed",
+        ),
+        (
+            {"several": [{"size": "x"}]},
+            "Expected `int`, got `str` - at `$.several[0].size`",
+            "several[0].size: expected a whole number, got text",
+        ),
+        (
+            {"number": True},
+            "Expected `int | float | null`, got `bool` - at `$.number`",
+            "number: expected a whole number or a number, got true or false",
+        ),
+        (
+            {"name": "-"},
+            f"Expected `str` matching regex {NAME_PATTERN!r} - at `$.name`",
+            f"name: expected a name: {NAME_RULE}",
+        ),
+        ({"text": ""}, "Expected `str` of length >= 1 - at `$.text`", "text: must not be empty"),
+        ({"several": []}, "Expected `array` of length >= 1 - at `$.several`", "several: must not be empty"),
+        (
+            {"clock": "Wall"},
+            "Invalid enum value 'Wall' - at `$.clock`",
+            "clock: 'Wall' is none; there are: wall, stepped; did you mean wall?",
+        ),
+        ([], "Expected `object`, got `array`", "expected a table, got a list in [ ]"),
+    ],
+)
+def test_the_words_of_msgspec_are_those_that_explain_reads(value: Any, words: str, wanted: str) -> None:
+    with pytest.raises(msgspec.ValidationError) as caught:
+        msgspec.convert(value, Sample)
+    assert str(caught.value) == words, (
+        "this msgspec words its errors differently: adapt shmio/config/wording.py, then the cap in pyproject.toml"
+    )
+    assert explain(caught.value) == wanted
