@@ -5,6 +5,8 @@ Programs on the same host start with :func:`attach`; :func:`open_dump` reads rec
 
 from __future__ import annotations
 
+from shmio.version import __version__
+
 TYPE_CHECKING = False  # typing's own costs every command 10 ms, in which Ctrl-C would print a traceback
 if TYPE_CHECKING:
     from typing import Any
@@ -12,7 +14,6 @@ if TYPE_CHECKING:
     from shmio.local.attach import attach
     from shmio.recording.dump import open_dump
 
-__version__ = "0.1.0"
 __all__ = ["__version__", "attach", "open_dump"]
 
 

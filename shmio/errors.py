@@ -34,10 +34,8 @@ The command-line tools print the message of any of these errors and exit with st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from shmio.layout.model import Diagnostic
+from dataclasses import dataclass
+from typing import Literal
 
 
 class ShmioError(Exception):
@@ -46,6 +44,20 @@ class ShmioError(Exception):
 
 class ConfigError(ShmioError):
     """The configuration cannot be used; the message names the full key and the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostic:
+    """An error or warning about a layout source; ``str()`` is ``file:line:col: severity: message``."""
+
+    file: str
+    line: int
+    column: int
+    message: str
+    severity: Literal["error", "warning"] = "error"
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}: {self.severity}: {self.message}"
 
 
 class LayoutError(ShmioError):

@@ -12,9 +12,9 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shmio import __version__
 from shmio.cli.interrupt import ended_by_interrupt, exit_on_signals
 from shmio.cli.run import add_full, add_json, complete, run
+from shmio.version import __version__
 
 PROGRAM = "shmio-dump"
 SOME_FILES = "print JSON: one object, or a list for several files"

@@ -7,15 +7,14 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from shmio import __version__
 from shmio.cli.run import add_json, complete, dumps, run
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program, Source
-from shmio.layout.document import describe
 from shmio.layout.image import initial_value_warnings
 from shmio.layout.model import MAX_BLOCK_BYTES, Layout, Register
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.logs import printable
+from shmio.version import __version__
 
 _HEADINGS = ("offset", "size", "type", "path", "initial", "comment")
 
@@ -99,7 +98,7 @@ def _unread(layout: Layout) -> Iterator[str]:
 
 def _print(layouts: Sequence[Layout], *, as_json: bool) -> None:
     if as_json:
-        described = [describe(layout) for layout in layouts]
+        described = [layout.describe() for layout in layouts]
         print(dumps(described[0] if len(described) == 1 else described, indent=2))
         return
     for position, layout in enumerate(layouts):

@@ -8,10 +8,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio import __version__
 from shmio.cli.interrupt import ended_by_interrupt
 from shmio.cli.run import add_json, at_least, complete, run
 from shmio.plan.replay import add_arguments
+from shmio.version import __version__
 
 PROGRAM = "shmio-supervisor"
 MODES = ("live", "log", "replay")

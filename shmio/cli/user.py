@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shmio import __version__
 from shmio.cli import completion, get, inject, registers, replay, step, watch
 from shmio.cli import set as set_verb
 from shmio.cli.cell import Cell
@@ -18,6 +17,7 @@ from shmio.cli.run import add_json, complete, run
 from shmio.cli.target import target
 from shmio.layout.spelling import may_be_tia_spelling, topic_path
 from shmio.local.attach import Attachment
+from shmio.version import __version__
 
 PROGRAM = "shmio"
 

@@ -6,7 +6,7 @@ from shmio import worker
 from shmio.config import Address
 from shmio.emulators.emulator import Emulator
 from shmio.errors import ShmioError
-from shmio.layout.model import Layout
+from shmio.layout.document import load_layout
 from shmio.logs import fields
 from shmio.worker import BEAT_S, Worker
 
@@ -17,7 +17,7 @@ def run(worker: Worker) -> None:
     The process description contains the compiled layouts.
     """
     config = worker.config
-    first, *others = (Layout.from_json(layout.encode()) for layout in config["layouts"])
+    first, *others = (load_layout(layout.encode()) for layout in config["layouts"])
     listen = Address.parse(config["listen"])
     emulator = Emulator(first, config["program"], listen, db_number=config["dbNumber"], others=others)
     with emulator:

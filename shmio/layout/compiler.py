@@ -12,7 +12,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
-from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Diagnostic, Layout
+from shmio.errors import Diagnostic
+from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Layout
 from shmio.layout.placement import emit, tags
 from shmio.layout.placement.place import MAX_TEXT, Placer
 from shmio.layout.placement.placed import Cost, Group

@@ -1,14 +1,12 @@
-"""JSON form of a layout, as ``shmio-layout --json`` prints it and segments and recordings store it.
+"""Reads a layout's JSON, as segments and recordings store it.
 
-Reading trusts nothing: types are checked strictly, then every value that can be computed is
+It trusts nothing: types are checked strictly, then every value that can be computed is
 computed again and compared.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from typing import Annotated
 
 import msgspec
@@ -58,42 +56,12 @@ class _Layout(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 _DECODER = msgspec.json.Decoder(_Layout)  # msgspec crashes if two threads use a type first
 
 
-def describe(layout: Layout) -> dict[str, object]:
-    """Return the layout as the object of the public contract: JSON types, without ``byte_order``."""
-    return {
-        "name": layout.name,
-        "number": layout.number,
-        "size": layout.size,
-        "optimized": layout.optimized,
-        "registers": [_describe_register(register) for register in layout.registers],
-    }
-
-
-def _describe_register(register: Register) -> Mapping[str, object]:
-    return {
-        "path": register.path,
-        "type": register.type,
-        "dims": [list(bounds) for bounds in register.dims] or None,
-        "offset": register.offset,
-        "bit": register.bit,
-        "size": register.size,
-        "count": register.count,
-        "comment": register.comment,
-        "initial": register.initial,
-    }
-
-
-def dump(layout: Layout) -> bytes:
-    """Return the canonical JSON: keys in fixed order, no white space, UTF-8."""
-    document = describe(layout) | {"byte_order": layout.byte_order}
-    return json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
-
-
-def load(data: bytes) -> Layout:
-    """Read and validate a layout's JSON.
+def load_layout(data: bytes) -> Layout:
+    """Read and validate the JSON of ``Layout.to_json``; the data may be hostile.
 
     Raises:
-        LayoutError: The JSON is not what ``dump`` writes for a valid layout.
+        LayoutError: The JSON is malformed, or the layout is impossible: registers that overlap,
+            have wrong sizes, or are outside the block.
 
     """
     if len(data) > MAX_JSON_BYTES:

@@ -1,12 +1,13 @@
 """The compiled layout: a block, its registers, and the address of each.
 
 Everything here is immutable and free of I/O. Segments, recordings and ``shmio-layout --json``
-hold a ``Layout``; its JSON form is in ``document.py``.
+hold a ``Layout`` as JSON, which ``document.py`` reads.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
@@ -27,20 +28,6 @@ MAX_BLOCK_BYTES = 1 << 20  # any block: optimized ones, and those of other sourc
 MAX_REGISTERS = 100_000
 MAX_ELEMENTS = 1 << 20  # of all registers together
 MAX_STRUCTURES = 200_000  # of a block, including structures without registers
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnostic:
-    """An error or warning about a source; ``str()`` is ``file:line:col: severity: message``."""
-
-    file: str
-    line: int
-    column: int
-    message: str
-    severity: Literal["error", "warning"] = "error"
-
-    def __str__(self) -> str:
-        return f"{self.file}:{self.line}:{self.column}: {self.severity}: {self.message}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,24 +151,34 @@ class Layout:
             comment=register.comment,
         )
 
+    def describe(self) -> dict[str, object]:
+        """Return the layout as the object of ``shmio-layout --json``: JSON types, without ``byte_order``."""
+        return {
+            "name": self.name,
+            "number": self.number,
+            "size": self.size,
+            "optimized": self.optimized,
+            "registers": [_describe(register) for register in self.registers],
+        }
+
     def to_json(self) -> bytes:
-        """Return canonical JSON: the object of ``shmio-layout --json`` plus ``byte_order``."""
-        from shmio.layout.document import dump  # noqa: PLC0415  (document imports this module)
+        """Return canonical JSON: :meth:`describe` and ``byte_order``, keys in fixed order, no white space, UTF-8."""
+        document = self.describe() | {"byte_order": self.byte_order}
+        return json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
 
-        return dump(self)
 
-    @classmethod
-    def from_json(cls, data: bytes) -> Layout:
-        """Read and validate the JSON that ``to_json`` writes; the data may be hostile.
-
-        Raises:
-            LayoutError: The JSON is malformed, or the layout is impossible: registers that overlap,
-                have wrong sizes, or are outside the block.
-
-        """
-        from shmio.layout.document import load  # noqa: PLC0415
-
-        return load(data)
+def _describe(register: Register) -> Mapping[str, object]:
+    return {
+        "path": register.path,
+        "type": register.type,
+        "dims": [list(bounds) for bounds in register.dims] or None,
+        "offset": register.offset,
+        "bit": register.bit,
+        "size": register.size,
+        "count": register.count,
+        "comment": register.comment,
+        "initial": register.initial,
+    }
 
 
 class _Sorted:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from shmio.errors import LayoutError, ShmioError
-from shmio.layout.model import Diagnostic
+from shmio.errors import Diagnostic, LayoutError, ShmioError
 
 MAX_ERRORS = 100
 MAX_WARNINGS = 1000

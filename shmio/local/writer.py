@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import secrets
+import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +20,8 @@ from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge
 from shmio.model.outcome import Outcome, OutcomeKind
-from shmio.segment.commands import MAX_NAME_BYTES, CommandKind, CommandSender, InjectionOptions
-from shmio.segment.events import DONE, Event, EventKind
+from shmio.segment.commands import EMPTY, MAX_NAME_BYTES, MAX_WRITES, Command, CommandKind, InjectionOptions
+from shmio.segment.events import Event, EventKind
 from shmio.segment.pending_commands import CommandOutcomes, End
 
 if TYPE_CHECKING:
@@ -36,6 +39,61 @@ _UNKNOWN: Final = "; it is not known whether the value was written"
 RESTARTED: Final = f"the source was restarted meanwhile{_UNKNOWN}"
 REPLACED: Final = f"{RETIRED}{_UNKNOWN}"
 SILENT: Final = f"the source gave no answer in time{_UNKNOWN}"
+
+
+class CommandSender:
+    """Sends a writer's commands to one block. The writer's process holds the slot that owns the queue."""
+
+    def __init__(self, block: Block, writer: int) -> None:
+        self.block = block
+        self.writer = writer
+        self._turn = threading.Lock()
+        self._pid = os.getpid()  # two processes on one queue would overwrite each other's commands
+        # Random, so as never to reuse the number of a predecessor's command, whose outcome may still come.
+        self._next = secrets.randbits(62) + 1
+
+    def submit(
+        self,
+        writes: Sequence[Write],
+        deadline_ns: int,
+        kind: CommandKind = CommandKind.WRITE,
+        injection: int = 0,
+        **laid: Unpack[InjectionOptions],
+    ) -> int:
+        """Send a command to the source's present process, without waiting.
+
+        Args:
+            writes: The items.
+            deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
+            kind: Kind of command.
+            injection: The injection to lift, or to give values to.
+            laid: Options of a new injection.
+
+        Returns:
+            The command's number.
+
+        Raises:
+            CommandError: The queue is full, or too small for the command.
+        """
+        source = self.block.source
+        if (len(writes) > 0) == (kind in EMPTY) or len(writes) > MAX_WRITES:
+            raise CommandError(f"{source}: a command has 1 to {MAX_WRITES} items, this has {len(writes)}")
+        with self._turn:
+            number, self._next = self._next, self._next + 1
+            incarnation = self.block.incarnation
+            command = Command(self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **laid)
+            record = command.pack()
+            queues = self.block.commands
+            if len(record) + 8 > queues.capacity:
+                most = queues.capacity - 8
+                raise CommandError(
+                    f"{source}: a command of {len(record)} bytes, {most} are the most: write fewer at once"
+                )
+            if self._pid != os.getpid():
+                raise CommandError("this process is a copy, made by fork, of the one that attached: attach anew in it")
+            if not queues.push(self.writer, record):
+                raise CommandError(f"{source}: its command queue is full: it takes none at present, or too many come")
+            return number
 
 
 @dataclass(slots=True)

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from shmio.config import Config, Emulator, Source
-from shmio.errors import ConfigError, LayoutError
+from shmio.errors import ConfigError, Diagnostic, LayoutError
 from shmio.layout import compiler
-from shmio.layout.model import Diagnostic, Layout
+from shmio.layout.model import Layout
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 
 _QUOTED = re.compile(r"'[^']*'")

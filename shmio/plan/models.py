@@ -12,6 +12,7 @@ import msgspec
 from shmio.connectors.models.describe import Answer, Request
 from shmio.connectors.models.simulation import Simulation
 from shmio.errors import ConfigError, PathError, ShmioError, ValueRangeError
+from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.topic import find, parse_topic, shorten
@@ -46,7 +47,7 @@ def describe(key: str, options: Simulation.Options, layout: Layout | None) -> tu
         ) from None
     if answer.error:
         raise ConfigError(f"{key}.{answer.error}")
-    return Layout.from_json(answer.layout.encode()), answer.inputs
+    return load_layout(answer.layout.encode()), answer.inputs
 
 
 def check_connections(

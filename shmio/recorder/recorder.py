@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmio import __version__
 from shmio.recorder.attached_files import AttachedFile, AttachedFiles, no_attachments
 from shmio.recorder.block_follower import BlockEntry, BlockFollower, InstanceEntry
 from shmio.recorder.instance_follower import TURN_S, InstanceFollower
@@ -17,6 +16,7 @@ from shmio.recorder.output import Output
 from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, Reason
 from shmio.recording.writer import JSON, Channels, Writer
 from shmio.segment import Event, Frame
+from shmio.version import __version__
 
 
 @dataclass(slots=True)

@@ -70,14 +70,29 @@ class Columns(Mapping[str, Array]):
         return len(self.values_by_path)
 
     def to_arrow(self) -> pyarrow.Table:
-        """Convert to a pyarrow table with a column for each register; arrays become lists.
+        """Convert to a pyarrow table: time (UTC, ns), source time, number, cycle, quality, provenance, registers.
+
+        Types are native: arrays are lists of fixed size, POINTER and ANY are bytes. Null means that
+        the bytes are no value of the type, or that the source never had an image. A register with
+        the name of another column is prefixed by its source.
 
         Raises:
             MissingLibraryError: pyarrow is not installed.
         """
-        from shmio.recording.arrow import table  # noqa: PLC0415  pyarrow only for those who ask for it
-
-        return table(self)
+        arrow = library("pyarrow", ANALYSIS)
+        unknown = self.source_ns == 0
+        time = arrow.timestamp("ns", "UTC")
+        fields = {
+            "time": arrow.array(self.time_ns).cast(time),
+            "source_time": arrow.array(self.source_ns, mask=unknown).cast(time),
+            "number": arrow.array(self.number),
+            "cycle": arrow.array(self.cycle),
+            "quality": _categories(arrow, self.quality, ("bad", "uncertain", "good")),
+            "provenance": _categories(arrow, self.provenance, ("live", "simulated", "replayed", "injected")),
+        }
+        for path, values in self.items():
+            fields[heading(self.source, path)] = _lists(arrow, values, unknown)
+        return arrow.Table.from_arrays(list(fields.values()), names=list(fields))
 
     def to_pandas(self) -> pandas.DataFrame:
         """Convert to a pandas data frame, indexed by time, with a column for each register and array element.
@@ -200,3 +215,27 @@ def record_codec(registers: tuple[Register, ...], size: int, byte_order: ByteOrd
     """Return a codec for registers in a batch's records: images of ``size`` bytes behind a header."""
     shifted = tuple(replace(register, offset=register.offset + HEAD.itemsize) for register in registers)
     return FrameCodec(Layout("", None, HEAD.itemsize + size, False, shifted, byte_order))
+
+
+def _categories(arrow: Any, codes: npt.NDArray[np.uint8], names: tuple[str, ...]) -> Any:
+    known = np.where(codes < len(names), codes, 0).astype(np.int8)  # unknown codes count as the first name
+    return arrow.DictionaryArray.from_arrays(arrow.array(known), arrow.array(names))
+
+
+def _lists(arrow: Any, values: npt.NDArray[Any], unknown: npt.NDArray[np.bool_]) -> Any:
+    """Convert values of shape (n, …) to an array of n values or nested lists."""
+    mask = np.repeat(unknown, values[0].size) if len(values) and values.ndim > 1 else unknown
+    plain = np.ascontiguousarray(values).reshape(-1)
+    if plain.dtype.kind in "mM":
+        mask = mask | np.isnat(plain)
+    if plain.dtype.kind == "V":
+        size = plain.dtype.itemsize
+        hidden = [None if hide else bytes(value) for value, hide in zip(plain, mask, strict=True)]
+        found = arrow.array(hidden, arrow.binary(size))
+    elif plain.dtype.kind == "U":
+        found = arrow.array(plain.tolist(), arrow.string(), mask=mask)
+    else:
+        found = arrow.array(plain, mask=mask)
+    for length in reversed(values.shape[1:]):
+        found = arrow.FixedSizeListArray.from_arrays(found, length)
+    return found

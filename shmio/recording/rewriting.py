@@ -11,7 +11,6 @@ from typing import IO, Final
 
 import numpy as np
 
-from shmio import __version__
 from shmio.errors import RecordingError
 from shmio.layout.model import Register
 from shmio.layout.topic import holder
@@ -26,6 +25,7 @@ from shmio.recording.selection import RecordedRegisters
 from shmio.recording.times import span
 from shmio.recording.writer import JSON, TEXT, TOML, Channels, Writer
 from shmio.segment import Event, Frame
+from shmio.version import __version__
 
 MAX_ATTACHMENT_BYTES: Final = 16 << 20
 FLUSH_BYTES: Final = 4 << 20

@@ -8,7 +8,6 @@ from typing import IO, Final, Protocol, cast
 
 import mcap.writer
 
-from shmio import __version__
 from shmio.layout.model import Layout
 from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.format.encoding import (
@@ -37,6 +36,7 @@ from shmio.recording.format.encoding import (
     encode_position,
 )
 from shmio.segment import Block, Event, Frame
+from shmio.version import __version__
 
 CHUNK_BYTES: Final = 1 << 20
 

@@ -7,7 +7,7 @@ from shmio.layout.values.write import Write
 from shmio.model.values import Provenance, Quality
 from shmio.segment.block import Attributes, Block, BlockWriter, Stamp
 from shmio.segment.build import BlockSpec, Origin, segment_size
-from shmio.segment.commands import Command, CommandKind, CommandSender, Direction
+from shmio.segment.commands import Command, CommandKind, Direction
 from shmio.segment.cursor import Cursor
 from shmio.segment.events import DONE, ENDS, NO_WRITER, Event, EventKind, EventRing, Record
 from shmio.segment.frame import Frame
@@ -27,7 +27,6 @@ __all__ = [
     "BlockWriter",
     "Command",
     "CommandKind",
-    "CommandSender",
     "Cursor",
     "Direction",
     "Event",

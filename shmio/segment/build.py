@@ -13,7 +13,6 @@ from pathlib import Path
 
 import msgspec
 
-from shmio import __version__
 from shmio.layout.model import Layout
 from shmio.segment import _atomics, commands, header, model_channel, playhead
 from shmio.segment.block import Attributes
@@ -23,6 +22,7 @@ from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, S
 from shmio.segment.processes import GUEST_SLOTS, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
 from shmio.segment.standing_injections import CELL_SIZE
+from shmio.version import __version__
 
 RING_SECONDS = 8
 SECTIONS_PER_BLOCK = 8  # of a block that has every kind

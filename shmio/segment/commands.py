@@ -6,21 +6,13 @@ Only the source decides what is done, and in which order; it reports outcomes in
 
 from __future__ import annotations
 
-import os
-import secrets
 import struct
-import threading
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final, TypedDict, Unpack
+from typing import Final, TypedDict
 
-from shmio.errors import CommandError
 from shmio.layout.values.write import Write
 from shmio.segment import _atomics
-
-if TYPE_CHECKING:
-    from shmio.segment.block import Block
 
 WRITERS: Final = 8
 """Command queues of a block; processes.py assigns them."""
@@ -217,58 +209,3 @@ class InjectionOptions(TypedDict, total=False):
     priority: int
     keep: bool
     name: str
-
-
-class CommandSender:
-    """Sends a writer's commands to one block. The writer's process holds the slot that owns the queue."""
-
-    def __init__(self, block: Block, writer: int) -> None:
-        self.block = block
-        self.writer = writer
-        self._turn = threading.Lock()
-        self._pid = os.getpid()  # two processes on one queue would overwrite each other's commands
-        # Random, so as never to reuse the number of a predecessor's command, whose outcome may still come.
-        self._next = secrets.randbits(62) + 1
-
-    def submit(
-        self,
-        writes: Sequence[Write],
-        deadline_ns: int,
-        kind: CommandKind = CommandKind.WRITE,
-        injection: int = 0,
-        **laid: Unpack[InjectionOptions],
-    ) -> int:
-        """Send a command to the source's present process, without waiting.
-
-        Args:
-            writes: The items.
-            deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
-            kind: Kind of command.
-            injection: The injection to lift, or to give values to.
-            laid: Options of a new injection.
-
-        Returns:
-            The command's number.
-
-        Raises:
-            CommandError: The queue is full, or too small for the command.
-        """
-        source = self.block.source
-        if (len(writes) > 0) == (kind in EMPTY) or len(writes) > MAX_WRITES:
-            raise CommandError(f"{source}: a command has 1 to {MAX_WRITES} items, this has {len(writes)}")
-        with self._turn:
-            number, self._next = self._next, self._next + 1
-            incarnation = self.block.incarnation
-            command = Command(self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **laid)
-            record = command.pack()
-            queues = self.block.commands
-            if len(record) + 8 > queues.capacity:
-                most = queues.capacity - 8
-                raise CommandError(
-                    f"{source}: a command of {len(record)} bytes, {most} are the most: write fewer at once"
-                )
-            if self._pid != os.getpid():
-                raise CommandError("this process is a copy, made by fork, of the one that attached: attach anew in it")
-            if not queues.push(self.writer, record):
-                raise CommandError(f"{source}: its command queue is full: it takes none at present, or too many come")
-            return number

@@ -10,9 +10,9 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
-from shmio import __version__
 from shmio.errors import FormatError, UnfinishedError
 from shmio.segment import _atomics
+from shmio.version import __version__
 
 MAGIC: Final = int.from_bytes(b"SHMIOSEG", "little")
 ABI_VERSION: Final = 1

@@ -20,7 +20,7 @@ from shmio.errors import (
     UnfinishedError,
     WrongInstanceError,
 )
-from shmio.layout.model import Layout
+from shmio.layout.document import load_layout
 from shmio.segment import _atomics, header, shm
 from shmio.segment.block import Attributes, Block, BlockWriter, Stamp
 from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, Origin, align, build_segment, wake, write_blocks
@@ -75,7 +75,7 @@ def read_block(
         return parts[kind].offset, parts[kind].size
 
     try:
-        layout = Layout.from_json(bytes(memory[described.offset : described.offset + described.size]))
+        layout = load_layout(bytes(memory[described.offset : described.offset + described.size]))
         at, size = part(SectionKind.SOURCE)
         attributes = _ATTRIBUTES.decode(bytes(memory[at : at + size]))
         frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))

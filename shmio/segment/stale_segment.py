@@ -12,13 +12,13 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from shmio import __version__
 from shmio.errors import AlreadyRunningError, FormatError, NotRunningError, SegmentError, UnfinishedError
 from shmio.segment import shm
 from shmio.segment.header import HEADER_SIZE, State
 from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSlot
 from shmio.segment.segment import PREFIX, Segment, refuse_second
 from shmio.segment.shm import SharedObject
+from shmio.version import __version__
 
 GRACE_S = 3.0
 

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from shmio.errors import LayoutError, ModelError, ShmioError
 from shmio.layout.model import Layout
 from shmio.layout.placement.tag_place import place_tags
 from shmio.layout.structures import members
 from shmio.layout.topic import canonical_path
+from shmio.simulation.ports import Ends, Port
 
-if TYPE_CHECKING:
-    from shmio.simulation.model import Model
+
+class DeclaringModel(Protocol):
+    """A model, as its declarations see it."""
+
+    _ports: Mapping[str, Port]
+    _ends: Mapping[str, Ends]
 
 
 class Declaration:
@@ -60,10 +65,10 @@ class Declaration:
         self.name = name
         self.path = self.path or name
 
-    def __get__(self, model: Model | None, owner: type) -> Any:
+    def __get__(self, model: DeclaringModel | None, owner: type) -> Any:
         return self if model is None else model._ports[self.name].read()
 
-    def __set__(self, model: Model, value: object) -> None:
+    def __set__(self, model: DeclaringModel, value: object) -> None:
         raise AttributeError(f"{self.name} is {self.kind}: a model reads it and cannot set it")
 
     @cached_property
@@ -118,7 +123,7 @@ class Output(Declaration):
 
     kind = "an output"
 
-    def __set__(self, model: Model, value: object) -> None:
+    def __set__(self, model: DeclaringModel, value: object) -> None:
         model._ports[self.name].write(value)
 
 
@@ -127,10 +132,10 @@ class InOut(Declaration):
 
     kind = "an in-out register"
 
-    def __get__(self, model: Model | None, owner: type) -> Any:
+    def __get__(self, model: DeclaringModel | None, owner: type) -> Any:
         return self if model is None else model._ends[self.name]
 
-    def __set__(self, model: Model, value: object) -> None:
+    def __set__(self, model: DeclaringModel, value: object) -> None:
         raise AttributeError(f"{self.name} is {self.kind}: set {self.name}.shown")
 
 

@@ -14,7 +14,8 @@ import pytest
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.errors import ConnectorError
-from shmio.segment import CommandSender, Event, EventKind, Frame, Quality, Write
+from shmio.local.writer import CommandSender
+from shmio.segment import Event, EventKind, Frame, Quality, Write
 from shmio.testing.conformance import PATIENCE_S, ConnectorConformance, Rig, Run
 
 ENDS = {EventKind.WRITTEN, EventKind.REFUSED, EventKind.EXPIRED, EventKind.UNKNOWN}

@@ -11,6 +11,7 @@ from functools import cache
 
 from shmio.errors import LayoutError, ValueRangeError
 from shmio.layout.compiler import Compiled, Source, compile_sources
+from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame, unread
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
@@ -39,7 +40,7 @@ def check_sources(data: bytes) -> None:
         assert all(d.line >= 1 and d.column >= 1 and "\n" not in str(d) for d in compiled.diagnostics)
         return
     for layout in compiled.layouts:
-        assert Layout.from_json(layout.to_json()) == layout
+        assert load_layout(layout.to_json()) == layout
         frame, missing = initial_frame(layout)
         assert [register.path for register in unread(layout)] == list(missing)
         _check_frame(layout, bytes(frame))
@@ -55,10 +56,10 @@ def _outcome(sources: list[Source]) -> Compiled | LayoutError:
 def check_document(data: bytes) -> None:
     """A layout's JSON is taken or refused, and what is taken can be used."""
     try:
-        layout = Layout.from_json(data)
+        layout = load_layout(data)
     except LayoutError:
         return
-    assert Layout.from_json(layout.to_json()) == layout
+    assert load_layout(layout.to_json()) == layout
     if layout.size <= 1 << 16:
         _check_frame(layout, (data * (layout.size // len(data) + 1))[: layout.size])
 

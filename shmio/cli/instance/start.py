@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from shmio import logs
-from shmio.cli.instance.up import Configured, Failed, Started, StartMessage, headline
+from shmio.cli.instance.start_messages import Configured, Failed, Started, StartMessage, headline
 from shmio.cli.run import say
 from shmio.errors import ShmioError
 from shmio.logs import printable

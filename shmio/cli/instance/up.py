@@ -16,42 +16,17 @@ from pathlib import Path
 
 import msgspec
 
+from shmio.cli.instance.start_messages import Failed, Started, StartMessage, headline
 from shmio.cli.interrupt import ended_by_interrupt
 from shmio.cli.run import say
 from shmio.cli.target import config_file, option_for
 from shmio.errors import ControlError
 from shmio.local.status import InstanceStatus, SourceStatus, read_status
 from shmio.plan.replay import given, options
-from shmio.segment import PREFIX
 from shmio.supervisor.process import child_environment
 
 DETACH_S = 120.0
 """The longest time that the start of a detached instance is waited for."""
-
-
-class Configured(msgspec.Struct, tag=True):
-    """A detached supervisor has read its configuration."""
-
-    log_file: str
-    warnings: tuple[str, ...]
-
-
-class Started(msgspec.Struct, tag=True):
-    """All runs. ``history``: what was found of an earlier supervisor; ``processes``: what there is, a line each."""
-
-    instance: str
-    history: list[str]
-    processes: list[str]
-
-
-class Failed(msgspec.Struct, tag=True):
-    """The start has failed."""
-
-    error: str
-
-
-StartMessage = Configured | Started | Failed
-"""What a detached supervisor tells about its start: a JSON object a line, of printable text."""
 
 
 def execute(arguments: argparse.Namespace) -> int:
@@ -65,12 +40,6 @@ def execute(arguments: argparse.Namespace) -> int:
     if arguments.report is not None:
         return start.detached(file, arguments.mode, keys, arguments.report)
     return start.foreground(file, arguments.mode, keys)
-
-
-def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path) -> str:
-    """``segment_bytes``: None before a take-over, of which nobody knows yet what it will find."""
-    size = "" if segment_bytes is None else f" ({segment_bytes / 1e6:.1f} MB)"
-    return f"{instance}: mode {mode}, segment {PREFIX}{instance}{size}, logs in {log_dir}"
 
 
 def _detach(file: Path, mode: str, words: Sequence[str]) -> int:

@@ -13,7 +13,7 @@ import msgspec
 
 from shmio.connectors.models.simulation import Simulation, make
 from shmio.errors import ShmioError
-from shmio.layout.model import Layout
+from shmio.layout.document import load_layout
 
 
 class Request(msgspec.Struct):
@@ -40,7 +40,7 @@ def main() -> int:
     os.dup2(2, 1)  # what a model prints is no answer
     request = msgspec.json.decode(sys.stdin.buffer.read(), type=Request)
     try:
-        runner = make(request.options, None if request.layout is None else Layout.from_json(request.layout.encode()))
+        runner = make(request.options, None if request.layout is None else load_layout(request.layout.encode()))
         answer = Answer(runner.layout.to_json().decode(), runner.inputs)
     except ShmioError as error:
         answer = Answer(error=str(error))

@@ -12,14 +12,13 @@ from typing import Annotated, Final, Literal
 import msgspec
 
 from shmio.config.wording import explain
-from shmio.errors import PathError, ValueRangeError
+from shmio.errors import Diagnostic, PathError, ValueRangeError
 from shmio.layout.model import (
     MAX_BLOCK_BYTES,
     MAX_DIMENSIONS,
     MAX_ELEMENTS,
     MAX_REGISTERS,
     ByteOrder,
-    Diagnostic,
     Dims,
     Layout,
     Register,

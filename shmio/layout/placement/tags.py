@@ -27,7 +27,8 @@ import msgspec
 
 from shmio.config.lines import MAX_PARTS, too_long
 from shmio.config.wording import explain, explain_toml
-from shmio.layout.model import Diagnostic, Layout
+from shmio.errors import Diagnostic
+from shmio.layout.model import Layout
 from shmio.layout.placement.tag_place import Table, place_table
 from shmio.layout.report import Report
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from shmio.errors import ShmioError
-from shmio.layout.model import Diagnostic
+from shmio.errors import Diagnostic, ShmioError
 from shmio.layout.source.expression import HIGHEST, LOWEST
 from shmio.layout.source.syntax import Bound, Constant, ConstantDeclaration, Sum
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
-from shmio.layout.model import Diagnostic
+from shmio.errors import Diagnostic
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 
-from shmio.errors import ShmioError
-from shmio.layout.model import Diagnostic
+from shmio.errors import Diagnostic, ShmioError
 from shmio.layout.report import Report
 from shmio.layout.source.lexer import Kind, Token
 from shmio.layout.source.syntax import Position

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from mcap.writer import Writer
 
-from shmio import __version__
 from shmio.layout.model import Register
 from shmio.recording.columns import Columns, heading
 from shmio.recording.dump import Dump
@@ -20,6 +19,7 @@ from shmio.recording.explain import Explainer, kind_of, object_of
 from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.names import Chosen
 from shmio.recording.pieces import pieces
+from shmio.version import __version__
 
 FRAME: Final = "frame"
 HEAD: Final = {"number": "integer", "cycle": "integer", "quality": "integer", "provenance": "integer"}

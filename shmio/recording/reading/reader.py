@@ -14,6 +14,7 @@ from mcap.opcode import Opcode
 from mcap.records import Header, Metadata
 
 from shmio.errors import LayoutError, RecordingError
+from shmio.layout.document import load_layout
 from shmio.layout.model import Layout
 from shmio.recording.format.channels import MAX_CHANNEL_BYTES, MAX_CHANNELS, Channel, describe
 from shmio.recording.format.damage import Damage, DamageLog
@@ -236,7 +237,7 @@ class Reader:
             if hashlib.sha256(data).hexdigest() != digest:
                 raise RecordingError(f"{self.file}: the layout of {channel.topic} is damaged")
             try:
-                self._layouts[digest] = Layout.from_json(data)
+                self._layouts[digest] = load_layout(data)
             except LayoutError as error:
                 raise RecordingError(f"{self.file}: the layout of {channel.topic}: {error}") from None
         return self._layouts[digest]

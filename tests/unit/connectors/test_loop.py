@@ -14,7 +14,8 @@ from shmio.connectors.loop import SourceLoop
 from shmio.connectors.schedule import Schedule
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
-from shmio.segment import BlockSpec, CommandSender, EventKind, Frame, ProcessSpec, Quality, Segment, Write
+from shmio.local.writer import CommandSender
+from shmio.segment import BlockSpec, EventKind, Frame, ProcessSpec, Quality, Segment, Write
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
 PERIOD_NS = 20_000_000

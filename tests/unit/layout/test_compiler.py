@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Compiled, Source, compile_sources
+from shmio.layout.document import load_layout
 from shmio.layout.model import Layout, Register
 from shmio.layout.report import MAX_ERRORS
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES, MAX_TOKENS
@@ -83,7 +84,7 @@ def test_what_stands_between_the_words_of_a_name_becomes_spaces(gap: str) -> Non
     text = block(f"fill{gap}level : Int;", f"fill{gap}level := 3;")
     layout = layout_of(text)
     assert [(r.path, r.initial) for r in layout.registers] == [("fill level", "3")]
-    assert Layout.from_json(layout.to_json()) == layout
+    assert load_layout(layout.to_json()) == layout
 
 
 def test_comments() -> None:
@@ -434,7 +435,7 @@ def test_anything_compiles_or_ends_in_a_layout_error(fragments: list[str]) -> No
             assert result.diagnostics
             assert all(d.line >= 1 and d.column >= 1 for d in result.diagnostics)
         else:
-            assert all(Layout.from_json(layout.to_json()) == layout for layout in result.layouts)
+            assert all(load_layout(layout.to_json()) == layout for layout in result.layouts)
 
 
 @settings(max_examples=100)

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from shmio.layout.compiler import Compiled, Source, compile_sources
-from shmio.layout.document import describe
 from shmio.layout.model import Register
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "layout"
@@ -48,7 +47,7 @@ def test_rule_files_are_all_there() -> None:
 def test_db201_as_printed() -> None:
     compiled = compile_file(GOLDEN / "db201-as-printed.db")
     (layout,) = compiled.layouts
-    assert describe(layout) == json.loads((GOLDEN / "db201-as-printed.json").read_bytes())
+    assert layout.describe() == json.loads((GOLDEN / "db201-as-printed.json").read_bytes())
     assert (layout.size, len(layout.registers), layout.optimized) == (2180, 22, True)
     spaced = [warning for warning in compiled.warnings if "no quotes" in warning.message]
     assert [warning.line for warning in spaced] == [7, 11, 12, 13, 14, 15, 29, 30]

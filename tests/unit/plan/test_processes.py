@@ -11,6 +11,7 @@ import pytest
 
 from shmio.config import Config, Emulator, Grpc, Instance, Mqtt, Recorder, Source, Token
 from shmio.errors import ConfigError
+from shmio.layout.document import load_layout
 from shmio.layout.model import Layout, Register
 from shmio.plan.processes import MAX_PROCESSES, MODES, MODULES, RANKS, Job, make_plan, process_names
 from shmio.segment import Segment
@@ -81,7 +82,7 @@ def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
     }
     assert source["log_file"] == str(tmp_path / "logs" / "cell0.log")
     assert source["config"]["connector"] == "s7"
-    assert [Layout.from_json(text.encode()) for text in emulator["config"]["layouts"]] == [LAYOUT]
+    assert [load_layout(text.encode()) for text in emulator["config"]["layouts"]] == [LAYOUT]
     assert grpc["config"]["listen"] == ["127.0.0.1:0"]
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from shmio.errors import CommandError
 from shmio.layout.model import Layout, Register
-from shmio.segment import BlockSpec, Command, CommandSender, ProcessSpec, Segment, Write
+from shmio.local.writer import CommandSender
+from shmio.segment import BlockSpec, Command, ProcessSpec, Segment, Write
 from shmio.segment._atomics import QUEUE_HEADER_SIZE, queue_pop, queue_push, store64
 from shmio.segment.commands import MAX_WRITES, CommandQueues, capacity_for
 

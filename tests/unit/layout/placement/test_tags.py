@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import codec
@@ -52,7 +53,7 @@ def test_values_lie_in_the_order_of_the_file_at_multiples_of_their_size() -> Non
     assert layout.registers[3].dims == ((1, 3), (0, 8))
     assert layout.registers[2].comment == "rad"
     assert layout.size == 73
-    assert Layout.from_json(layout.to_json()) == layout
+    assert load_layout(layout.to_json()) == layout
 
 
 def test_initial_values_are_those_of_the_table() -> None:
@@ -147,4 +148,4 @@ def test_anything_is_compiled_or_refused(data: str | bytes) -> None:
             layout = compiled(text)
         except LayoutError:
             continue
-        assert Layout.from_json(layout.to_json()) == layout
+        assert load_layout(layout.to_json()) == layout
