@@ -1,8 +1,23 @@
 """Read, check and resolve ``supervisor.toml`` (architecture: *Config*)."""
 
 from shmio.config.address import Address, UnixAddress, parse_address
-from shmio.config.model import Config, Declaration, Emulator, Grpc, Instance, Recorder, Source, Tls, Token, Trigger
-from shmio.config.mqtt.model import Mqtt, MqttAccount, MqttTls, MqttTopic, Sparkplug
+from shmio.config.model import (
+    Config,
+    Declaration,
+    Emulator,
+    Grpc,
+    Instance,
+    Mqtt,
+    MqttAccount,
+    MqttTls,
+    MqttTopic,
+    Recorder,
+    Source,
+    Sparkplug,
+    Tls,
+    Token,
+    Trigger,
+)
 from shmio.config.read import RESERVED_SOURCES, load
 
 __all__ = [

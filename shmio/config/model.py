@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from msgspec import Meta, field
+from msgspec import Meta, Struct, field
 
-from shmio.config.mqtt.model import Mqtt
-from shmio.config.section import Section, Text, Texts
+Text = Annotated[str, Meta(min_length=1)]
+Texts = Annotated[list[Text], Meta(min_length=1)]
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z"
 NAME_RULE = "at most 40 letters, digits and _ . -, the first a letter or a digit"
@@ -21,6 +21,8 @@ ClockName = Literal["wall", "stepped"]
 ReplayedInjections = Literal["keep", "leave out"]
 DistributionName = Literal["uniform", "gaussian"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
+BrokerName = Literal["embedded", "mosquitto", "external"]
+PayloadName = Literal["text", "json", "structure", "frames"]
 TypeBytes = Annotated[dict[Text, Annotated[int, Meta(ge=1, le=1 << 20)]], Meta(max_length=1000)]
 """Sizes in bytes of types whose members are unknown, by type name."""
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
@@ -28,6 +30,10 @@ RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
 
 ROLES = ("read", "write", "inject", "control")
 """The permissions that clients of the gRPC endpoint can have."""
+
+
+class Section(Struct, forbid_unknown_fields=True, kw_only=True):
+    """A table of the file; unknown keys are refused."""
 
 
 class Instance(Section):
@@ -227,6 +233,87 @@ class Declaration(Section, omit_defaults=True):
     times: Annotated[int, Meta(ge=1)] | None = None
     priority: Annotated[int, Meta(ge=-(2**31), lt=2**31)] = 0
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
+
+
+class MqttTls(Section):
+    """``[mqtt.tls]``: PEM files.
+
+    ``ca`` issues the peer's certificates; without it, an external broker's certificate is checked
+    with the host's authorities. ``certificate`` and ``key`` identify shmio to an external broker,
+    or shmio's own broker to its clients.
+    """
+
+    ca: Text | None = None
+    certificate: Text | None = None
+    key: Text | None = None
+
+
+class MqttTopic(Section):
+    """``[[mqtt.topic]]``: how matching registers are published; the first matching rule counts."""
+
+    match: Text | Texts
+    publish: bool = True
+    payload: PayloadName = "text"
+    qos: Annotated[int, Meta(ge=0, le=1)] = 1
+    retain: bool = True
+    deadband: Annotated[float, Meta(ge=0, le=1e300)] = 0.0
+    max_rate_hz: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    elements: bool = False
+
+    @property
+    def patterns(self) -> list[str]:
+        """Globs over paths that begin with their source."""
+        return [self.match] if isinstance(self.match, str) else self.match
+
+
+class Sparkplug(Section):
+    """``[mqtt.sparkplug]``: the instance as a Sparkplug B edge node, by default of its own name."""
+
+    group: Text
+    node: Text | None = None
+    primary_host: Text | None = None
+    datatypes: bool = True
+    elements: bool = False
+    max_rate_hz: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    match: Text | Texts = "**"
+
+    @property
+    def patterns(self) -> list[str]:
+        """Globs that select the metrics, over paths that begin with their source."""
+        return [self.match] if isinstance(self.match, str) else self.match
+
+
+class MqttAccount(Section):
+    """``[[mqtt.account]]``: the roles of an account of shmio's own broker.
+
+    Without ``name`` it holds for clients without an account. ``publish`` has filters of the topics
+    that the role ``write`` allows besides commands.
+    """
+
+    roles: Texts
+    name: Text | None = None
+    publish: list[Text] = []
+
+
+class Mqtt(Section):
+    """``[mqtt]``: the bridge to a broker, and the broker itself unless that is ``external``."""
+
+    broker: BrokerName = "embedded"
+    listen: Text | None = None
+    host: Text | Texts | None = None
+    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    prefix: Text | None = None
+    insecure: bool = False
+    tls: MqttTls | None = None
+    username: Text | None = None
+    password_file: Text | None = None
+    client_id: Annotated[str, Meta(min_length=1, max_length=128)] | None = None
+    keep_alive_s: Annotated[int, Meta(ge=5, le=3600)] = 30
+    session_expiry_s: Annotated[int, Meta(ge=0, le=2**32 - 2)] = 0
+    backlog_mb: Annotated[float, Meta(ge=0, le=65536)] = 16.0
+    account: list[MqttAccount] = []
+    topic: list[MqttTopic] = []
+    sparkplug: Sparkplug | None = None
 
 
 class Config(Section):

@@ -23,17 +23,21 @@ from shmio.config.model import (
     Grpc,
     Instance,
     Listening,
+    Mqtt,
+    MqttAccount,
+    MqttTls,
+    MqttTopic,
     Recorder,
     Replay,
+    Section,
     Source,
+    Sparkplug,
     Tls,
     Token,
     Trigger,
 )
-from shmio.config.mqtt.model import Mqtt, MqttAccount, MqttTls, MqttTopic, Sparkplug
 from shmio.config.mqtt.rules import check_mqtt, resolve_mqtt
 from shmio.config.properties import read_properties
-from shmio.config.section import Section
 from shmio.config.wording import explain, explain_toml, near
 from shmio.errors import ConfigError
 

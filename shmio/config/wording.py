@@ -11,8 +11,16 @@ from typing import Any, get_args
 from msgspec import ValidationError
 
 from shmio.config.lines import Lines
-from shmio.config.model import NAME_PATTERN, NAME_RULE, ClockName, DistributionName, OperationName, ReplayedInjections
-from shmio.config.mqtt.model import BrokerName, PayloadName
+from shmio.config.model import (
+    NAME_PATTERN,
+    NAME_RULE,
+    BrokerName,
+    ClockName,
+    DistributionName,
+    OperationName,
+    PayloadName,
+    ReplayedInjections,
+)
 
 MAX_LINE = 80
 MAX_HINTED = 100

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from shmio.layout.model import Register
-from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.reading.batch import Batch
+from shmio.recording.reading.blocks import DumpBlock
 from shmio.segment.changed_registers import runs
 
 _Bytes = npt.NDArray[np.uint8]

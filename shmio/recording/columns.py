@@ -14,9 +14,9 @@ import numpy.typing as npt
 from shmio.errors import RecordingError
 from shmio.layout.model import ByteOrder, Layout, Register
 from shmio.layout.values.frame_codec import FrameCodec
-from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.libraries import ANALYSIS, library
 from shmio.recording.reading.batch import HEAD, Batch
+from shmio.recording.reading.blocks import DumpBlock
 
 if TYPE_CHECKING:
     import pandas

@@ -12,9 +12,9 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import elements
 from shmio.recording.dump import Dump
-from shmio.recording.format.blocks import DumpBlock
-from shmio.recording.format.entries import Entry
 from shmio.recording.joining import EVENT_FIELDS, Pair, aligned, at_once, joined, one_by_one
+from shmio.recording.reading.blocks import DumpBlock
+from shmio.recording.reading.entries import Entry
 from shmio.segment import Event, EventKind, Frame, Provenance
 from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.playhead import OWN_WORDS

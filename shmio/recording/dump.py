@@ -13,11 +13,11 @@ from shmio.errors import RecordingError
 from shmio.layout.model import Register
 from shmio.recording.changes import Changes
 from shmio.recording.columns import Collector, Columns
-from shmio.recording.format.blocks import Contents, DumpBlock, contents
 from shmio.recording.format.encoding import Gap
-from shmio.recording.format.entries import Entry, batches_of, latest_of, messages_of
 from shmio.recording.names import Names
 from shmio.recording.reading.batch import Batch
+from shmio.recording.reading.blocks import Contents, DumpBlock, contents
+from shmio.recording.reading.entries import Entry, batches_of, latest_of, messages_of
 from shmio.recording.reading.part import MAX_NS, Damaged, Part
 from shmio.recording.reading.reader import Item, Reader
 from shmio.recording.sequence import Sequence

@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from itertools import groupby, islice
 from typing import Final, TypeVar
 
-from shmio.recording.format.entries import Entry
+from shmio.recording.reading.entries import Entry
 from shmio.segment import Event, Frame
 
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")

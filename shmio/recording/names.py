@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Sequence
 from shmio.errors import PathError
 from shmio.layout.model import Register
 from shmio.layout.topic import Topic, parse_topic
-from shmio.recording.format.blocks import DumpBlock
+from shmio.recording.reading.blocks import DumpBlock
 
 Chosen = dict[DumpBlock, list[Register]]
 

@@ -8,7 +8,7 @@ from typing import Final
 from shmio.layout.model import Register
 from shmio.recording.columns import Collector, Columns
 from shmio.recording.dump import Dump
-from shmio.recording.format.blocks import DumpBlock
+from shmio.recording.reading.blocks import DumpBlock
 from shmio.recording.reading.part import MAX_NS
 
 PIECE_BYTES: Final = 8 << 20

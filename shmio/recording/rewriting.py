@@ -16,9 +16,9 @@ from shmio.layout.model import Register
 from shmio.layout.topic import holder
 from shmio.layout.values.write import covering
 from shmio.recording.dump import Dump
-from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.format.encoding import Gap, ProcessChange, Reason, StepMark
-from shmio.recording.format.entries import Entry
+from shmio.recording.reading.blocks import DumpBlock
+from shmio.recording.reading.entries import Entry
 from shmio.recording.reading.part import MAX_NS
 from shmio.recording.reading.reader import Item
 from shmio.recording.selection import RecordedRegisters

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from shmio.recording.format.blocks import Contents, DumpBlock
 from shmio.recording.format.encoding import Gap, Reason
+from shmio.recording.reading.blocks import Contents, DumpBlock
 from shmio.recording.reading.reader import Item
 from shmio.segment import Event, Frame
 

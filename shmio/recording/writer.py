@@ -9,7 +9,6 @@ from typing import IO, Final, Protocol, cast
 import mcap.writer
 
 from shmio.layout.model import Layout
-from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.format.encoding import (
     ABOUT,
     EVENT,
@@ -35,6 +34,7 @@ from shmio.recording.format.encoding import (
     encode_json,
     encode_position,
 )
+from shmio.recording.reading.blocks import DumpBlock
 from shmio.segment import Block, Event, Frame
 from shmio.version import __version__
 

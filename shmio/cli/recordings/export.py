@@ -17,9 +17,9 @@ from shmio.recording.dump import Dump
 from shmio.recording.export.events import export_events
 from shmio.recording.export.tables import TABLES, BlockTables
 from shmio.recording.export.viewer import export_mcap
-from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.names import Chosen
 from shmio.recording.pieces import pieces
+from shmio.recording.reading.blocks import DumpBlock
 from shmio.recording.rewriting import new_file
 from shmio.recording.times import span
 

@@ -10,7 +10,7 @@ from shmio.cli.recordings.verify import lines, verify
 from shmio.errors import RecordingError
 from shmio.recording import rewriting
 from shmio.recording.dump import Dump
-from shmio.recording.format.entries import Entry
+from shmio.recording.reading.entries import Entry
 from shmio.recording.reading.reader import Item
 from shmio.recording.rewriting import Rewriter
 

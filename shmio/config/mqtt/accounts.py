@@ -9,7 +9,7 @@ import secrets
 from collections.abc import Sequence
 from typing import Final
 
-from shmio.config.mqtt.model import MqttAccount
+from shmio.config.model import MqttAccount
 from shmio.config.secret_file import read_secret
 from shmio.errors import ConfigError
 

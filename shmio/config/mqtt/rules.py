@@ -8,8 +8,7 @@ from typing import Final
 from unicodedata import category
 
 from shmio.config.address import Address
-from shmio.config.model import Config
-from shmio.config.mqtt.model import Mqtt, MqttTopic
+from shmio.config.model import Config, Mqtt, MqttTopic
 from shmio.errors import ConfigError
 
 PORT: Final = 1883

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ssl
 
-from shmio.config.mqtt.model import MqttTls
+from shmio.config.model import MqttTls
 from shmio.config.pem import detail, load_authority, load_pair
 from shmio.errors import ConfigError
 

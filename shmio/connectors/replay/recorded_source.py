@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from shmio.recording.dump import Dump
-from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.format.damage import Damage
 from shmio.recording.format.encoding import Gap
+from shmio.recording.reading.blocks import DumpBlock
 from shmio.segment import Event, Frame
 
 log = logging.getLogger("shmio.source")

@@ -10,8 +10,8 @@ from typing import IO, Any, Final
 
 from shmio.recording.dump import Dump
 from shmio.recording.explain import Explainer, cells_of, kind_of
-from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.libraries import ANALYSIS, library
+from shmio.recording.reading.blocks import DumpBlock
 from shmio.recording.times import iso
 
 NUMBERS: Final = ("frame", "cycle", "injection", "command", "item", "items", "offset", "mask", "size")

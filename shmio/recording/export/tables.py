@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from shmio.layout.model import Register
 from shmio.recording.columns import Columns, flat, heading
-from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.libraries import ANALYSIS, library
 from shmio.recording.names import Chosen
+from shmio.recording.reading.blocks import DumpBlock
 from shmio.recording.rewriting import new_file
 from shmio.segment import Provenance, Quality
 

@@ -15,12 +15,12 @@ from shmio.connectors.commands.processor import MAX_WAITING, CommandProcessor
 from shmio.connectors.output import Output
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
+from shmio.local.writer import CommandSender
 from shmio.segment import (
     BlockSpec,
     BlockWriter,
     Command,
     CommandKind,
-    CommandSender,
     Cursor,
     Event,
     EventKind,

@@ -21,14 +21,13 @@ from shmio.injection.draw import SeededRandom
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value, codec
 from shmio.local.reading import reading
-from shmio.local.writer import SourceWriter
+from shmio.local.writer import CommandSender, SourceWriter
 from shmio.model.clock import Clock
 from shmio.model.outcome import OutcomeKind
 from shmio.segment import (  # fmt: skip
     Attributes,
     BlockSpec,
     CommandKind,
-    CommandSender,
     Event,
     EventKind,
     Frame,

@@ -8,9 +8,9 @@ from typing import Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from shmio.recording.format.blocks import Contents, DumpBlock
 from shmio.recording.format.encoding import Gap, encode_frame
 from shmio.recording.reading.batch import HEAD, Batch
+from shmio.recording.reading.blocks import Contents, DumpBlock
 from shmio.recording.reading.part import Part
 from shmio.recording.reading.reader import Item
 from shmio.segment import Frame
