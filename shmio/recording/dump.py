@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import heapq
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from shmio.errors import RecordingError
 from shmio.layout.model import Register
-from shmio.recording.changes import Changes
 from shmio.recording.columns import Collector, Columns
-from shmio.recording.format.encoding import Gap
+from shmio.recording.format.encoding import Gap, Reason
 from shmio.recording.names import Names
 from shmio.recording.reading.batch import Batch
 from shmio.recording.reading.blocks import Contents, DumpBlock, contents
 from shmio.recording.reading.entries import Entry, batches_of, latest_of, messages_of
 from shmio.recording.reading.part import MAX_NS, Damaged, Part
 from shmio.recording.reading.reader import Item, Reader
-from shmio.recording.sequence import Sequence
 from shmio.segment import Event, Frame
+from shmio.segment.changed_registers import runs
 
 MAX_FILES: Final = 512
 OVERLAP_NS: Final = 1_000_000_000
@@ -255,7 +258,7 @@ class Dump:
         """
         chosen = self._names.of_one_source(path)
         source = next(iter(chosen)).source
-        changes = Changes(chosen)
+        changes = _Changes(chosen)
         before = self.latest(source, after_ns)
         if before is not None and before.block is not None:
             changes.begin(before.block, before.item.image)
@@ -344,7 +347,7 @@ class Dump:
             for part, within, wanted in parts
             if part.begin_ns <= to_ns and part.end_ns >= from_ns - OVERLAP_NS
         )
-        sequence = Sequence()
+        sequence = _FileJoin()
         if self._overlap:
             ordered: Iterable[tuple[Contents, Entry[Item]]] = heapq.merge(*streams, key=lambda pair: pair[1].time_ns)
         else:
@@ -370,3 +373,80 @@ class Dump:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class _FileJoin:
+    """Joins the numbered frames and events of several files.
+
+    It removes duplicates, and finds what is missing between two files.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[tuple[DumpBlock, str], tuple[Contents, int, int]] = {}
+        """File, number and log time of the last item."""
+
+    def next(self, file: Contents, block: DumpBlock, time_ns: int, item: Item) -> tuple[Gap | None, Item | None]:
+        """Return the gap before an item, or None, and the item without what came before, or None."""
+        if isinstance(item, Gap):
+            what, first, last = item.what, item.first, item.last
+        elif isinstance(item, Frame | Event):
+            what = "frames" if isinstance(item, Frame) else "events"
+            first = last = item.number
+        else:
+            return None, item
+        before = self._last.get((block, what))
+        if before is not None:
+            file_before, number, before_ns = before
+            if last <= number:
+                return None, None
+            if first <= number and isinstance(item, Gap):
+                first = number + 1
+                item = msgspec.structs.replace(item, first=first, count=last - number)
+        self._last[block, what] = file, last, time_ns
+        if before is None or first == number + 1 or file_before is file:
+            return None, item
+        missing = first - number - 1
+        place = block.source, file.number[block], what
+        return Gap(*place, number + 1, first - 1, missing, Reason.ELSEWHERE, before_ns, time_ns), item
+
+
+_Bytes = npt.NDArray[np.uint8]
+
+
+def _register_bytes(registers: Sequence[Register]) -> tuple[npt.NDArray[np.intp], _Bytes]:
+    """Return offset and mask of each byte of an image that holds data of the registers, without padding."""
+    places: list[int] = []
+    masks: list[int] = []
+    for register in registers:
+        for offset, size, mask in runs(register):
+            places += range(offset, offset + size)
+            masks += [mask or 0xFF] * size
+    return np.array(places, np.intp), np.array(masks, np.uint8)
+
+
+class _Changes:
+    """Compares the bytes of each frame with those of the previous frame."""
+
+    def __init__(self, chosen: Mapping[DumpBlock, Sequence[Register]]) -> None:
+        self._bytes = {block: _register_bytes(registers) for block, registers in chosen.items()}
+        self._before: dict[DumpBlock, npt.NDArray[Any]] = {}
+
+    def begin(self, block: DumpBlock, image: bytes) -> None:
+        """Set the image before the first frame."""
+        if block in self._bytes:
+            self._before[block] = self._of(block, np.frombuffer(image, np.uint8)[None, :])[0]
+
+    def _of(self, block: DumpBlock, images: _Bytes) -> _Bytes:
+        places, masks = self._bytes[block]
+        found: _Bytes = images[:, places] & masks
+        return found
+
+    def first(self, block: DumpBlock, batch: Batch) -> int | None:
+        """Return the index of the first frame that differs; the first frame of a block counts as unchanged."""
+        if block not in self._bytes:
+            return None
+        now = self._of(block, batch.images)
+        before = np.concatenate((self._before.get(block, now[0])[None, :], now[:-1]))
+        self._before[block] = now[-1]
+        changed = (now != before).any(axis=1)
+        return int(changed.argmax()) if changed.any() else None
