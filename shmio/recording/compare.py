@@ -12,7 +12,7 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import elements
 from shmio.recording.dump import Dump
-from shmio.recording.joining import EVENT_FIELDS, Pair, aligned, at_once, joined, one_by_one
+from shmio.recording.joining import EVENT_FIELDS, MAX_EVENTS, MAX_FRAMES, InOrder, Pair, aligned, grouped, joined
 from shmio.recording.reading.blocks import DumpBlock
 from shmio.recording.reading.entries import Entry
 from shmio.segment import Event, EventKind, Frame, Provenance
@@ -200,10 +200,12 @@ class _Source:
 
     def compare(self) -> SourceDifference:
         found = self._found
-        frames = [one_by_one(_frames(dump, self._name), self._frame_key) for dump in self._dumps]
-        self._compare(found.frames, joined(frames[0], frames[1], zip), self._frames)
-        if "events" not in self._how.ignore:
-            events = [at_once(_events(dump, self._name), self._event_key) for dump in self._dumps]
+        ignore = self._how.ignore
+        frames = [grouped(_frames(dump, self._name), self._frame_key, MAX_FRAMES) for dump in self._dumps]
+        in_order = InOrder(late="ends" in ignore and not {"cycle", "times"} <= {*ignore})
+        self._compare(found.frames, joined(frames[0], frames[1], in_order), self._frames)
+        if "events" not in ignore:
+            events = [grouped(_events(dump, self._name), self._event_key, MAX_EVENTS) for dump in self._dumps]
             self._compare(found.events, joined(events[0], events[1], aligned), self._events)
         found.missing = sorted({path for pair in self._pairs.values() for path in pair.missing})
         return found
@@ -325,26 +327,33 @@ class _Alone:
 
 
 class _Common:
-    """Time span, in each recording, from the first to the last entry that both have."""
+    """In each of the two, from the first to the last entry that both have."""
 
     def __init__(self) -> None:
-        self._times: tuple[tuple[int, int], tuple[int, int]] | None = None
+        self._ends: list[tuple[_Position, _Position]] = []
 
     def add(self, one: Entry[Any], other: Entry[Any]) -> None:
-        first, last = self._times or (((one.time_ns, other.time_ns),) * 2)
-        self._times = (
-            (min(first[0], one.time_ns), min(first[1], other.time_ns)),
-            (max(last[0], one.time_ns), max(last[1], other.time_ns)),
-        )
+        both = _position(one), _position(other)
+        ends = self._ends or [(position, position) for position in both]
+        self._ends = [
+            (min(first, position), max(last, position)) for (first, last), position in zip(ends, both, strict=True)
+        ]
 
     def has(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
-        """Return whether an entry that only one recording has is within the span."""
-        if self._times is None:
-            return False
-        first, last = self._times
-        return all(
-            entry is None or first[place] <= entry.time_ns <= last[place] for place, entry in enumerate((one, other))
+        """Whether what only one of them has lies within."""
+        return bool(self._ends) and all(
+            entry is None or first <= _position(entry) <= last
+            for entry, (first, last) in zip((one, other), self._ends, strict=True)
         )
+
+
+_Position = tuple[int, int, bool]
+
+
+def _position(entry: Entry[Any]) -> _Position:
+    """Where a frame or event is in its recording: virtual time, which stands still, does not say it alone."""
+    item = entry.item
+    return (entry.time_ns, item.frame, True) if isinstance(item, Event) else (entry.time_ns, item.number, False)
 
 
 class _Registers:

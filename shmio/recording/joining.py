@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from itertools import groupby, islice
+from itertools import groupby, islice, zip_longest
 from typing import Final, TypeVar
 
 from shmio.recording.reading.entries import Entry
@@ -12,23 +12,19 @@ from shmio.segment import Event, Frame
 
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
 """Content of an event, which does not depend on the run."""
-MAX_AT_ONCE: Final = 4096
-"""Limit on events of one key in memory: while time is paused, one cycle may have any number."""
+MAX_EVENTS: Final = 4096
+MAX_FRAMES: Final = 64
+"""Limits on entries of one key in memory: while time is paused, one cycle may have any number."""
 
 T = TypeVar("T", Frame, Event)
 Pair = tuple[Entry[T] | None, Entry[T] | None]
 Groups = Iterator[tuple[int, list[Entry[T]]]]
 
 
-def one_by_one(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int]) -> Groups[T]:
-    """Yield each entry as a group of its own, with its key."""
-    return ((key(entry), [entry]) for entry in entries)
-
-
-def at_once(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int]) -> Groups[T]:
-    """Yield groups of consecutive entries with the same key."""
+def grouped(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int], most: int) -> Groups[T]:
+    """Yield groups of at most ``most`` consecutive entries with the same key."""
     for value, some in groupby(entries, key):
-        while group := list(islice(some, MAX_AT_ONCE)):
+        while group := list(islice(some, most)):
             yield value, group
 
 
@@ -52,6 +48,25 @@ def joined(
         elif one is not None and other is not None:
             yield from align(one[1], other[1])
             one, other = next(first, None), next(second, None)
+
+
+class InOrder:
+    """Pairs entries of one key in their order.
+
+    If ``late``, the last ones of the first common key: a recording that began within a cycle has
+    only the cycle's last frames.
+    """
+
+    def __init__(self, *, late: bool) -> None:
+        self._late = late
+
+    def __call__(self, ones: Sequence[Entry[T]], others: Sequence[Entry[T]]) -> Iterator[Pair[T]]:
+        """Yield pairs, with None for an entry that one group lacks."""
+        if not self._late:
+            return zip_longest(ones, others)
+        self._late = False
+        pairs = list(zip_longest(reversed(ones), reversed(others)))
+        return reversed(pairs)
 
 
 def aligned(ones: Sequence[Entry[Event]], others: Sequence[Entry[Event]]) -> Iterator[Pair[Event]]:

@@ -215,6 +215,27 @@ def test_ends_are_what_lies_outside_of_both(diff: Diff) -> None:
     }  # fmt: skip
 
 
+def test_recordings_may_begin_and_end_within_a_cycle(diff: Diff) -> None:
+    """While time stands still, several frames and events have the same cycle and time."""
+
+    def recorded(file: str, first: int, last: int) -> None:
+        """Three frames of each cycle, and an event behind each."""
+        with build(Path(file), first=first) as work:
+            work.block("cell", after_event=first - 1)
+            for number in range(first, last + 1):
+                cycle = number // 3
+                work.frame(cycle, image(number), number=number)
+                work.event(number, number, f"event {number}", cycle=cycle)
+
+    recorded("a.mem", 1, 31)
+    recorded("b.mem", 10, 35)
+    status, found = diff("--ignore", "ends")
+    assert (status, found["frames"]["compared"], found["events"]["compared"]) == (0, 22, 22)
+    recorded("b.mem", 11, 32)
+    status, found = diff("--ignore", "ends")
+    assert (status, found["frames"]["compared"], found["events"]["compared"]) == (0, 21, 21)
+
+
 def test_elements_that_differ_are_named(capsys: pytest.CaptureFixture[str]) -> None:
     counting("a.mem")
 

@@ -85,13 +85,14 @@ class Build:
         }
         self.writer.frame(self.blocks[source], Frame(**(fields | other)), START_NS + clock_ns + late_ns)
 
-    def event(self, number: int, after: int, text: str = "", source: str = "cell") -> None:
-        """An event behind a frame."""
+    def event(self, number: int, after: int, text: str = "", source: str = "cell", *, cycle: int | None = None) -> None:
+        """An event behind a frame, in the cycle of its number or another."""
         self.events[source] = number
-        clock_ns = after * PERIOD_NS
+        cycle = after if cycle is None else cycle
+        clock_ns = cycle * PERIOD_NS
         utc_ns = START_NS + clock_ns
         event = Event(
-            number, EventKind.QUALITY, after, after, clock_ns, clock_ns, utc_ns, 1, Quality.GOOD,
+            number, EventKind.QUALITY, after, cycle, clock_ns, clock_ns, utc_ns, 1, Quality.GOOD,
             0xFFFFFFFF, 0, 0, 0, 0, 0, 0, b"", text, 0,
         )  # fmt: skip
         self.writer.event(self.blocks[source], event, utc_ns)
