@@ -132,7 +132,7 @@ def read_text(file: Path) -> str:
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(f"{file}: larger than {MAX_FILE_BYTES} bytes")
     try:
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")  # some editors write a byte order mark
     except UnicodeDecodeError as error:
         raise ConfigError(f"{file}: not UTF-8 at byte {error.start}") from None
 
@@ -143,9 +143,11 @@ def parse(file: Path, text: str) -> dict[str, Any]:
         raise ConfigError(f"{file}:{line}: a key is longer than {MAX_KEY} characters or {MAX_PARTS} parts")
     try:
         tables = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, or a number too long for int()
+    except ValueError as error:  # TOMLDecodeError, or a number too long for int()
         raise ConfigError(f"{file}: not TOML: {explain_toml(error, text)}") from None
-    if _depth(tables) > MAX_DEPTH:
+    except RecursionError:
+        tables = None
+    if tables is None or _depth(tables) > MAX_DEPTH:
         raise ConfigError(f"{file}: tables and lists are nested more than {MAX_DEPTH} deep")
     return tables
 

@@ -106,7 +106,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             _check_trigger(config.recorder.trigger.when, layouts)
     odd = [*notices, *files.odd]
     for found in (
-        lambda: _odd(config, layouts),
+        lambda: _odd(config, layouts, faults),
         lambda: _odd_topics(config, layouts),
         lambda: _odd_recorder(config, layouts),
         lambda: _not_served(config, layouts, emulated),
@@ -218,8 +218,8 @@ def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
             raise ConfigError(f"{key}.dbNumber: this key is needed, for {why}{alone}")
 
 
-def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
-    """Return warnings about settings that are valid but probably unintended."""
+def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str]:
+    """Return warnings about settings that are valid but probably unintended; note invalid patterns."""
     odd = []
     for index, source in enumerate(config.source):
         key, layout = f"source[{index}]", layouts[source.name]
@@ -233,7 +233,7 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
                     elif name == "allow_nonfinite" and not _covers(pattern, layout, NONFINITE):
                         odd.append(f"{key}.{name}: {pattern!r} names no REAL or LREAL in {layout.name}")
                 except PathError as error:
-                    raise ConfigError(f"{key}.{name}: {error}") from None
+                    faults.add(f"{key}.{name}: {error}")
         number = source.options.get("dbNumber")
         if number is not None and layout.number is not None and number != layout.number:
             odd.append(f"{key}.dbNumber: {number}, but the layout is that of DB{layout.number}")

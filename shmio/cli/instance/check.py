@@ -53,9 +53,9 @@ def _taken(file: Path, plan: Plan) -> list[str]:
 
 
 def _lines(found: dict[str, Any]) -> list[str]:
-    count = len(found["warnings"])
+    count, processes = len(found["warnings"]), len(found["processes"])
     return [
-        f"{found['config']}: instance {found['instance']}, {len(found['processes'])} processes",
+        f"{found['config']}: instance {found['instance']}, {processes} process{'es' * (processes != 1)}",
         *(f"  {_line(source)}" for source in found["sources"]),
         *(f"  {text}" for text in found["injections"]),
         *(f"  with --mode replay: {_line(source)}" for source in found["replay"]),

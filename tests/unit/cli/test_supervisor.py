@@ -546,6 +546,13 @@ def test_a_pattern_that_names_nothing_is_odd(
     assert ("usable, with 1 warning\n" in output) is odd
 
 
+def test_all_patterns_that_name_no_part_are_told_at_once(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    example('"Outputs"', '"Inputs.%X0", "NCAchse1_Pos.%X0"')
+    assert main(["check"]) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert ["Inputs.%X0" in told[0], "NCAchse1_Pos.%X0" in told[1], len(told)] == [True, True, 2]
+
+
 @pytest.mark.parametrize(("roles", "odd"), [('["read", "write"]', True), ('["read"]', False)])
 def test_a_broker_that_lets_everybody_write_is_odd(
     example: Edit,

@@ -106,6 +106,12 @@ def test_a_slip_is_told_with_what_to_write(tmp_path: Path, text: str, said: str)
     assert said in line
 
 
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    file = tmp_path / "supervisor.toml"
+    file.write_text(HEAD, encoding="utf-8-sig")
+    assert load(file).instance.name == "x"
+
+
 def test_each_key_has_its_line() -> None:
     text = (
         '# a\na.\'b c\'."d" = 1 # [x]\n[t] # [u]\nlong = \'\'\'\nk = 1\n[z]\n\'\'\'\nmore = """\\"""\n[y]""""\n'
@@ -129,7 +135,7 @@ def test_each_key_has_its_line() -> None:
         (HEAD + "".join(f"k{i}.{'.'.join('a' * 100)} = 1\n" for i in range(4000)), 1, "F:3: a key is longer"),
         (HEAD + "".join(f"k{i}.{'.'.join('a' * 60)} = 1\n" for i in range(3000)), 1001, "instance.k0: unknown key"),
         (f"[{'.'.join('a' * 60)}]\n{'.'.join('b' * 60)} = 1\n", 1, "nested more than 64 deep"),
-        (f"x = {'[' * 5000}{']' * 5000}", 1, "not TOML: "),
+        (f"x = {'[' * 5000}{']' * 5000}", 1, "F: tables and lists are nested more than 64 deep"),
         (HEAD + "".join(f"k{i} = 1\n" for i in range(30_000)), 1001, "instance.k0: unknown key"),
         (HEAD + "[[source]]\n" * 30_000, 401, "source: 30000 of them; an instance has at most 200 processes"),
         (HEAD + "[grpc]\nlisten = ['127.0.0.1:0']\n" + "[[grpc.token]]\n" * 9000, 1001, "grpc.token: 9000 of them"),
