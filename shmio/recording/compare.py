@@ -229,6 +229,8 @@ class _Source:
         begun = False
         for one, other in pairs:
             if one is None or other is None:
+                if "ends" in self._how.ignore and self._common.begins_after(one, other):
+                    continue
                 since.add(one, other)
                 if self._common.has(one, other):
                     inside.add(one, other)
@@ -338,6 +340,13 @@ class _Common:
         self._ends = [
             (min(first, position), max(last, position)) for (first, last), position in zip(ends, both, strict=True)
         ]
+
+    def begins_after(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
+        """Whether what only one of them has lies before the first entry of both."""
+        return bool(self._ends) and any(
+            entry is not None and _position(entry) < first
+            for entry, (first, _) in zip((one, other), self._ends, strict=True)
+        )
 
     def has(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
         """Whether what only one of them has lies within."""
