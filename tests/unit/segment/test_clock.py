@@ -186,3 +186,11 @@ def test_a_segment_without_a_clock_page_is_refused(segment: Segment, instance: s
     segment.memory[kind_at : kind_at + 4] = (99).to_bytes(4, "little")
     with pytest.raises(FormatError, match=r"no clock page.*older"):
         Segment.open(instance)
+
+
+def test_a_wait_returns_the_value_of_the_doorbell(segment: Segment) -> None:
+    bell = segment.clock.bell
+    before = bell.value()
+    assert bell.wait(before, 1) == before  # nobody rings within a nanosecond
+    bell.ring()
+    assert bell.wait(before) == bell.value() != before

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -98,3 +100,10 @@ def test_any_bytes_are_some_event(raw: bytes, quality: int) -> None:
     event = decode((5, 1, 2, 3, 4, 1, quality, 0, 9, 0, "", raw, None))
     assert len(event.data) <= EVENT_DATA_SIZE
     assert event.quality in Quality
+
+
+def test_kinds_have_the_numbers_of_the_documentation() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "dump-format.md").read_text()
+    found = re.search(r"\| kind \| (1 started.*) \|", page)
+    assert found is not None
+    assert found[1] == ", ".join(f"{kind.value} {kind.name.lower()}" for kind in EventKind)

@@ -316,3 +316,11 @@ def test_all_who_are_far_behind_are_tried_again_together() -> None:
         for losses in monitors:
             losses.offer(now_s)
         assert [losses.behind for losses in monitors] == [behind] * 3
+
+
+def test_values_that_were_never_queued_count_as_lost() -> None:
+    losses = LossMonitor()
+    losses.offer(100.0)
+    losses.skip(3)
+    losses.offer(100.0 + WINDOW_S)
+    assert losses.behind

@@ -103,6 +103,11 @@ def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypat
             wake_ups.resume(block, busy)
             while not heard:  # noqa: ASYNC110  another thread's doing
                 await asyncio.sleep(0)
+            wake_ups.rest(block, patient)  # busy has no time any more
+            heard.clear()
+            writer.publish(image(), cycle=101)
+            while not heard:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
         wake_ups.close()
 
     asyncio.run(test())
