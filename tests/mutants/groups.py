@@ -19,7 +19,13 @@ class Group:
 GROUPS: Final = {
     "segment": Group(
         ("shmio/segment/*.py", "shmio/segment/*.h", "shmio/segment/_atomics.c", "shmio/local/*.py"),
-        ("tests/unit/segment", "tests/unit/local", "tests/native"),
+        (
+            "tests/unit/connectors/models",
+            "tests/unit/connectors/test_*.py",
+            "tests/unit/local",
+            "tests/unit/segment",
+            "tests/native",
+        ),
     ),
     "s7": Group(
         ("shmio/connectors/s7/*.py",),

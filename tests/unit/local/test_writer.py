@@ -172,3 +172,10 @@ def test_guests_have_four_places_and_give_them_back(writer: BlockWriter, source:
 def test_who_only_reads_cannot_write(writer: BlockWriter, instance: str) -> None:
     with shmio.attach(instance) as cell, pytest.raises(CommandError, match="writable=True"):
         cell.write({"cell/count": 5})
+
+
+@pytest.mark.parametrize(("text", "complaint"), [("", "0"), ("ü" * 52, "104")])
+def test_a_note_has_a_length_within_the_limits(writer: BlockWriter, instance: str, text: str, complaint: str) -> None:
+    """It is refused before it is sent: this source would not answer."""
+    with shmio.attach(instance, writable=True) as cell, pytest.raises(ValueRangeError, match=rf"103 .*{complaint}"):
+        cell.note(text, "cell")

@@ -106,4 +106,4 @@ def test_kinds_have_the_numbers_of_the_documentation() -> None:
     page = (Path(__file__).parents[3] / "docs" / "reference" / "dump-format.md").read_text()
     found = re.search(r"\| kind \| (1 started.*) \|", page)
     assert found is not None
-    assert found[1] == ", ".join(f"{kind.value} {kind.name.lower()}" for kind in EventKind)
+    assert found[1] == ", ".join(f"{kind.value} {kind}" for kind in EventKind)
