@@ -174,8 +174,8 @@ def test_who_only_reads_cannot_write(writer: BlockWriter, instance: str) -> None
         cell.write({"cell/count": 5})
 
 
-@pytest.mark.parametrize(("text", "complaint"), [("", "0"), ("ü" * 52, "104")])
+@pytest.mark.parametrize(("text", "complaint"), [("", "0"), ("ü" * 129, "258")], ids=["empty", "long"])
 def test_a_note_has_a_length_within_the_limits(writer: BlockWriter, instance: str, text: str, complaint: str) -> None:
     """It is refused before it is sent: this source would not answer."""
-    with shmio.attach(instance, writable=True) as cell, pytest.raises(ValueRangeError, match=rf"103 .*{complaint}"):
+    with shmio.attach(instance, writable=True) as cell, pytest.raises(ValueRangeError, match=rf"256 .*{complaint}"):
         cell.note(text, "cell")
