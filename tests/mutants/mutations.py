@@ -165,7 +165,9 @@ def _of_statement(node: ast.stmt) -> Iterator[ast.stmt]:
             yield ast.Pass()
         case ast.Assign(targets=[ast.Attribute() | ast.Subscript()]):
             yield ast.Pass()
-        case ast.Return(value=ast.expr() as value) if not (isinstance(value, ast.Constant) and value.value is None):
+        case ast.Return(value=ast.expr() as value) if not (
+            isinstance(value, ast.Constant) and isinstance(value.value, bool | None)
+        ):
             yield ast.Return(ast.Constant(None))
         case ast.Break():
             yield ast.Continue()

@@ -63,7 +63,7 @@ class Record(NamedTuple):
 class Records:
     """Records of a file; ``closed`` and ``damage`` are valid after :meth:`walk`."""
 
-    def __init__(self, file: Path, *, own: bool = False, beat: Callable[[], object] = lambda: None) -> None:
+    def __init__(self, file: Path, *, own: bool, beat: Callable[[], object]) -> None:
         """Open a file.
 
         Args:
