@@ -149,6 +149,16 @@ def test_the_largest_file_is_attached_and_a_larger_one_is_not(
     assert [record.getMessage() for record in caplog.records] == [f"{file} is not attached: larger than 10 bytes"]
 
 
+def test_a_configuration_that_became_invalid_is_named_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file = tmp_path / "supervisor.toml"
+    file.write_text("[instance\n")
+    files = attached_files.ConfigFiles(file)
+    assert files("cell", 1) == files("cell", 1) == []
+    (line,) = caplog.messages
+    assert line.startswith("the layout's sources of cell are not attached: ")
+    assert str(file) in line
+
+
 def test_behind_many_entries_the_next_turn_comes_sooner(segment: Segment) -> None:
     tap = InstanceFollower(segment)
     tap.take()
