@@ -25,7 +25,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from shmio.config import Address, Mqtt, MqttTopic
 from shmio.endpoints.mqtt.bridge import Bridge
-from shmio.endpoints.mqtt.frame_reader import MAX_FRAMES_PER_TURN
+from shmio.endpoints.mqtt.feed import MAX_FRAMES_PER_TURN
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Segment
 from shmio.testing.mosquitto import Mosquitto, missing

@@ -217,17 +217,14 @@ class Attachment(TimeMethods):
         return self._views(block, block.cursor(), timeout_s)
 
     def _views(self, block: Block, cursor: Cursor[Frame], timeout_s: float | None) -> Iterator[View]:
-        missed = 0
         while True:
             frame = self._next(block, cursor, timeout_s)
             if frame is not None:
-                yield View(block, frame, cursor.missed - missed)
-                missed = cursor.missed
-            elif block.retired:
-                if not cursor.behind:
-                    block = self._successor(block)
-                    cursor, missed = block.cursor(after=0), 0
-            else:
+                yield View(block, frame, cursor.take_missed())
+            elif cursor.ended:
+                block = self._successor(block)
+                cursor = block.cursor(after=0)
+            elif not block.retired:
                 return
 
     def _successor(self, block: Block) -> Block:

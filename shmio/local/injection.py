@@ -73,7 +73,6 @@ class Shadow:
         self._source_writer = source_writer
         self._events = events
         self._gathered = CommandAssembler()
-        self._missed = 0
         self._image = bytearray(source_writer.block.layout.size)  # all writes diverted so far
         self._next_event = next_event
         self._keep = keep
@@ -122,10 +121,9 @@ class Shadow:
 
     def _diversion(self, diverted: CommandWrites) -> Diversion:
         apply(self._image, diverted.writes)
-        missed, self._missed = self._events.missed - self._missed, self._events.missed
         event = diverted.event
         written = values(self._source_writer.block.layout, bytes(self._image), diverted.writes)
-        return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, missed)
+        return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, self._events.take_missed())
 
     def lift(self) -> None:
         """Lift the shadow: consumers see what the source delivers.
@@ -172,7 +170,7 @@ def _written(
     block: Block, bits: bytes, events: Cursor[Event], next_event: Next, timeout_s: float | None
 ) -> Iterator[Diversion]:
     layout, gatherer = block.layout, CommandAssembler(EventKind.ACCEPTED)
-    last, missed = block.latest(), 0
+    last = block.latest()
     image = bytearray(layout.size if last is None else last.image)
     until_s = _deadline(timeout_s)
     while (event := next_event(events, _rest(until_s))) is not None:
@@ -184,8 +182,7 @@ def _written(
             if any(mask):
                 found = values(layout, bytes(image), merge(image, mask, [(0, layout.size)]))
                 told = accepted.event
-                yield Diversion(found, told.writer, told.command, told.clock_ns, told.utc_ns, events.missed - missed)
-                missed = events.missed
+                yield Diversion(found, told.writer, told.command, told.clock_ns, told.utc_ns, events.take_missed())
                 until_s = _deadline(timeout_s)
 
 

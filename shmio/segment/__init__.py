@@ -10,6 +10,7 @@ from shmio.segment.build import BlockSpec, Origin, segment_size
 from shmio.segment.commands import Command, CommandKind, Direction
 from shmio.segment.cursor import Cursor
 from shmio.segment.events import DONE, ENDS, NO_WRITER, Event, EventKind, EventRing, Record
+from shmio.segment.follower import FrameFollower, QualityChange
 from shmio.segment.frame import Frame
 from shmio.segment.header import State
 from shmio.segment.processes import Activity, Phase, ProcessSlot, ProcessSpec, Report, Supervised
@@ -33,12 +34,14 @@ __all__ = [
     "EventKind",
     "EventRing",
     "Frame",
+    "FrameFollower",
     "Origin",
     "Phase",
     "ProcessSlot",
     "ProcessSpec",
     "Provenance",
     "Quality",
+    "QualityChange",
     "Record",
     "Report",
     "Segment",

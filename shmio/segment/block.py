@@ -35,7 +35,8 @@ _QUALITIES = tuple(Quality)
 _PROVENANCES = tuple(Provenance)
 
 
-def _frame(fields: FrameTuple) -> Frame:
+def decode_frame(fields: FrameTuple) -> Frame:
+    """Make a frame of what the ring returns."""
     number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance = fields[:8]
     event, delay_us, reason, raw, effective = fields[8:]
     return Frame(
@@ -176,7 +177,7 @@ class Block:
         """
         fields = self.ring.latest()
         if fields is not None:
-            return _frame(fields)
+            return decode_frame(fields)
         if self.ring.head() == 0:
             return None
         raise SegmentError(
@@ -186,11 +187,11 @@ class Block:
     def read(self, number: int) -> Frame | None:
         """Return a copy of the frame with this number; None if the ring does not hold it."""
         fields = self.ring.read(number)
-        return None if fields is None else _frame(fields)
+        return None if fields is None else decode_frame(fields)
 
     def cursor(self, *, after: int | None = None) -> Cursor[Frame]:
         """Return a cursor that starts behind frame ``after`` (default: the newest one)."""
-        return Cursor(self.ring, _frame, self.ring.head() if after is None else after, self._retired)
+        return Cursor(self.ring, decode_frame, self.ring.head() if after is None else after, self._retired)
 
 
 class BlockWriter:

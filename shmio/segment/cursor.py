@@ -31,7 +31,8 @@ class Cursor(Generic[Entry]):
         self._retired = retired
         self._last = after
         self.missed = 0
-        """Total number of entries that were overwritten before this cursor read them."""
+        """Total number of entries that were overwritten or skipped before this cursor read them."""
+        self._reported = 0
 
     @property
     def last(self) -> int:
@@ -42,6 +43,20 @@ class Cursor(Generic[Entry]):
     def behind(self) -> int:
         """Number of entries that are not read yet."""
         return max(0, self._ring.head() - self._last)
+
+    @property
+    def ended(self) -> bool:
+        """Whether a reload has retired the block, and all its entries have been read."""
+        return self._retired() and not self.behind  # in this order: nothing is published after the end
+
+    def take_missed(self) -> int:
+        """Return how many entries were missed since the last call."""
+        missed, self._reported = self.missed - self._reported, self.missed
+        return missed
+
+    def resume(self, *, after: int) -> None:
+        """Continue with the entry behind this number; those in between do not count as missed."""
+        self._last = after
 
     def poll(self) -> Entry | None:
         """Return the next entry if there is one, without waiting."""

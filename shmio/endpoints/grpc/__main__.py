@@ -17,7 +17,7 @@ from shmio.endpoints.grpc.server import memory
 from shmio.endpoints.grpc.server.listeners import Listeners
 from shmio.endpoints.grpc.server.server import Server
 from shmio.endpoints.grpc.services.services import Services
-from shmio.endpoints.grpc.streams.feeds import Feeds
+from shmio.endpoints.grpc.streams.feed import Feeds
 from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.endpoints.grpc.time.virtual_time import VirtualTime
 from shmio.errors import SegmentError, ShmioError

@@ -152,11 +152,7 @@ class Bridge:
             key.data(events)
         self._turn_connections()
         self._follow_reloads()
-        held = [feed for feed in self._feeds.values() if feed.step_driven]
-        self.steps.poll(self._feeds.values())
-        self._behind.update(
-            feed for feed in held if not feed.step_driven
-        )  # what came since the last step was not looked at
+        self._behind.update(self.steps.poll(self._feeds.values()))
         for feed in list(self._behind):
             self._poll(feed)
         due_s = [TURN_S, *self._mark_due()]

@@ -12,7 +12,7 @@ from shmio.layout.model import Register
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.text import json_value, texts
 from shmio.local.reading import holds_none, reading
-from shmio.segment import Block, Frame, Quality
+from shmio.segment import Frame, FrameFollower, Quality
 
 ONLINE: Final = b"online"
 NUMBERS: Final = (int, float)
@@ -33,25 +33,6 @@ class Message(NamedTuple):
     source_ns: int = 0
 
 
-class SourceState(NamedTuple):
-    """A source's newest frame, if it has one, and its quality."""
-
-    frame: Frame | None
-    quality: Quality
-    reason: str
-
-
-class SourceFollower(Protocol):
-    """What a channel needs of the feed that follows its source."""
-
-    block: Block
-    state: SourceState
-
-    @property
-    def missed(self) -> int:
-        """Number of frames that were skipped."""
-
-
 class Channel(Protocol):
     """A topic that the bridge publishes."""
 
@@ -67,7 +48,7 @@ class Channel(Protocol):
 class RegisterChannel:
     """The topic of a register or an array's element, as text or JSON."""
 
-    def __init__(self, follower: SourceFollower, register: Register, topic: str, rule: MqttTopic) -> None:
+    def __init__(self, follower: FrameFollower, register: Register, topic: str, rule: MqttTopic) -> None:
         self.register = register
         self.registers = (register,)
         self.topic = topic
@@ -93,12 +74,12 @@ class RegisterChannel:
     def message(self, *, late: bool = False) -> Message:
         """Make the message; without a good value, text is empty, and JSON says why."""
         payload = self._json(late=late) if self.json else self._text()
-        frame = self._follower.state.frame
+        frame = self._follower.frame
         return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
 
     def _text(self) -> bytes:
-        frame, quality, _ = self._follower.state
-        if frame is None or quality is Quality.BAD:
+        frame = self._follower.frame
+        if frame is None or self._follower.quality is Quality.BAD:
             self._note(None)
             return b""
         value = self._decode(frame.image)
@@ -107,8 +88,9 @@ class RegisterChannel:
         return self._to_text(value).encode()
 
     def _json(self, *, late: bool) -> bytes:
-        frame, quality, reason = self._follower.state
-        found = reading(self._follower.block, self.register, frame)
+        follower = self._follower
+        frame, quality, reason = follower.frame, follower.quality, follower.reason
+        found = reading(follower.block, self.register, frame)
         if holds_none(found.value):
             quality, reason = Quality.BAD, reason or found.reason
         self._note(None if quality is Quality.BAD else found.value)
@@ -126,7 +108,7 @@ class FramesChannel:
 
     json = False
 
-    def __init__(self, follower: SourceFollower, topic: str, rule: MqttTopic) -> None:
+    def __init__(self, follower: FrameFollower, topic: str, rule: MqttTopic) -> None:
         self.topic = topic
         self.limited = rule.max_rate_hz is not None
         self._follower = follower
@@ -140,7 +122,7 @@ class FramesChannel:
 
     def message(self, *, late: bool = False) -> Message:
         """Make the message; empty while there is no good frame."""
-        frame, quality, _ = self._follower.state
+        frame, quality = self._follower.frame, self._follower.quality
         self.due_ns = self._follower.block.now_ns() + self._pause_ns
         payload = b"" if frame is None or quality is Quality.BAD else frame.image
         return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
@@ -149,14 +131,14 @@ class FramesChannel:
 class StatusChannel:
     """The topic of a source's status, as JSON."""
 
-    def __init__(self, follower: SourceFollower, topic: str) -> None:
+    def __init__(self, follower: FrameFollower, topic: str) -> None:
         self.topic = topic
         self._follower = follower
 
     def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is published again when the broker is back
         """Make the message from the current state."""
-        frame, quality, reason = self._follower.state
-        return status(self.topic, quality, reason, self._follower.missed, frame)
+        follower = self._follower
+        return status(self.topic, follower.quality, follower.reason, follower.missed, follower.frame)
 
 
 class BridgeStatusChannel:

@@ -59,13 +59,12 @@ class CommandClient:
 
     def poll(self) -> None:
         """Read new events, and end the commands whose outcome is known or overdue."""
-        retired, missed = self.block.retired, self._events.missed
         while (event := self._events.poll()) is not None:
             self._pending.hear(event)
-        if self._events.missed != missed:
+        if self._events.take_missed():
             self._pending.hurry()
         self._pending.expire()
-        if retired:
+        if self._events.ended:
             self._pending.end(REPLACED)
 
 

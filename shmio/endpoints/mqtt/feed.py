@@ -13,13 +13,10 @@ from shmio.endpoints.mqtt.channel import (
     FramesChannel,
     Message,
     RegisterChannel,
-    SourceFollower,
-    SourceState,
     StatusChannel,
     json_payload,
 )
 from shmio.endpoints.mqtt.command_client import CommandClient
-from shmio.endpoints.mqtt.frame_reader import FrameReader
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.topic_rules import TopicRules
 from shmio.errors import PathError
@@ -29,7 +26,7 @@ from shmio.layout.values.codec import codec
 from shmio.layout.values.text import json_value
 from shmio.layout.values.write import elements
 from shmio.local.reading import injected
-from shmio.segment import Block, Frame, Provenance, Quality
+from shmio.segment import Block, Frame, FrameFollower, Provenance, Quality, QualityChange
 from shmio.segment.changed_registers import ChangeScan
 
 Value = Callable[[bytes], Any]
@@ -42,7 +39,7 @@ class StructureChannel:
     json = True
 
     def __init__(
-        self, follower: SourceFollower, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic
+        self, follower: FrameFollower, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic
     ) -> None:
         """``path``: of the structure that contains the registers; empty: the whole source."""
         self.registers = registers
@@ -62,13 +59,14 @@ class StructureChannel:
 
     def message(self, *, late: bool = False) -> Message:
         """Make the message; while the quality is bad, with the last known values."""
-        block, (frame, quality, reason) = self._follower.block, self._follower.state
+        follower = self._follower
+        block, frame = follower.block, follower.frame
         self.due_ns = block.now_ns() + self._pause_ns
         value, provenance = None, Provenance.LIVE
         if frame is not None:
             provenance = Provenance.INJECTED if injected(block, self.registers, frame) else frame.provenance
             value = self._value(frame.image) if frame.source_ns else None
-        payload = json_payload(value, quality, reason, str(provenance), frame, late=late)
+        payload = json_payload(value, follower.quality, follower.reason, str(provenance), frame, late=late)
         return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
 
 
@@ -95,7 +93,15 @@ log = logging.getLogger("shmio.mqtt")
 
 ValueChannel = RegisterChannel | StructureChannel
 
-NO_DATA: Final = SourceState(None, Quality.BAD, "no data yet")
+MAX_FRAMES_PER_TURN: Final = 8
+"""Frames that are read before other work has its turn."""
+CATCH_UP_S: Final = 3.0
+"""A bridge that is further behind than this, or than half the ring, skips to the newest frame."""
+
+
+def follow(block: Block) -> FrameFollower:
+    """Follow a block from its newest frame on, and never fall far behind."""
+    return FrameFollower(block, catch_up_s=CATCH_UP_S)
 
 
 class Feed:
@@ -110,18 +116,18 @@ class Feed:
         For a large layout this takes seconds.
         """
         self.block = block
-        self.state = NO_DATA
+        self.follower = follow(block)
         self.step_driven = False
         """Whether only steps publish: the block is on the instance's clock, which is virtual."""
         self.command_client = CommandClient(block, writer)
         base = f"{prefix}/{block.source}"
-        self.status = StatusChannel(self, f"{base}/status")
+        self.status = StatusChannel(self.follower, f"{base}/status")
         chosen = list(_chosen(block.layout, rules, block.source))
         self._channel_of = [*self._channels_of(chosen, rules, base)]
         """The channel of each published register, in the layout's order."""
         self.channels = list(dict.fromkeys(self._channel_of))
         frames = rules.frames(block.source)
-        self.frames = FramesChannel(self, f"{base}/frames", frames) if frames else None
+        self.frames = FramesChannel(self.follower, f"{base}/frames", frames) if frames else None
         self.depths = _depths(block.layout)
         """The numbers of segments that this source's paths have."""
         self._json = [channel for channel in self.channels if channel.json]
@@ -133,7 +139,6 @@ class Feed:
         self._scan = ChangeScan([register for register, _ in chosen])
         self._outbox = outbox
         self._limited: dict[ValueChannel | FramesChannel, None] = {}
-        self._reader = FrameReader(block)
 
     def _channels_of(
         self, chosen: Sequence[tuple[Register, MqttTopic]], rules: TopicRules, base: str
@@ -147,58 +152,59 @@ class Feed:
         structures: dict[str, StructureChannel] = {}
         for (register, rule), path in zip(chosen, paths, strict=True):
             if path is None:
-                yield RegisterChannel(self, register, f"{base}/{register.path}/out", rule)
+                yield RegisterChannel(self.follower, register, f"{base}/{register.path}/out", rule)
                 continue
             if path not in structures:
                 topic = f"{base}/{path}/out" if path else f"{base}/out"
-                structures[path] = StructureChannel(self, path, parts[path], topic, rule)
+                structures[path] = StructureChannel(self.follower, path, parts[path], topic, rule)
             yield structures[path]
 
     @property
     def missed(self) -> int:
         """Number of frames that were skipped because the bridge was too slow."""
-        return self._reader.missed
+        return self.follower.missed
 
     @property
     def ended(self) -> bool:
         """Whether a reload has ended the block, and all its frames have been read."""
-        return self.block.retired and not self._reader.behind
+        return self.follower.ended
 
     def poll(self) -> bool:
         """Read a few new frames, and return whether more are waiting."""
         if self.step_driven:
             return False
-        missed = self._reader.missed
-        for frame in self._reader.read():
-            if self._reader.missed != missed:
-                missed = self._reader.missed
-                log.warning("source %s: the bridge was too slow: it has missed %d frames", self.block.source, missed)
+        for frame in self.follower.read(MAX_FRAMES_PER_TURN):
+            if self.follower.take_missed():
+                log.warning(
+                    "source %s: the bridge was too slow: it has missed %d frames", self.block.source, self.missed
+                )
                 self._outbox.mark(self.status)
             self.take(frame)
             if self._outbox.busy:
                 self._outbox.flush()  # publishes the changes of each frame as long as the broker keeps up
-        if self._reader.behind:
+        if self.follower.behind:
             return True
-        self._check_age()
+        if self.follower.became_stale():
+            self._mark_everything()
         return False
 
     def step(self) -> None:
         """Publish what the step being delivered has changed, if steps drive this block."""
-        if self.step_driven and (frame := self.block.latest()):
-            self._reader.resume_after(frame.number)
+        if self.step_driven and (frame := self.follower.newest()):
             self.take(frame)
 
     def take(self, frame: Frame) -> None:
-        """Make a frame the current state, and mark the topics that it changes."""
-        before = self.state
-        quality, reason = self.block.assess(frame)
-        self.state = SourceState(frame, quality, reason)
-        if not self._mark_quality(before):
-            if quality is Quality.BAD:
+        """Make a frame the current one, and mark the topics that it changes."""
+        old = self.follower.frame
+        change = self.follower.take(frame)
+        if old is None or change in (QualityChange.RECOVERED, QualityChange.BAD):
+            self._mark_everything()
+        else:
+            if change is QualityChange.DETAIL:
+                self._outbox.mark_all([self.status, *self._json])
+            if self.follower.quality is Quality.BAD:
                 return
-            old = before.frame
-            changed = self._scan.changed(old.image, frame.image) if old else range(len(self._channel_of))
-            channels = dict.fromkeys(self._channel_of[index] for index in changed)
+            channels = dict.fromkeys(self._channel_of[index] for index in self._scan.changed(old.image, frame.image))
             self._outbox.mark_all([one for one in channels if not one.limited or self._is_due(one, frame)])
             if self._json and (frame.effective is not None or self._injected):
                 self._mark_injected(frame)
@@ -219,27 +225,7 @@ class Feed:
         self._injected = frozenset() if frame.effective is None else self._covered
         self._outbox.mark_all(one for one in self._json if (one in before) != (one in self._injected))
 
-    def _check_age(self) -> None:
-        """Check whether the last frame has become stale."""
-        before = self.state
-        if before.frame is not None and before.quality is not Quality.BAD:
-            self.state = SourceState(before.frame, *self.block.assess(before.frame))
-            self._mark_quality(before)
-
-    def _mark_quality(self, before: SourceState) -> bool:
-        """Mark what a change of quality affects; return whether everything was marked."""
-        now = self.state
-        if (before.quality, before.reason) == (now.quality, now.reason) and before is not NO_DATA:
-            return False
-        self._outbox.mark(self.status)
-        if before is NO_DATA or (before.quality is Quality.BAD) != (now.quality is Quality.BAD):
-            self.mark_all()
-            return True
-        self._outbox.mark_all(self._json)
-        return False
-
-    def mark_all(self) -> None:
-        """Mark all topics."""
+    def _mark_everything(self) -> None:
         self._limited.clear()
         self._outbox.mark_all(self.all())
 
@@ -268,7 +254,7 @@ class Feed:
             When the next one elapses, in ns of the source's clock; None: none is waiting.
 
         """
-        now_ns, frame = self.block.now_ns(), self.state.frame
+        now_ns, frame = self.block.now_ns(), self.follower.frame
         for channel in [channel for channel in self._limited if channel.due_ns <= now_ns]:
             del self._limited[channel]
             if frame and channel.moved(frame.image):

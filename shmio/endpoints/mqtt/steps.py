@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Final
 
 import msgspec
@@ -30,24 +30,36 @@ class StepDelivery:
         self._clock, self._index, self._topic, self._connection, self._outbox = clock, index, topic, connection, outbox
         self._delivering: StepMarker | None = None
         self._until_s = 0.0
+        self._virtual = False  # whether time was virtual at the last poll
         self.done = clock.read().done
         """The last step that was delivered."""
         clock.deliver(index, self.done)  # from now on each step waits for it
 
-    def poll(self, feeds: Iterable[Feed]) -> None:
-        """Start to deliver a step that is done, or finish it; update which feeds steps drive."""
+    def poll(self, feeds: Collection[Feed]) -> Collection[Feed]:
+        """Start to deliver a step that is done, or finish it; update which feeds steps drive.
+
+        Returns:
+            The feeds that steps no longer drive: they may have frames that were not read.
+
+        """
         now = self._clock.read()
-        for feed in feeds:
-            feed.step_driven = now.virtual and feed.block.attributes.stepped and feed.state.frame is not None
-        if self._delivering is None:
-            if not now.virtual or now.done <= self.done:
-                return
+        released: Collection[Feed] = ()
+        if now.virtual:
+            for feed in feeds:
+                feed.step_driven = feed.block.attributes.stepped and feed.follower.frame is not None
+        elif self._virtual:
+            released = [feed for feed in feeds if feed.step_driven]
+            for feed in released:
+                feed.step_driven = False
+        self._virtual = now.virtual
+        if self._delivering is None and now.virtual and now.done > self.done:
             self._begin(now, feeds)
         if self._delivering is not None and self._over(self._delivering):
             self.done, self._delivering = self._delivering.number, None
             self._clock.deliver(self._index, self.done)
+        return released
 
-    def _begin(self, state: Clock, feeds: Iterable[Feed]) -> None:
+    def _begin(self, state: Clock, feeds: Collection[Feed]) -> None:
         for feed in feeds:
             feed.command_client.poll()
             feed.step()

@@ -12,10 +12,9 @@ from typing import Any, Final, Unpack
 import msgspec
 
 from shmio.config import Declaration
-from shmio.endpoints.grpc.commands.event_follower import EventFollower
 from shmio.endpoints.grpc.commands.followers import InjectionFollower, InjectionFollowers
 from shmio.endpoints.grpc.commands.write_subscriptions import WriteSubscriptions
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.streams.wakeups import BatchReader, WakeUps
 from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, Done, InFlightTable
 from shmio.errors import CommandError
 from shmio.layout.model import Register
@@ -28,6 +27,9 @@ from shmio.segment.pending_commands import End
 
 RETRY_S: Final = 0.25
 """Pause before a source that has not lifted an injection is asked again."""
+
+BATCH_EVENTS: Final = 32
+"""Events that are processed before the event loop serves the streams."""
 
 log = logging.getLogger("shmio.grpc")
 
@@ -60,25 +62,19 @@ class CommandClient:
         self._turn = asyncio.Lock()  # callers that wait for room are served in order
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._event_follower = EventFollower(
-            block,
-            wake_ups,
-            on_event=self._on_event,
-            on_batch_end=self._free,
-            missed=self._missed,
-            retired=self._retired,
-        )
+        self._events = block.events.cursor()
+        self._reader = BatchReader(block, wake_ups, self._read, patient=True)
 
     @property
     def alive(self) -> bool:
         """Whether the block's events are being followed, or the block has retired."""
-        return self._event_follower.alive or self.block.retired
+        return self._reader.alive or self.block.retired
 
     @property
     def over(self) -> bool:
         """Whether no events are followed, no command is in flight, and nobody listens to writes."""
         return not (
-            self._event_follower.alive
+            self._reader.alive
             or self._in_flight
             or self._turn.locked()
             or self.write_subscriptions.busy
@@ -87,17 +83,19 @@ class CommandClient:
 
     def start(self) -> None:
         """Start following the block's events."""
-        self._event_follower.start()
+        self._reader.start()
 
     def stop(self) -> None:
         """Stop following the block's events."""
-        self._event_follower.stop()
+        self._reader.stop()
         if self._timer is not None:
             self._timer.cancel()
 
     def catch_up(self) -> None:
         """Process all events so far, which also delivers the writes to subscribers."""
-        self._event_follower.catch_up()
+        newest = self.block.events.head()
+        while self._reader.alive and self._events.last < newest:
+            self._reader.read()
 
     def ready(self, values: Mapping[str, object]) -> bool:
         """Return whether :meth:`send` or :meth:`give` of these values would not have to wait."""
@@ -170,13 +168,15 @@ class CommandClient:
         return self._lay(self._source_writer.ask_to_declare(declaration, keep=keep), cost, follower, done)
 
     def _lay(self, ticket: PendingCommand, cost: CommandCost, follower: InjectionFollower, done: Done) -> int:
-        self._follow_up(ticket, cost, done)
+        self._in_flight.add(ticket, cost, done)
+        self._start_timer()
         self.followers.add(ticket.number, follower)
         return ticket.number
 
     def lift(self, injection: int, done: Done) -> None:
         """Ask the source to lift an injection, without waiting. CommandError: it was not sent."""
-        self._follow_up(self._source_writer.ask_to_lift(injection), CommandCost.of(()), done)
+        self._in_flight.add(self._source_writer.ask_to_lift(injection), CommandCost.of(()), done)
+        self._start_timer()
 
     async def _send(
         self,
@@ -198,20 +198,8 @@ class CommandClient:
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
                 )
-            self._follow_up(submit(), cost, done, accepted, until_accepted=until_accepted)
-
-    def _follow_up(
-        self,
-        ticket: PendingCommand,
-        cost: CommandCost,
-        done: Done,
-        accepted: Callable[[], None] | None = None,
-        *,
-        until_accepted: bool = False,
-    ) -> None:
-        self._in_flight.add(ticket, cost, done, accepted, until_accepted=until_accepted)
-        if self._timer is None:
-            self._set_timer()
+            self._in_flight.add(submit(), cost, done, accepted, until_accepted=until_accepted)
+            self._start_timer()
 
     async def _prepare(self) -> None:
         if not self._prepared:
@@ -229,6 +217,24 @@ class CommandClient:
         return self._silent or not pending or (fits and pending.open_events + cost.events <= MAX_OPEN)
 
     # ---- events of the source --------------------------------------------------------------------------------
+
+    def _read(self) -> bool:
+        events = self._events
+        for count in range(BATCH_EVENTS):
+            event = events.poll()
+            if missed := events.take_missed():
+                self._missed(missed)
+            if event is not None:
+                self._on_event(event)
+                continue
+            if count:
+                self._free()
+            if events.ended:
+                self._reader.stop()
+                self._retired()
+            return False
+        self._free()
+        return True
 
     def _on_event(self, event: Event) -> None:
         for channel, message in self.write_subscriptions.follow(event):
@@ -261,6 +267,10 @@ class CommandClient:
             self._freed.set_result(None)
 
     # ---- time-outs -----------------------------------------------------------------------------------------
+
+    def _start_timer(self) -> None:
+        if self._timer is None:
+            self._set_timer()
 
     def _set_timer(self) -> None:
         if self._timer is not None:

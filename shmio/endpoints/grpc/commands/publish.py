@@ -12,8 +12,7 @@ import grpc
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 
-from shmio.endpoints.grpc.commands.path_kind import Shape, shape
-from shmio.endpoints.grpc.commands.topics import Topics
+from shmio.endpoints.grpc.commands.topics import Shape, Topics, shape
 from shmio.endpoints.grpc.injection.injections import ShadowKind, Shadows
 from shmio.endpoints.grpc.server.rejected_calls import Refusals
 from shmio.endpoints.in_flight import Done, in_words

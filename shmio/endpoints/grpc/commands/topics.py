@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import Enum
-from typing import Final
+from typing import Final, NamedTuple
 
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.errors import PathError
@@ -75,3 +75,31 @@ class Topics:
     def register(self, topic: Topic) -> Register:
         """Return a topic's register. PathError: there is none; the message lists similar names."""
         return look_up(self.layout(topic), topic)
+
+
+class Shape(NamedTuple):
+    """The registers that a path names.
+
+    Attributes:
+        path: Canonical path in the block.
+        registers: One register or array element, or all registers below a structure.
+        whole: Whether the path names a register or an element, not a structure.
+
+    """
+
+    path: str
+    registers: tuple[Register, ...]
+    whole: bool
+
+    @property
+    def elements(self) -> int:
+        """Number of values in all registers: numbers, bits and texts."""
+        return sum(register.count for register in self.registers)
+
+
+def shape(layout: Layout, topic: Topic) -> Shape:
+    """Return what a topic names in a layout. PathError: nothing."""
+    below = layout.members(topic.path)
+    if below:
+        return Shape(topic.path, tuple(layout.registers[index] for index in below), whole=False)
+    return Shape(topic.path, (look_up(layout, topic),), whole=True)

@@ -9,12 +9,12 @@ from typing import NamedTuple, cast
 
 from shmio.endpoints.grpc.commands import command_client
 from shmio.endpoints.grpc.commands.followers import InjectionFollower
-from shmio.endpoints.grpc.commands.path_kind import Shape
+from shmio.endpoints.grpc.commands.topics import Shape
 from shmio.endpoints.grpc.commands.write_subscriptions import Listener
 from shmio.endpoints.grpc.injection.injection_base import InjectionBase
+from shmio.endpoints.grpc.streams.channel import Encode, SourceImage, Subject
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import EventLane, Finish, Outbox, StateLane
-from shmio.endpoints.grpc.streams.subject import Encode, SourceImage, Subject
 from shmio.endpoints.in_flight import Done
 from shmio.errors import CommandError, PathError
 from shmio.layout.topic import Topic, find

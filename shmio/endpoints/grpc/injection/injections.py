@@ -12,8 +12,7 @@ from enum import Enum
 from functools import partial
 from typing import Final, NamedTuple
 
-from shmio.endpoints.grpc.commands.path_kind import Shape
-from shmio.endpoints.grpc.commands.topics import TimeTopic, Topics
+from shmio.endpoints.grpc.commands.topics import Shape, TimeTopic, Topics
 from shmio.endpoints.grpc.injection.injection import Injection
 from shmio.endpoints.grpc.server.connections import Peer, connected, peer_of
 from shmio.errors import ConflictError, EndpointError, ValueRangeError

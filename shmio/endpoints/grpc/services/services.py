@@ -15,9 +15,8 @@ from shmio.endpoints.grpc.services.simlog_v2 import SimlogV2
 from shmio.endpoints.grpc.services.simserver import SimServer
 from shmio.endpoints.grpc.shmio_v1.service import ShmioV1
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.outboxes import Outboxes
+from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
 from shmio.endpoints.grpc.streams.wakeups import WakeUps
-from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.endpoints.grpc.time.virtual_time import VirtualTime
 from shmio.segment import ProcessSlot, Segment

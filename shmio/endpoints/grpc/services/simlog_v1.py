@@ -11,16 +11,14 @@ from typing import Any, Final
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.commands.path_kind import Shape, shape
 from shmio.endpoints.grpc.commands.publish import Publisher, Request
-from shmio.endpoints.grpc.commands.topics import TimeTopic, Topics
+from shmio.endpoints.grpc.commands.topics import Shape, TimeTopic, Topics, shape
 from shmio.endpoints.grpc.injection.injection import Injection
 from shmio.endpoints.grpc.injection.injections import ShadowKind, Shadows, shadow_path
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.services.simlog_v1_values import encoder, message_type, read, time_stamp
-from shmio.endpoints.grpc.streams.outbox import EventLane, Lane, Outbox, StateLane
-from shmio.endpoints.grpc.streams.outboxes import Outboxes
-from shmio.endpoints.grpc.streams.subject import Subject
+from shmio.endpoints.grpc.streams.channel import Subject
+from shmio.endpoints.grpc.streams.outbox import EventLane, Lane, Outbox, Outboxes, StateLane
 from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.endpoints.grpc.time.virtual_time import Moment
 from shmio.errors import PathError, ShmioError, ValueRangeError

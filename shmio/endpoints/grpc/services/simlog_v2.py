@@ -13,9 +13,8 @@ from typing import Any, Final
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.commands.path_kind import Shape, shape
 from shmio.endpoints.grpc.commands.publish import Publisher, Request
-from shmio.endpoints.grpc.commands.topics import TimeTopic, Topics
+from shmio.endpoints.grpc.commands.topics import Shape, TimeTopic, Topics, shape
 from shmio.endpoints.grpc.injection.injections import Shadow, ShadowKind, Shadows, shadow_paths
 from shmio.endpoints.grpc.server.access import holder_of
 from shmio.endpoints.grpc.server.time_slices import time_sliced
@@ -34,8 +33,7 @@ from shmio.endpoints.grpc.services.simlog_v2_values import (
     time_stamp,
     value_type,
 )
-from shmio.endpoints.grpc.streams.outbox import EventLane, Finish, Lane, Outbox, StateLane
-from shmio.endpoints.grpc.streams.outboxes import Outboxes
+from shmio.endpoints.grpc.streams.outbox import EventLane, Finish, Lane, Outbox, Outboxes, StateLane
 from shmio.endpoints.grpc.time.time_topics import TimeTopics
 from shmio.errors import ConflictError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten

@@ -10,8 +10,7 @@ import grpc
 from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.services.error_status import Context, refuse
-from shmio.endpoints.grpc.streams.outbox import StateLane
-from shmio.endpoints.grpc.streams.outboxes import Outboxes
+from shmio.endpoints.grpc.streams.outbox import Outboxes, StateLane
 from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.endpoints.grpc.time.virtual_time import TimeStatus
 from shmio.errors import ShmioError

@@ -15,9 +15,9 @@ from shmio.config.declaration import MAX_DECLARATIONS
 from shmio.endpoints.grpc.commands import command_client
 from shmio.endpoints.grpc.commands.command_client import CommandClient
 from shmio.endpoints.grpc.commands.followers import InjectionFollower
-from shmio.endpoints.grpc.shmio_v1.send_queue import SendQueue
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.outbox import SendQueue
 from shmio.errors import CommandError, ValueRangeError
 from shmio.injection import Program
 from shmio.layout.topic import names_part

@@ -13,17 +13,16 @@ from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1 import describe
 from shmio.endpoints.grpc.shmio_v1.clock import TimeCalls
 from shmio.endpoints.grpc.shmio_v1.commands import CommandCalls
-from shmio.endpoints.grpc.shmio_v1.follow import aged
 from shmio.endpoints.grpc.shmio_v1.replay import ReplayCalls
 from shmio.endpoints.grpc.shmio_v1.selection import Selections
 from shmio.endpoints.grpc.shmio_v1.simulate import SimulateCalls
 from shmio.endpoints.grpc.shmio_v1.subscribe import SubscribeCall
-from shmio.endpoints.grpc.shmio_v1.views import AGE_NS, ORIGINALS, Selection, View
+from shmio.endpoints.grpc.shmio_v1.views import AGE_NS, ORIGINALS, Selection, View, stale_fields
 from shmio.endpoints.grpc.streams.encoding import field, number
 from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.outbox import OpenStreams
 from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.endpoints.grpc.time.delivery import PATIENCE_S
-from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.errors import EndpointError, ShmioError
 from shmio.local.time_control import Step
@@ -174,7 +173,10 @@ def _reading(view: View, *, originals: bool) -> bytes:
     frame = view.block.latest()
     if frame is None:
         return wire.Update(table=view.number, reason="no data yet", whole=True).SerializeToString()
-    update = b"".join(view.update(frame)) + aged(view.block, frame)
+    update = b"".join(view.update(frame))
+    quality, reason = view.block.assess(frame)
+    if quality is not frame.quality:
+        update += stale_fields(reason)
     if originals and isinstance(view, Selection) and frame.effective is not None and frame.source_ns:
         update += field(ORIGINALS, view.originals(frame))
     return update + number(AGE_NS, max(0, frame.age_ns(view.block.now_ns())))

@@ -5,19 +5,29 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncIterator, Callable, Collection
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
-from shmio.endpoints.grpc.shmio_v1.follow import BlockFollower, EveryFrame, LatestFrame
+from shmio.endpoints.grpc.commands.command_client import CommandClient
+from shmio.endpoints.grpc.shmio_v1.columns import DecodedImage
 from shmio.endpoints.grpc.shmio_v1.selection import Selections, SourceDirection
-from shmio.endpoints.grpc.shmio_v1.views import Selection, View
-from shmio.endpoints.grpc.shmio_v1.write_updates import WriteFollower
-from shmio.endpoints.grpc.streams.encoding import field
+from shmio.endpoints.grpc.shmio_v1.views import (
+    MISSED,
+    Selection,
+    UpdateMessage,
+    View,
+    WriteUpdates,
+    head,
+    stale_fields,
+)
+from shmio.endpoints.grpc.streams.encoding import field, number
+from shmio.endpoints.grpc.streams.outbox import SendQueue
 from shmio.endpoints.grpc.streams.wakeups import Callback, WakeUps
 from shmio.endpoints.grpc.time.virtual_time import VirtualTime
-from shmio.errors import EndpointError, PathError, ValueRangeError
+from shmio.errors import EndpointError, PathError, SegmentError, ValueRangeError
 from shmio.local.time_control import Step
+from shmio.segment import Event, Frame, FrameFollower
 from shmio.wire import shmio_v1_pb2 as wire
 
 BATCH_BYTES: Final = 1 << 18
@@ -49,6 +59,140 @@ def check(request: wire.SubscribeRequest) -> None:
         raise ValueRangeError("deadband is for the format VALUES")
 
 
+class BlockUpdates(Protocol):
+    """Makes the updates of one block for one subscriber; the ring in shared memory is the queue."""
+
+    view: View
+    follower: FrameFollower
+    due_s: float
+    """Event loop's time of the next possible update; infinity: it takes a new frame."""
+
+    def next(self, now_s: float) -> bytes | None:
+        """Return the next serialised ``Update``, or None."""
+
+
+class EveryFrame:
+    """Makes an update of every frame from the present one on, and counts those overwritten."""
+
+    due_s = math.inf
+
+    def __init__(self, view: View) -> None:
+        self.view = view
+        self.follower = FrameFollower(view.block)
+
+    def next(self, now_s: float) -> bytes | None:  # noqa: ARG002  as fast as the client takes them
+        """Return the next frame's update, or one that says that the last frame is stale."""
+        follower = self.follower
+        frame = follower.poll()
+        if frame is None:
+            return _stale_update(self.view, follower)
+        update = b"".join(self.view.update(frame, follower.frame))
+        if missed := follower.take_missed():
+            update += number(MISSED, missed)
+        follower.take(frame, aged=not follower.behind)
+        return update + stale_fields(follower.reason) if follower.stale else update
+
+
+class LatestFrame:
+    """Makes updates of the newest frame that differs, at most once per interval."""
+
+    def __init__(self, view: View, interval_s: float, deadband: float) -> None:
+        self.view = view
+        self.follower = FrameFollower(view.block)
+        self.due_s = math.inf
+        self._interval_s = interval_s
+        self._deadband = deadband
+        self._last_s = -math.inf
+        self._sent: DecodedImage | None = None  # with a dead-band
+
+    def next(self, now_s: float) -> bytes | None:
+        """Return the newest frame's changes, or an update that reports the last one as stale."""
+        follower = self.follower
+        shown = follower.frame
+        if shown is not None and not follower.behind:
+            return _stale_update(self.view, follower)
+        if now_s < self._last_s + self._interval_s:
+            self.due_s = self._last_s + self._interval_s
+            return None
+        self.due_s = math.inf
+        try:
+            frame = follower.newest()
+        except SegmentError:  # overwritten during each read; there will be another
+            return None
+        if frame is None:
+            return None
+        update = self._update(frame, shown)
+        was_stale = follower.stale
+        follower.take(frame)
+        stale = stale_fields(follower.reason) if follower.stale else b""
+        if shown is not None and not (update.body or stale or was_stale or _state(frame) != _state(shown)):
+            return None
+        self._last_s = now_s
+        return b"".join(update) + stale
+
+    def _update(self, frame: Frame, shown: Frame | None) -> UpdateMessage:
+        if not (self._deadband and isinstance(self.view, Selection)):
+            return self.view.update(frame, shown)
+        if shown is None or self._sent is None or not shown.source_ns:
+            self._sent = self.view.decode(frame)
+            return self.view.update(frame)
+        update, self._sent = self.view.update_beyond(frame, shown, self._sent, self._deadband)
+        return update
+
+
+def _stale_update(view: View, follower: FrameFollower) -> bytes | None:
+    """Return an update if the last frame has become stale since, or None."""
+    frame = follower.frame
+    if frame is None or not follower.became_stale():
+        return None
+    return head(view.number, frame) + stale_fields(follower.reason)
+
+
+def _state(frame: Frame) -> tuple[object, ...]:
+    return frame.quality, frame.reason, frame.provenance, frame.incarnation
+
+
+class WriteFollower:
+    """Follows the writes to a table for one subscriber, in a queue from which none is dropped."""
+
+    def __init__(self, writes: WriteUpdates, commands: CommandClient, ring: Callable[[], None]) -> None:
+        """``ring`` is called when there is an update."""
+        self.failure = ""
+        """Why writes are missing; empty: none are."""
+        self._writes = writes
+        self._commands = commands
+        self._ring = ring
+        self._waiting = SendQueue()
+        commands.followers.listen(self)
+
+    def leave(self) -> None:
+        """Stop following writes."""
+        self._commands.followers.leave(self)
+
+    @property
+    def waits(self) -> bool:
+        """Whether an update waits."""
+        return bool(self._waiting)
+
+    def next(self) -> bytes | None:
+        """Return the next serialised ``Update``, or None."""
+        return self._waiting.pop() if self._waiting else None
+
+    def accept(self, event: Event) -> None:
+        """Queue a part of a command that the source has accepted."""
+        if not self.failure and (update := self._writes.of(event)):
+            if reason := self._waiting.add(update):
+                self.fail(reason)
+            self._ring()
+
+    def fail(self, reason: str) -> None:
+        """Fail because writes are missing; discard what waits, and stop following."""
+        self.failure = self.failure or reason
+        self._waiting = SendQueue()
+        self.leave()
+        self._ring()
+
+
 class SubscribeCall:
     """A Subscribe call: follows its blocks and collects their updates."""
 
@@ -69,7 +213,7 @@ class SubscribeCall:
         self._wanted = selections.resolve(request.patterns, inward=True)
         if request.format == wire.FORMAT_FRAMES and any(place.inward for place in self._wanted):
             raise ValueRangeError("what is written has no raw frames: leave out /in, or ask for the format VALUES")
-        self._followers: dict[SourceDirection, BlockFollower] = {}
+        self._blocks: dict[SourceDirection, BlockUpdates] = {}
         self._inward: dict[SourceDirection, WriteFollower] = {}
         self._rings: dict[SourceDirection, Callback] = {}  # the callbacks of their wake-ups
         self._moved: dict[SourceDirection, None] = {}
@@ -163,7 +307,7 @@ class SubscribeCall:
                 self.updates += 1
                 size += len(written)
                 parts.append(field(UPDATES, written))
-        waiting = deque(follower for follower in self._followers.values() if self._open(follower))
+        waiting = deque(one for one in self._blocks.values() if self._open(one))
         waiting.rotate(self._turn)
         self._turn += 1  # else a block with long updates would starve the others
         most = len(parts) + BATCH_UPDATES
@@ -178,21 +322,21 @@ class SubscribeCall:
             parts.append(field(UPDATES, update))
         return b"".join(parts), not (waiting or any(inward.waits for inward in self._inward.values()))
 
-    def _open(self, follower: BlockFollower) -> bool:
+    def _open(self, updates: BlockUpdates) -> bool:
         """Return whether a block's updates may be sent now.
 
         In virtual time those of a block on the instance's clock wait for the end of a step.
         """
-        held = self._virtual_time.on and follower.view.block.attributes.stepped
-        return not held or bool(self._step_marks) or not follower.begun
+        held = self._virtual_time.on and updates.view.block.attributes.stepped
+        return not held or bool(self._step_marks) or updates.follower.frame is None
 
-    def _ring(self, follower: BlockFollower) -> None:
-        """Wake the stream, because the follower's block has something new."""
-        if self._open(follower):
+    def _ring(self, updates: BlockUpdates) -> None:
+        """Wake the stream, because a block has something new."""
+        if self._open(updates):
             self._wake.set()
 
     async def _wait(self) -> None:
-        due_s = min((follower.due_s for follower in self._followers.values()), default=math.inf)
+        due_s = min((updates.due_s for updates in self._blocks.values()), default=math.inf)
         if math.isinf(due_s):
             await self._wake.wait()
             return
@@ -221,19 +365,19 @@ class SubscribeCall:
             self._inward[place] = WriteFollower(view.writes, self._selections.commands(place.source), self._wake.set)
             return field(TABLES, view.table)
         if request.mode == wire.MODE_EVERY_FRAME:
-            follower: BlockFollower = EveryFrame(view)
+            updates: BlockUpdates = EveryFrame(view)
         else:
-            follower = LatestFrame(view, 1 / request.max_rate_hz if request.max_rate_hz else 0.0, request.deadband)
-        self._followers[place] = follower
-        ring = self._rings[place] = partial(self._ring, follower)
+            updates = LatestFrame(view, 1 / request.max_rate_hz if request.max_rate_hz else 0.0, request.deadband)
+        self._blocks[place] = updates
+        ring = self._rings[place] = partial(self._ring, updates)
         self._wake_ups.join(view.block, ring)
         return field(TABLES, view.table)
 
     def _leave(self, place: SourceDirection) -> None:
         if inward := self._inward.pop(place, None):
             inward.leave()
-        if follower := self._followers.pop(place, None):
-            self._wake_ups.leave(follower.view.block, self._rings.pop(place))
+        if updates := self._blocks.pop(place, None):
+            self._wake_ups.leave(updates.view.block, self._rings.pop(place))
 
 
 def _set(sent: asyncio.Future[None]) -> None:

@@ -1,4 +1,4 @@
-"""Views of a block: a table of registers, or raw frames, with the updates made of frames."""
+"""Views of a block: a table of registers, or raw frames, with the updates made of frames and writes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from shmio.endpoints.grpc.shmio_v1.columns import Columns, DecodedImage, column_of, merge, pack
-from shmio.endpoints.grpc.shmio_v1.write_updates import WriteUpdates
-from shmio.endpoints.grpc.streams.encoding import field
+from shmio.endpoints.grpc.commands.write_subscriptions import PendingImage, ones
+from shmio.endpoints.grpc.shmio_v1.columns import Columns, DecodedImage, column_of, merge, pack, pack_slots
+from shmio.endpoints.grpc.streams.encoding import field, number
 from shmio.layout.model import Register
+from shmio.layout.values.write import covering
 from shmio.model.values import Column
-from shmio.segment import Block, Frame
+from shmio.segment import Block, Event, Frame
+from shmio.segment.events import EVENT_DATA_SIZE
+from shmio.segment.pending_commands import NO_COMMAND, apply
 from shmio.wire import shmio_v1_pb2 as wire
 
 VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, AGE_NS = (
@@ -24,6 +27,7 @@ VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, 
     )
 )  # fmt: skip
 
+_QUALITY_BAD: Final = number(QUALITY, 0)  # as the last field it wins over the frame's own quality
 _CACHED: Final = 8
 _NO_PLACES: Final = np.zeros(0, "<u4")
 
@@ -35,6 +39,50 @@ class UpdateMessage(NamedTuple):
 
     head: bytes
     body: bytes
+
+
+class WriteUpdates:
+    """Encodes writes to a table's registers, once for all subscribers. For the loop's thread."""
+
+    def __init__(self, number: int, block: Block, registers: Sequence[Register], columns: Columns) -> None:
+        """``number`` is that of the table."""
+        self._number = number
+        self._block = block
+        self._columns = columns
+        self._cover = np.frombuffer(covering(registers, block.layout.size), np.uint8)
+        self._pending_image = PendingImage(block)
+        self._command = NO_COMMAND
+        self._event = 0
+        self._update = b""
+
+    def of(self, event: Event) -> bytes:
+        """Return the serialised ``Update`` of an accepted write; empty: it is not in the table.
+
+        If an element is written in part, the rest is taken from the frame before the command. An
+        element that the command's next event completes is left to that event.
+        """
+        if event.number != self._event:
+            self._event, self._update = event.number, self._make(event)
+        return self._update
+
+    def _make(self, event: Event) -> bytes:
+        if event.command_key != self._command:
+            self._command = event.command_key
+            self._pending_image.begin(event.frame)
+        self._pending_image.put(event)
+        image, mask = self._pending_image.image, self._pending_image.mask
+        part = bytearray(len(mask))
+        apply(part, (ones(event),))
+        if not (np.frombuffer(part, np.uint8) & self._cover).any():
+            return b""
+        slots = self._columns.touched(bytes(part))
+        if len(event.data) == EVENT_DATA_SIZE:
+            left = self._columns.touched(bytes(bits ^ 0xFF for bits in mask))
+            whole = {column: np.setdiff1d(found, left[column]) for column, found in slots.items() if column in left}
+            slots = {column: found for column, found in (slots | whole).items() if len(found)}
+        if not slots:
+            return b""
+        return head_of(self._number, event) + field(VALUES, pack_slots(self._columns.decode(bytes(image)), slots))
 
 
 class Selection:
@@ -207,6 +255,24 @@ def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
         provenance=int(frame.provenance),  # type: ignore[arg-type]
         whole=whole,
     ).SerializeToString()
+
+
+def head_of(table: int, event: Event) -> bytes:
+    """Return a serialised ``Update`` for an event, without values."""
+    return wire.Update(
+        table=table,
+        frame=event.frame,
+        cycle=event.cycle,
+        incarnation=event.incarnation,
+        clock_ns=event.clock_ns,
+        source_ns=event.utc_ns,
+        quality=wire.QUALITY_GOOD,
+    ).SerializeToString()
+
+
+def stale_fields(reason: str) -> bytes:
+    """Return the addition to a frame's update that reports the frame as stale."""
+    return _QUALITY_BAD + field(REASON, reason.encode())
 
 
 def describe(register: Register, found: wire.Register, column: Column | None = None, slot: int = 0) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sized
 from typing import Final
 
 from shmio.endpoints.grpc.streams.channel import Stream
-from shmio.segment import Block, Cursor, Frame
+from shmio.segment import Block, FrameFollower
 
 WINDOW_S: Final = 0.25
 """Length of the window in which a client's losses are compared with its values."""
@@ -156,20 +156,20 @@ class BackPressure:
                 stream.refills[self._refill] = None
         return time.monotonic() <= self._until_s
 
-    def look(self, cursor: Cursor[Frame]) -> Cursor[Frame]:
-        """Return the cursor to continue with: after the frames that are too many or too old."""
+    def skip(self, follower: FrameFollower) -> None:
+        """Skip the frames that are too many, or too old for the streams."""
         passing, self._passing = self._passing, False
         self._until_s = time.monotonic() + LOOK_S
         behind = passing and all(stream.behind for stream in self._streams)
         head = self._block.ring.head()
-        if head - cursor.last <= (CATCH_UP_FRAMES if self._streams and not behind else 1):
-            return cursor
+        if head - follower.last <= (CATCH_UP_FRAMES if self._streams and not behind else 1):
+            return
         first = head
         if behind:
-            several = max(cursor.last + 1, head - FEW_FRAMES + 1)
+            several = max(follower.last + 1, head - FEW_FRAMES + 1)
             frame = self._block.read(several)
             if frame is not None and self._block.now_ns() - frame.publish_ns < 1e9 * LATE_S:
                 first = several
         for stream, topics in self._streams.items():
-            stream.skip(first - cursor.last - 1, topics)
-        return self._block.cursor(after=first - 1)
+            stream.skip(first - follower.last - 1, topics)
+        follower.resume(after=first - 1)

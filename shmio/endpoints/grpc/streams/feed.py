@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-from collections.abc import Callable, Iterable, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 
 from shmio.endpoints.grpc.commands.command_client import CommandClient
 from shmio.endpoints.grpc.streams.back_pressure import BackPressure
-from shmio.endpoints.grpc.streams.channel import Channel, ChannelTable, Listener
-from shmio.endpoints.grpc.streams.subject import Subject
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.streams.channel import Channel, ChannelTable, Listener, Subject
+from shmio.endpoints.grpc.streams.wakeups import BatchReader, WakeUps
 from shmio.endpoints.grpc.time.virtual_time import DeliveredImage, Moment, VirtualTime
-from shmio.segment import Block, Event, Frame, Quality
-
-log = logging.getLogger("shmio.grpc")
+from shmio.segment import Block, Event, Frame, FrameFollower, Quality, QualityChange, Segment
 
 TURN_FRAMES = 8
 """Frames that are delivered before the event loop serves the streams."""
@@ -46,7 +42,6 @@ class Feed:
         self._shown: Frame | DeliveredImage | None = None  # delivered last; None: quality is bad
         self._good = False  # as last reported
         self._loop = asyncio.get_running_loop()
-        self._wake_ups = wake_ups
         self._on_quality = on_quality
         self._channels: dict[Subject, Channel] = {}
         self._back_pressure = BackPressure(block, self._refill)
@@ -55,33 +50,30 @@ class Feed:
         self._outdated = False
         self._owed: dict[Listener, Channel] = {}  # listeners that wait for a good value
         _ = block.layout.members("")  # builds the index of paths before the first client needs it
-        self._cursor = block.cursor()
-        self._following = False
-        self._again = False  # whether another look is scheduled
+        self._follower = FrameFollower(block, notice_gaps=True)
+        self._reader = BatchReader(block, wake_ups, self._read, passes=self._passes)
 
     @property
     def alive(self) -> bool:
         """Whether the block and its events are being followed, or the block has retired."""
-        return (self._following or self.block.retired) and self.commands.alive
+        return (self._reader.alive or self.block.retired) and self.commands.alive
 
     @property
     def over(self) -> bool:
         """Whether the feed has ended, has no listeners left, and no commands in flight."""
-        return not (self._following or self._channels) and self.commands.over
+        return not (self._reader.alive or self._channels) and self.commands.over
 
     def start(self) -> None:
         """Start following the block."""
-        newest = self.block.latest()
         if self._held:
-            self._adopt(newest)
-        self._cursor = self.block.cursor(after=newest.number - 1 if newest else 0)
-        self._following = True
+            self._adopt(self.block.latest())
+        self._follower.restart()
         self.commands.start()  # first: a write is delivered before the frame after it
-        self._wake_ups.join(self.block, self._look)
+        self._reader.start()
 
     def stop(self) -> None:
         """Stop following the block."""
-        self._end()
+        self._reader.stop()
         self.commands.stop()
 
     def listen(self, subject: Subject, listener: Listener) -> None:
@@ -125,9 +117,8 @@ class Feed:
         if not self._held:
             return
         self._held = self._stepped = False
-        newest = self.block.latest()
-        self._cursor = self.block.cursor(after=newest.number - 1 if newest else 0)
-        self._look()
+        self._follower.restart()
+        self._reader.look()
         self._settle()
 
     def step(self) -> None:
@@ -184,11 +175,13 @@ class Feed:
 
     def _turn_bad(self, frame: int) -> None:
         """Drop the values of listeners from before ``frame``: quality is bad from it on."""
+        self._shown = None
         for channel in self._channels.values():
             for listener in channel.listeners:
                 if listener.since < frame:
                     listener.lose()
                     listener.since = 0  # it may have dropped this value
+        self._tell(good=False)
 
     def _rebuild(self) -> None:
         self._table = ChannelTable.of(self._channels.values(), len(self._channels) + len(self._free))
@@ -196,81 +189,49 @@ class Feed:
 
     # ---- what the source publishes -----------------------------------------------------------------------------
 
-    def _end(self) -> None:
-        if self._following:
-            self._following = False
-            self._wake_ups.leave(self.block, self._look)
-
-    def _look(self) -> None:
-        """Read new frames, a few at a time; without new frames check the age of the last one."""
-        if not self._following:
-            return  # stopped during the wake-up
-        if not self._held and self._back_pressure.passes():
-            self._wake_ups.rest(self.block, self._look)
-        else:
-            self._read()
-
-    def _read(self) -> None:
-        try:
-            self._follow()
-        except Exception:
-            log.exception("the feed of %s failed", self.block.source)
-            self._end()
-
-    def _look_again(self) -> None:
-        self._again = False
-        self._look()
+    def _passes(self) -> bool:
+        return not self._held and self._back_pressure.passes()
 
     def _refill(self) -> None:
         """Read on, because a busy stream can take more again."""
-        if self._following:
-            self._read()
+        if self._reader.alive:
+            self._reader.read()
             if not self._back_pressure.passes():
-                self._wake_ups.resume(self.block, self._look)
+                self._reader.resume()
 
-    def _follow(self) -> None:
-        block = self.block
+    def _read(self) -> bool:
+        """Read a few new frames; without new frames check the age of the last one."""
+        follower = self._follower
         if not self._held:  # a held feed delivers nothing from here
-            self._cursor = self._back_pressure.look(self._cursor)
-        retired = block.retired  # before reading: the frames before the end are still delivered
+            self._back_pressure.skip(follower)
         take = self._regard if self._held else self._take
         for count in range(TURN_FRAMES):
-            frame = self._cursor.poll()
+            frame = follower.poll()
             if frame is not None:
                 take(frame)
                 continue
-            if not count:
-                take(None)
-            if retired:
-                self._end()
-            return
-        if not self._again:
-            self._again = True
-            self._loop.call_soon(self._look_again)
+            if not (count or self._held) and follower.became_stale():
+                self._turn_bad(follower.last + 1)
+            if follower.ended:
+                self._reader.stop()
+            return False
+        return True
 
-    def _take(self, frame: Frame | None) -> None:
-        """Deliver a good frame; turn bad if it is not good, or none came for too long."""
-        block, shown = self.block, self._shown
-        good = frame is not None and block.assess(frame)[0] is not Quality.BAD
-        # Age at the next frame's time, if there is one: the last may have been stale unnoticed.
-        until_ns = frame.publish_ns if frame else block.now_ns()
-        known = shown is None or frame is None or frame.number == shown.number + 1  # unknown if frames were skipped
-        stale = known and isinstance(shown, Frame) and shown.age_ns(until_ns) > block.stale_ns
-        if shown is not None and (stale or (frame is not None and not good)):
-            since = shown.number + 1 if frame is None else frame.number
-            shown = self._shown = None
-            self._turn_bad(since)
-            self._tell(good=False)
-        if frame is not None and good:
+    def _take(self, frame: Frame) -> None:
+        """Deliver a good frame; turn bad if it is not good, or the one before was stale."""
+        change = self._follower.take(frame)
+        bad = self._follower.quality is Quality.BAD
+        if self._shown is not None and (bad or change is QualityChange.GAP):
+            self._turn_bad(frame.number)
+        if not bad:
             self._tell(good=True)
-            self._show(shown, frame)
+            self._show(self._shown, frame)
             self._shown = frame
 
-    def _regard(self, frame: Frame | None) -> None:
+    def _regard(self, frame: Frame) -> None:
         """Report quality at once, even though values wait for a step."""
-        if frame is not None:
-            self._tell(good=frame.quality is not Quality.BAD)
-            self._adopt(frame)
+        self._tell(good=frame.quality is not Quality.BAD)
+        self._adopt(frame)
 
     def _tell(self, *, good: bool) -> None:
         if good != self._good:
@@ -310,3 +271,105 @@ class Feed:
     def _stamp(self, event: Event) -> tuple[int, int]:
         """Return an event's number and time: of the frame, in virtual time of the step, before."""
         return self._virtual_time.moment if self._held else Moment(event.frame, event.clock_ns)
+
+
+class Feeds(Mapping[str, Feed]):
+    """The feeds of a segment's blocks, by source name; for the event loop's thread."""
+
+    def __init__(
+        self,
+        segment: Segment,
+        writer: int,
+        wake_ups: WakeUps,
+        on_quality: Callable[[str, bool], None],
+        virtual_time: VirtualTime | None = None,
+    ) -> None:
+        """Start without feeds; see :meth:`start`.
+
+        Args:
+            segment: The instance's shared memory.
+            writer: The command queue of this process.
+            wake_ups: Wakes the feeds when their blocks have something new.
+            on_quality: Called with a source's name, and whether its quality is good.
+            virtual_time: See :class:`Feed`.
+
+        """
+        self._segment = segment
+        self._generation = -1  # of the segment when it was last read
+        self._writer = writer
+        self._wake_ups = wake_ups
+        self._on_quality = on_quality
+        self._virtual_time = virtual_time
+        self._feeds: dict[str, Feed] = {}
+        self._ended: list[Feed] = []
+        self._ended_messages = 0
+
+    def __getitem__(self, source: str) -> Feed:
+        return self._feeds[source]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._feeds)
+
+    def __len__(self) -> int:
+        return len(self._feeds)
+
+    @property
+    def messages(self) -> int:
+        """Number of messages encoded since the start."""
+        return self._ended_messages + sum(feed.messages for feed in (*self._feeds.values(), *self._ended))
+
+    @property
+    def alive(self) -> bool:
+        """Whether every block is being followed."""
+        return all(feed.alive for feed in self._feeds.values())
+
+    def start(self) -> None:
+        """Start a feed for each block that has none."""
+        for source, block in self._segment.blocks.items():
+            if source not in self._feeds:
+                feed = self._feeds[source] = Feed(
+                    block, self._writer, self._wake_ups, self._on_quality, self._virtual_time
+                )
+                self._on_quality(source, False)
+                feed.start()
+
+    async def follow(self) -> list[str]:
+        """Adopt what a reload has changed.
+
+        Returns:
+            The sources that were added or removed, or have a new feed.
+
+        Raises:
+            FormatError: The segment is damaged.
+
+        """
+        self._prune()
+        if self._segment.generation == self._generation:
+            return []
+        await asyncio.to_thread(self._read)
+        before = dict(self._feeds)
+        over = [name for name, feed in self._feeds.items() if self._segment.blocks.get(name) is not feed.block]
+        for name in over:
+            feed = self._feeds.pop(name)
+            self._ended.append(feed)  # it ends by itself after its last frame
+            self._on_quality(name, False)
+        self.start()
+        return [name for name in before | self._feeds if before.get(name) is not self._feeds.get(name)]
+
+    def _read(self) -> None:
+        """Read the segment's blocks. Runs in a thread, because a large layout takes a second."""
+        self._generation = self._segment.generation  # first: a change during the read is noticed next time
+        self._segment.refresh()
+        for block in self._segment.blocks.values():
+            block.layout.members(""), block.layout.by_path
+
+    def _prune(self) -> None:
+        """Forget the feeds that are over, and release what they hold of the segment."""
+        over = [feed for feed in self._ended if feed.over]
+        self._ended_messages += sum(feed.messages for feed in over)
+        self._ended = [feed for feed in self._ended if feed not in over]
+
+    def stop(self) -> None:
+        """Stop all feeds."""
+        for feed in (*self._feeds.values(), *self._ended):
+            feed.stop()

@@ -1,17 +1,18 @@
-"""Queues of one client's stream: states may be conflated, events may not."""
+"""Queues of clients' streams: states may be conflated, events may not."""
 
 from __future__ import annotations
 
 import asyncio
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Iterator, Sized
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
 
 from shmio.endpoints.grpc.streams.back_pressure import LATE_S, Backlog, LossMonitor, TotalBacklog
+from shmio.endpoints.grpc.streams.channel import Subject
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.subject import Subject
 from shmio.segment.events import EVENT_SLOTS
 
 TOPIC_BOUND: Final = 64
@@ -275,3 +276,116 @@ class EventLane(_Lane):
 
 
 Lane = StateLane | EventLane
+
+
+class OpenStreams:
+    """Number of the open streams of all services; for the event loop's thread."""
+
+    def __init__(self) -> None:
+        self.changed: Callable[[], object] = lambda: None
+        """Called when the first stream opens, before it gets values, and when the last closes."""
+        self._count = 0
+
+    def __bool__(self) -> bool:
+        return self._count > 0
+
+    @contextmanager
+    def joined(self) -> Iterator[None]:
+        """Count a stream for as long as it is open."""
+        self._count += 1
+        if self._count == 1:
+            self.changed()
+        try:
+            yield
+        finally:
+            self._count -= 1
+            if not self._count:
+                self.changed()
+
+
+class Outboxes:
+    """The outboxes of all open streams."""
+
+    def __init__(self, open_streams: OpenStreams | None = None) -> None:
+        """``open_streams`` counts these streams together with those of other services."""
+        self._open_streams = OpenStreams() if open_streams is None else open_streams
+        self._open: set[Outbox] = set()
+        self._dropped = 0
+        self._total = TotalBacklog()
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Size of all waiting messages, in bytes."""
+        return self._total.size
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    @property
+    def dropped(self) -> int:
+        """Number of messages dropped since the start because a client was too slow."""
+        return self._dropped + sum(outbox.dropped for outbox in self._open)
+
+    @contextmanager
+    def opened(self) -> Iterator[Outbox]:
+        """Give a stream an outbox for as long as the stream is open."""
+        outbox = Outbox(self._total)
+        self._open.add(outbox)
+        self._total.streams += 1
+        try:
+            with self._open_streams.joined():
+                yield outbox
+        finally:
+            self._open.discard(outbox)
+            self._total.streams -= 1
+            self._dropped += outbox.dropped
+            outbox.close()
+
+    async def taken(self, patience_s: float) -> None:
+        """Wait until all clients have taken what they are owed.
+
+        Streams whose clients have not done so within ``patience_s`` fail.
+        """
+        owing = [outbox for outbox in self._open if outbox.owing]
+        if not owing:
+            return
+        try:
+            async with asyncio.timeout(patience_s):
+                for outbox in owing:
+                    await outbox.taken()
+        except TimeoutError:
+            for outbox in owing:
+                if outbox.owing:
+                    outbox.fail(f"the client has not taken the values of a step within {patience_s:g} s")
+
+
+MAX_WAITING: Final = 4096
+
+
+class SendQueue:
+    """A queue with bounds on the number and the size of its messages."""
+
+    def __init__(self) -> None:
+        self._messages: deque[bytes] = deque()
+        self._load = Backlog(TotalBacklog())
+
+    def __bool__(self) -> bool:
+        return bool(self._messages)
+
+    def add(self, message: bytes) -> str:
+        """Add a message; return why it does not fit, or an empty text."""
+        if self._load.full(message, MAX_WAITING):
+            return f"{self._load.count} messages wait to be read: the client is too slow for what is told"
+        self._load.add(message)
+        self._messages.append(message)
+        return ""
+
+    def pop(self) -> bytes:
+        """Remove and return the oldest message."""
+        message = self._messages.popleft()
+        self._load.remove(message)
+        return message
+
+    def all(self) -> bytes:
+        """Remove all messages and return them concatenated."""
+        return b"".join([self.pop() for _ in range(len(self._messages))])

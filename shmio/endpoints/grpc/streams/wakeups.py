@@ -1,13 +1,16 @@
-"""Wakes the event loop when a block has something new: one wake-up per block for all listeners."""
+"""Wakes the event loop when a block has something new, to read it in batches."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 from typing import Final
 
 from shmio.segment import Block
 from shmio.segment.relay import TURN_NS, Relay, WakeSource
+
+log = logging.getLogger("shmio.grpc")
 
 Callback = Callable[[], object]
 
@@ -132,3 +135,80 @@ class WakeUps:
         for wake_up in (*self._wake_ups.values(), *self._stopped):
             wake_up.join()
         self._wake_ups.clear()
+
+
+class BatchReader:
+    """Reads a block's frames or events at each wake-up, a batch at a time.
+
+    Between two batches the event loop serves the streams. For that loop's thread.
+    """
+
+    def __init__(
+        self,
+        block: Block,
+        wake_ups: WakeUps,
+        read: Callable[[], bool],
+        *,
+        passes: Callable[[], bool] | None = None,
+        patient: bool = False,
+    ) -> None:
+        """Prepare to read; see :meth:`start`.
+
+        Args:
+            block: The block that is read.
+            wake_ups: Wakes this reader.
+            read: Reads a batch, and returns whether more is waiting.
+            passes: Returns whether to read nothing now. Then the reader is patient until
+                :meth:`resume`. None: it reads at each wake-up.
+            patient: See :meth:`WakeUps.join`.
+
+        """
+        self.alive = False
+        """Whether the block is being followed."""
+        self._block = block
+        self._wake_ups = wake_ups
+        self._read = read
+        self._passes = passes
+        self._patient = patient
+        self._loop = asyncio.get_running_loop()
+        self._again = False  # whether another look is scheduled
+
+    def start(self) -> None:
+        """Start following the block."""
+        self.alive = True
+        self._wake_ups.join(self._block, self.look, patient=self._patient)
+
+    def stop(self) -> None:
+        """Stop following the block."""
+        if self.alive:
+            self.alive = False
+            self._wake_ups.leave(self._block, self.look)
+
+    def look(self) -> None:
+        """Read a batch, unless it is better to pass."""
+        if not self.alive:
+            return  # stopped during the wake-up
+        if self._passes is not None and self._passes():
+            self._wake_ups.rest(self._block, self.look)
+        else:
+            self.read()
+
+    def read(self) -> None:
+        """Read a batch now; if more is waiting, look again when the streams have been served."""
+        try:
+            more = self._read()
+        except Exception:
+            log.exception("source %s can no longer be followed", self._block.source)
+            self.stop()
+            return
+        if more and not self._again:
+            self._again = True
+            self._loop.call_soon(self._look_again)
+
+    def resume(self) -> None:
+        """Look at each wake-up again."""
+        self._wake_ups.resume(self._block, self.look)
+
+    def _look_again(self) -> None:
+        self._again = False
+        self.look()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Final, Protocol
 
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.outboxes import Outboxes
+from shmio.endpoints.grpc.streams.outbox import Outboxes
 from shmio.endpoints.grpc.time.virtual_time import Moment, VirtualTime
 from shmio.errors import SegmentError
 from shmio.local.time_control import Step

@@ -12,9 +12,8 @@ from typing import Any, Final, TypeVar
 
 from shmio.endpoints.grpc.commands.publish import Publisher
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.outboxes import Outboxes
+from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
 from shmio.endpoints.grpc.streams.wakeups import WakeUp, WakeUps
-from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.timeline import Timeline
 from shmio.endpoints.grpc.time.virtual_time import TimeStatus, VirtualTime
 from shmio.errors import ShmioError, TimeError

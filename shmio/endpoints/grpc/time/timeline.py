@@ -8,10 +8,9 @@ from functools import partial
 from typing import Any
 
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.outboxes import Outboxes
+from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
 from shmio.endpoints.grpc.streams.wakeups import WakeUp
 from shmio.endpoints.grpc.time.delivery import Delivery, StepReceiver, before
-from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.time_topics import TimeTopics
 from shmio.endpoints.grpc.time.virtual_time import Moment, TimeStatus, VirtualTime
 from shmio.local.time_control import Step

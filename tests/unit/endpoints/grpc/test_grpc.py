@@ -15,8 +15,8 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from shmio.config import Address, Tls
 from shmio.endpoints.grpc.server.server import Server
+from shmio.endpoints.grpc.streams.channel import Subject
 from shmio.endpoints.grpc.streams.outbox import Outbox
-from shmio.endpoints.grpc.streams.subject import Subject
 from shmio.errors import ConfigError, EndpointError
 from shmio.segment import Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire

@@ -9,8 +9,8 @@ import grpc
 import pytest
 
 from shmio.endpoints.grpc.server.server import MAX_REQUEST_BYTES
-from shmio.endpoints.grpc.shmio_v1 import send_queue
 from shmio.endpoints.grpc.shmio_v1.service import MAX_STREAMS
+from shmio.endpoints.grpc.streams import outbox
 from shmio.endpoints.grpc.streams.back_pressure import BOUND_BYTES
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as ours
@@ -332,7 +332,7 @@ def test_a_subscriber_of_ours_that_never_reads_holds_nobody_up(segment: Segment)
         await connection.drop(reset=True)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(send_queue, "MAX_WAITING", 64)
+        monkeypatch.setattr(outbox, "MAX_WAITING", 64)
         beside_a_polite_one(segment, test)
 
 
@@ -368,7 +368,7 @@ def test_who_does_not_read_what_is_told_of_an_injection_loses_it(segment: Segmen
         await connection.drop(reset=True)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(send_queue, "MAX_WAITING", 16)
+        monkeypatch.setattr(outbox, "MAX_WAITING", 16)
         beside_a_polite_one(segment, test)
 
 

@@ -395,7 +395,7 @@ def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
         got = await messages(reader, number + 4)
         assert got == [("sim/count", float(n)) for n in range(number + 4)]
         assert {subject.path for subject in served.feeds["sim"]._channels} == {"count"}
-        assert not any(one._followers for one in served.service._shmio_v1._open)
+        assert not any(one._blocks for one in served.service._shmio_v1._open)
         await connection.drop(reset=True)
 
     simulate(instance, test)

@@ -275,7 +275,7 @@ def test_frames_that_a_bridge_was_too_slow_for_are_counted_and_told(
     sparkplug: Sparkplug | None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.frame_reader.CATCH_UP_S", 48 * segment.blocks["cell"].period_ns / 1e9)
+    monkeypatch.setattr("shmio.endpoints.mqtt.feed.CATCH_UP_S", 48 * segment.blocks["cell"].period_ns / 1e9)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
     writer, slot = segment.writer("cell"), segment.processes.find("mqtt")
     burst(writer, range(1, 3))

@@ -98,7 +98,7 @@ def test_a_connection_that_is_cut_again_and_again_loses_no_change(
 ) -> None:
     """Under load. What the broker may or may not have had comes once more; nothing comes before what was before it."""
     # A busy host is not to be taken for a broker that is too slow, for which changes are conflated.
-    monkeypatch.setattr("shmio.endpoints.mqtt.frame_reader.CATCH_UP_S", 10.0)
+    monkeypatch.setattr("shmio.endpoints.mqtt.feed.CATCH_UP_S", 10.0)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
     with (
         FaultProxy(broker.address, framing=None) as proxy,
@@ -143,7 +143,7 @@ def test_who_listens_by_another_way_misses_nothing_of_a_broker_that_is_killed_ag
 ) -> None:
     """Under load. The bridge's own way is held up before each kill, so that what it sends then is acknowledged by none:
     what a broker has acknowledged and takes to its grave nobody could send again."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.frame_reader.CATCH_UP_S", 10.0)
+    monkeypatch.setattr("shmio.endpoints.mqtt.feed.CATCH_UP_S", 10.0)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
     filters = [f"{PREFIX}/{topic}" for topic in ("cell/step/out", "kill")]
     told: list[str] = []

@@ -128,7 +128,7 @@ def test_a_long_write_is_shown_once_and_whole(segment: Segment) -> None:
 
 def test_who_joins_in_the_middle_of_a_write_is_shown_the_next_one(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        events = served.feeds["cell"].commands._event_follower._cursor
+        events = served.feeds["cell"].commands._events
 
         async def heard() -> bool:
             return events.behind == 0

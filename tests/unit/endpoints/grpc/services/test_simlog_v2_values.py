@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from google.protobuf.struct_pb2 import Value
 
-from shmio.endpoints.grpc.commands.path_kind import Shape, shape
+from shmio.endpoints.grpc.commands.topics import Shape, shape
 from shmio.endpoints.grpc.services.simlog_v1_values import time_stamp as time_stamp_v1
 from shmio.endpoints.grpc.services.simlog_v2_values import (
     MAX_LEVELS,

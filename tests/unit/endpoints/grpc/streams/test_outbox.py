@@ -10,8 +10,7 @@ import pytest
 
 from shmio.endpoints.grpc.streams import back_pressure
 from shmio.endpoints.grpc.streams import outbox as module
-from shmio.endpoints.grpc.streams.outbox import TOPIC_BOUND, EventLane, Outbox, StateLane
-from shmio.endpoints.grpc.streams.outboxes import Outboxes
+from shmio.endpoints.grpc.streams.outbox import TOPIC_BOUND, EventLane, Outbox, Outboxes, StateLane
 
 
 async def rest(outbox: Outbox) -> list[bytes]:

@@ -9,7 +9,7 @@ import grpc
 import pytest
 
 from shmio.client import connect_aio
-from shmio.endpoints.grpc.shmio_v1 import send_queue
+from shmio.endpoints.grpc.streams import outbox
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, EventKind, ProcessSpec, Segment
 from shmio.wire import shmio_v1_pb2 as wire
@@ -146,7 +146,7 @@ def test_a_reload_is_followed(segment: Segment) -> None:
 
 
 def test_who_does_not_keep_up_is_told_and_left(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(send_queue, "MAX_WAITING", 8)
+    monkeypatch.setattr(outbox, "MAX_WAITING", 8)
 
     async def test(served: Endpoint, _: Plant) -> None:
         stream = subscribe(served, "cell/step/in")

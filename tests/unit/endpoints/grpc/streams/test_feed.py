@@ -11,8 +11,8 @@ import pytest
 
 from shmio.endpoints.grpc.streams import back_pressure
 from shmio.endpoints.grpc.streams import wakeups as ringing
-from shmio.endpoints.grpc.streams.feeds import Feeds
-from shmio.endpoints.grpc.streams.subject import Subject
+from shmio.endpoints.grpc.streams.channel import Subject
+from shmio.endpoints.grpc.streams.feed import Feeds
 from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.endpoints.grpc.time.virtual_time import Moment, VirtualTime
 from shmio.segment import Attributes, BlockSpec, Quality, Segment
