@@ -200,12 +200,12 @@ class Output:
     def _is_next(self) -> bool:
         """Wait until the previous file is complete; returns False if it will not be."""
         after, self._after = self._after, None
-        while after is not None and not after.whole:
-            if self._closing or after.ended:
-                self.error = f"{after.path} before it was not written to its end"
-                return after.whole
+        while after is not None and not (after.whole or after.ended or self._closing):
             after._thread.join(WAIT_S)
-        return True
+        if after is None or after.whole:
+            return True
+        self.error = f"{after.path} before it was not written to its end"
+        return False
 
     def _put(self, piece: bytes) -> bool:
         """Write a whole piece, or nothing of it."""

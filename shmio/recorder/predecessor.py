@@ -44,7 +44,6 @@ def last_positions(
                 found = _positions(reader, blocks) | found
         except (OSError, RecordingError) as error:
             log.warning("it is not known where the recording before ended: %s", error)
-            continue
         if found.keys() >= blocks.keys():
             break
     return found

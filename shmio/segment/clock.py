@@ -92,7 +92,7 @@ class ClockPage:
         """Doorbell that processes ring when they have delivered a step."""
 
     @staticmethod
-    def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int = 0) -> None:
+    def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int) -> None:
         """Write the page of a new segment. ``virtual``: time stands still at ``time_ns`` until it is stepped."""
         struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
         state = Clock(ClockMode.VIRTUAL, time_ns=time_ns) if virtual else Clock()

@@ -21,6 +21,7 @@ GROUPS: Final = {
         ("shmio/segment/*.py", "shmio/segment/*.h", "shmio/segment/_atomics.c", "shmio/local/*.py"),
         (
             "tests/unit/connectors/models",
+            "tests/unit/connectors/replay",
             "tests/unit/connectors/test_*.py",
             "tests/unit/local",
             "tests/unit/segment",
