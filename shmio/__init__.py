@@ -1,6 +1,7 @@
 """shmio: shared-memory I/O for digital twins of multi-robot cells.
 
-Programs on the same host start with :func:`attach`; :func:`open_dump` reads recordings.
+Programs on the same host start with :func:`attach`, others with :func:`connect`; both return a
+:class:`Cell`. :func:`open_dump` reads recordings.
 """
 
 from __future__ import annotations
@@ -11,18 +12,28 @@ TYPE_CHECKING = False  # typing's own costs every command 10 ms, in which Ctrl-C
 if TYPE_CHECKING:
     from typing import Any
 
+    from shmio.client import connect
     from shmio.local.attach import attach
+    from shmio.model.cell import Cell
     from shmio.recording.dump import open_dump
 
-__all__ = ["__version__", "attach", "open_dump"]
+__all__ = ["Cell", "__version__", "attach", "connect", "open_dump"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public function on first use: most processes of an instance need neither."""
+    """Import a public name on first use: most processes of an instance need none of them."""
     if name == "attach":
         from shmio.local.attach import attach  # noqa: PLC0415
 
         return attach
+    if name == "connect":
+        from shmio.client import connect  # noqa: PLC0415
+
+        return connect
+    if name == "Cell":
+        from shmio.model.cell import Cell  # noqa: PLC0415
+
+        return Cell
     if name == "open_dump":
         from shmio.recording.dump import open_dump  # noqa: PLC0415
 

@@ -4,6 +4,7 @@
 
     ShmioError
     ├── ConfigError        the configuration is wrong; names the key
+    │   └── DeclarationError     a declared injection is wrong; also a ValueRangeError
     ├── LayoutError        a data-block source is wrong; carries diagnostics with file, line, column
     ├── ValueRangeError    a value does not fit its register's type
     ├── PathError          no such source or register
@@ -15,7 +16,7 @@
     │   ├── AlreadyRunningError  another supervisor holds the instance
     │   └── FormatError          the segment's format is not one this version knows
     ├── CommandError       a command cannot be sent to its source, or was not carried out
-    ├── TimeError          the instance's clock cannot be moved, or a step failed
+    │   └── TimeError            the instance's clock cannot be moved, or a step failed
     ├── QualityError       the value exists but is not good
     ├── ConnectorError     the device did not answer as it should; carries a reason code
     ├── ModelError         a simulation model is declared wrongly, or its code failed; names it, and the line
@@ -23,7 +24,7 @@
     ├── MissingLibraryError  an optional library is not installed; names the command for it
     ├── EndpointError      an address cannot be served
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
-    │   ├── LostError            nothing serves this address at present; it may come back
+    │   ├── LostError            nothing serves this address at present; also a NotRunningError
     │   └── UnknownClientError   the endpoint requires a known client
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     its socket cannot be connected to
@@ -79,6 +80,10 @@ class ValueRangeError(ShmioError, ValueError):
     """A value does not fit the type of its register."""
 
 
+class DeclarationError(ConfigError, ValueRangeError):
+    """A declared injection is wrong; the message names the key."""
+
+
 class PathError(ShmioError, LookupError):
     """No source or register has this path."""
 
@@ -118,7 +123,7 @@ class CommandError(ShmioError):
     """
 
 
-class TimeError(ShmioError):
+class TimeError(CommandError):
     """Another program controls the instance's clock, or a step failed.
 
     The message names that program, or what did not answer, and the reason.
@@ -156,8 +161,8 @@ class RemoteError(ShmioError):
     """
 
 
-class LostError(RemoteError):
-    """Nothing serves this address, or the connection was lost; it may come back."""
+class LostError(RemoteError, NotRunningError):
+    """Nothing serves this address, or the connection was lost; the instance may come back."""
 
 
 class UnknownClientError(RemoteError):

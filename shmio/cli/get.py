@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from shmio.cli.cell import Cell
-from shmio.cli.readings import as_json, as_line, choose
+from shmio.cli.readings import as_json, as_line
 from shmio.cli.run import add_full, dumps, room
+from shmio.model.cell import Cell
 
 HELP = "Print the present values of registers, with quality and age."
 
@@ -19,12 +19,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Print all values of one source from one frame."""
-    chosen = choose(cell, options.patterns)
-    found = list(zip(chosen, cell.readings(options.patterns, chosen), strict=True))
+    found = cell.get(*options.patterns)
     if options.json:
-        print(dumps({what.path: as_json(now, what.register) for what, now in found}))
+        print(dumps({one.path: as_json(one) for one in found}))
         return 0
-    width = max(len(what.path) for what in chosen)
-    for what, now in found:
-        print(as_line(what.path, now, what.register, width, room(options)))
+    width = max(len(one.path) for one in found)
+    for one in found:
+        print(as_line(one, width, room(options)))
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,18 @@ from typing import Any
 import msgspec
 
 from shmio.cli.campaign import run_campaign
-from shmio.cli.cell import Cell
 from shmio.cli.interrupt import stop_on_signals
 from shmio.cli.run import dumps, seconds
 from shmio.cli.set import Pairs, read_value
+from shmio.config import Declaration
 from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.layout.model import Layout
 from shmio.layout.naming import paths_of
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
 from shmio.logs import printable
+from shmio.model.cell import Cell
 
 HELP = "Have consumers, or with /in the device, get other values than they would, until Ctrl-C."
 
@@ -56,8 +59,9 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         _list(cell, as_json=options.json)
         return 0
     wanted: dict[tuple[str, str], dict[str, Value]] = {}
+    layouts = cell.layouts()
     for path, text in options.pairs:
-        topic, value = _read(cell, path, text)
+        topic, value = _read(layouts, path, text)
         wanted.setdefault((topic.source, topic.direction or "out"), {})[f"{topic.source}/{topic.path}"] = value
     with ExitStack() as stack:
         for (_, direction), values in wanted.items():
@@ -81,12 +85,12 @@ def _seed(text: str) -> int:
     return int(text)
 
 
-def _read(cell: Cell, path: str, text: str) -> tuple[Topic, Value]:
-    sources = cell.sources
-    topic = parse_topic(path, sources, sources[0] if len(sources) == 1 else None)
-    if topic.source not in sources:
+def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, Value]:
+    """Return what a path names, and the value for it; PathError, ValueRangeError."""
+    topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
+    if topic.source not in layouts:
         raise PathError(f"{path}: nothing is served under {topic.source} in this version")
-    register = look_up(cell.layout(topic.source), topic)
+    register = look_up(layouts[topic.source], topic)
     try:
         return topic, read_value(text, register)
     except ValueRangeError as error:
@@ -101,29 +105,37 @@ def _wait(for_s: float | None) -> None:
 
 def _lift(cell: Cell, options: argparse.Namespace) -> int:
     if options.lift_all:
-        chosen = cell.lift_all()
+        lifted = [(one.source, one.number, one.name) for one in cell.lift_all()]
     else:
-        standing = [(source, one) for source, all_of_it in cell.injections().items() for one in all_of_it]
-        chosen = [(source, one) for source, one in standing if one.number == options.lift]
-        if not chosen:
+        lifted = [(one.source, one.number, one.name) for one in cell.injections() if one.number == options.lift]
+        if not lifted:
             raise CommandError(f"there is no injection {options.lift}; shmio inject lists them")
-        for source, one in chosen:
-            cell.lift(source, one.number)
-    for source, one in chosen:
-        print(f"{one.number}: lifted from {source}{f' ({printable(one.name)})' if one.name else ''}")
+        for source, number, _ in lifted:
+            cell.lift(source, number)
+    for source, number, name in lifted:
+        print(f"{number}: lifted from {source}{f' ({printable(name)})' if name else ''}")
     return 0
 
 
 def _list(cell: Cell, *, as_json: bool) -> None:
     """Print the present injections with their registers."""
     found: list[dict[str, Any]] = []
-    for source, standing in cell.injections().items():
-        layout = cell.layout(source)
-        for one in standing:
-            bits = (Write(offset, mask, bytes(size)) for offset, size, mask in one.ranges)
-            over = [f"{source}/{path}" for path in paths_of(layout, bits)]
-            fields = msgspec.to_builtins(one)
-            found.append({"source": source, **{k: v for k, v in fields.items() if k != "ranges"}, "registers": over})
+    standing = cell.injections()
+    layouts = cell.layouts() if standing else {}
+    for one in standing:
+        bits = (Write(offset, mask, bytes(size)) for offset, size, mask in one.ranges)
+        over = [f"{one.source}/{path}" for path in paths_of(layouts[one.source], bits)]
+        fields = msgspec.to_builtins(one)
+        if one.running is not None:  # the keys in one order, whatever the cell
+            declaration = msgspec.convert(one.running.declaration, Declaration)
+            fields["running"]["declaration"] = msgspec.to_builtins(declaration)
+        found.append(
+            {
+                "source": one.source,
+                **{key: value for key, value in fields.items() if key not in ("ranges", "source")},
+                "registers": over,
+            }
+        )
     if as_json:
         print(dumps(found))
         return

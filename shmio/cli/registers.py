@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from shmio.cli.cell import Cell
-from shmio.cli.readings import choose
 from shmio.cli.run import dumps
+from shmio.layout.glob import choose
 from shmio.layout.model import Register
 from shmio.logs import printable
+from shmio.model.cell import Cell
 
 HELP = "List registers with their types."
 
@@ -20,26 +20,27 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Print a line for each register, or one JSON list."""
-    found = choose(cell, options.patterns or cell.sources)
+    layouts = cell.layouts()
+    found = [(f"{source}/{one.path}", one) for source, one in choose(options.patterns or layouts, layouts)]
     if options.json:
         print(
             dumps(
                 [
                     {
-                        "path": one.path,
-                        "type": one.register.type,
-                        "dims": [list(d) for d in one.register.dims] or None,
-                        "comment": one.register.comment,
+                        "path": path,
+                        "type": one.type,
+                        "dims": [list(d) for d in one.dims] or None,
+                        "comment": one.comment,
                     }
-                    for one in found
+                    for path, one in found
                 ]
             )
         )
         return 0
-    width = max((len(one.path) for one in found), default=0)
-    for one in found:
-        comment = f"  {one.register.comment}" if one.register.comment else ""
-        print(printable(f"{one.path:<{width}}  {_type(one.register)}{comment}".rstrip()))
+    width = max((len(path) for path, _ in found), default=0)
+    for path, one in found:
+        comment = f"  {one.comment}" if one.comment else ""
+        print(printable(f"{path:<{width}}  {_type(one)}{comment}".rstrip()))
     return 0
 
 

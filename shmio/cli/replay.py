@@ -5,15 +5,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 from datetime import datetime
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
-from shmio.cli.cell import Cell
 from shmio.cli.run import dumps
-from shmio.local.replays import ReplayRequest
 from shmio.logs import printable
-from shmio.model.replay_status import Playing
+from shmio.model.cell import Cell
+from shmio.model.replay import Playing, Wish
 
 HELP = "Tell how recordings play, and move them: pause, play, seek, and more."
 
@@ -48,7 +47,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Carry out the action and print the new states; CommandError, PathError, ValueRangeError."""
-    found = cell.replay(_wanted(options))
+    found = cell.replay(**_wish(options))
     if options.json:
         print(dumps([msgspec.to_builtins(one) for one in found]))
     else:
@@ -56,7 +55,8 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     return 0
 
 
-def _wanted(options: argparse.Namespace) -> ReplayRequest:
+def _wish(options: argparse.Namespace) -> Wish:
+    """Return what the action changes."""
     action, value = options.action, options.value
     if (value is None) != (action in _ALONE):
         options.refuse(f"{action} takes no VALUE" if value is not None else f"{action} needs a VALUE: {_VERBS[action]}")
@@ -64,20 +64,20 @@ def _wanted(options: argparse.Namespace) -> ReplayRequest:
         options.refuse("--speed goes with play")
     if options.jump and action not in ("to-change", "to-event"):
         options.refuse("--jump goes with to-change and to-event")
-    wanted: dict[str, dict[str, Any]] = {
+    wishes: dict[str, Wish] = {
         "status": {},
         "pause": {"paused": True},
-        "play": {"paused": False, "speed": options.speed},
+        "play": {"paused": False} if options.speed is None else {"paused": False, "speed": options.speed},
         "seek": {"seek": value},
         "until": {"paused": False, "until": value},
-        "speed": {"speed": _number(options) if action == "speed" else None},
+        "speed": {"speed": _number(options)} if action == "speed" else {},
         "loop": {"loop": value == "on"},
         "to-change": {"change": value, "jump": options.jump},
         "to-event": {"event": value, "jump": options.jump},
     }
     if action == "loop" and value not in ("on", "off"):
         options.refuse(f"loop is on or off, not {value!r}")
-    return ReplayRequest(**wanted[action], sources=tuple(options.source))
+    return {**wishes[action], "sources": options.source}
 
 
 def _number(options: argparse.Namespace) -> float:

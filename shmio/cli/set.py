@@ -6,13 +6,12 @@ import argparse
 import json
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from shmio.cli.cell import Cell, Selected
 from shmio.cli.run import PartlyDoneError, dumps, seconds
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.glob import select
-from shmio.layout.model import Register
+from shmio.layout.model import Layout, Register
 from shmio.layout.source.lists import split_array
 from shmio.layout.topic import look_up, parse_topic
 from shmio.layout.values.codec import Value
@@ -20,6 +19,7 @@ from shmio.layout.values.literal import parse_literal
 from shmio.layout.values.text import from_text, wire_type
 from shmio.local.writer import MIN_PERIODS, TIMEOUT_S
 from shmio.logs import printable
+from shmio.model.cell import Cell
 from shmio.model.outcome import Outcome, OutcomeKind
 
 HELP = "Write values of registers, and print what became of each."
@@ -68,10 +68,11 @@ class Pairs(argparse.Action):
 def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Write all values of each source as one command; CommandError names the first failure."""
     wanted: dict[str, dict[str, Value]] = {}
+    layouts = cell.layouts()
     for path, text in options.pairs:
-        target = _target(cell, path)
-        values = wanted.setdefault(target.source, {})
-        name, register = target.path, target.register
+        source, register = _target(layouts, path)
+        values = wanted.setdefault(source, {})
+        name = f"{source}/{register.path}"
         if name in values:
             raise PathError(f"{name}: given twice")
         try:
@@ -82,7 +83,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     failed: list[tuple[str, Outcome]] = []
     try:
         for values in wanted.values():
-            outcomes |= zip(values, cell.write(values, options.timeout), strict=True)
+            outcomes |= zip(values, cell.set(values, options.timeout), strict=True)
         failed = [(path, outcome) for path, outcome in outcomes.items() if not outcome.done]
         if failed:
             more = f" (and {len(failed) - 1} more)" if failed[1:] else ""
@@ -141,16 +142,16 @@ def _literal(text: str, register: Register) -> Value:
         raise
 
 
-def _target(cell: Cell, path: str) -> Selected:
-    sources = cell.sources
-    topic = parse_topic(path, sources, sources[0] if len(sources) == 1 else None)
+def _target(layouts: Mapping[str, Layout], path: str) -> tuple[str, Register]:
+    """Return the source and the register that a path names; PathError."""
+    topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.direction == "out":
         raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
-    if topic.source not in sources:
+    if topic.source not in layouts:
         raise PathError(f"{path}: nothing is served under {topic.source} in this version")
-    layout = cell.layout(topic.source)
+    layout = layouts[topic.source]
     try:
-        return Selected(topic.source, look_up(layout, topic))
+        return topic.source, look_up(layout, topic)
     except PathError:
         if "*" not in topic.path:
             raise

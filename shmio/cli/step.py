@@ -8,13 +8,13 @@ import sys
 
 import msgspec
 
-from shmio.cli.cell import Cell
 from shmio.cli.instance.status import clock_line
 from shmio.cli.interrupt import stop_on_signals
 from shmio.cli.run import at_least, dumps
 from shmio.errors import CommandError, ValueRangeError
 from shmio.local.status import clock_status
 from shmio.local.time_control import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
+from shmio.model.cell import Cell
 
 HELP = "Step the instance's time: from the first step on nothing else moves it, until it is released."
 LOOK_S = 0.2
@@ -60,14 +60,14 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         cell.release()
     else:
         cell.step(dt_s, options.count)
-    clock = clock_status(cell.clock)
+    clock = clock_status(cell.clock())
     print(dumps(msgspec.to_builtins(clock)) if options.json else clock_line(clock, options.dt_ms))
     return 0
 
 
 def _ask(cell: Cell) -> None:
     """Ask before the clock departs from the devices' real time; CommandError unless confirmed."""
-    if cell.clock.virtual or not (real := cell.real_sources()):
+    if cell.clock().virtual or not (real := cell.real_sources()):
         return
     who = f"{real[0]} goes" if len(real) == 1 else f"{real[0]} and {len(real) - 1} more go"
     what = f"the instance's time is real: a step makes it stand until it is released, while {who} on in real time"
@@ -82,7 +82,7 @@ def _ask(cell: Cell) -> None:
 def _play(cell: Cell, rate: float, dt_s: float | None) -> None:
     with stop_on_signals() as over:
         cell.play(rate, dt_s)
-        while not over.wait(LOOK_S) and cell.clock.playing:
+        while not over.wait(LOOK_S) and cell.clock().playing:
             pass  # until it is told to stop, or a step fails
         cell.pause()
 

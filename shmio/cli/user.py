@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio.cli import completion, get, inject, registers, replay, step, watch
 from shmio.cli import set as set_verb
-from shmio.cli.cell import Cell
-from shmio.cli.interrupt import ended_by_interrupt
-from shmio.cli.local import Local
 from shmio.cli.run import add_json, complete, run
-from shmio.cli.target import target
+from shmio.cli.target import opened
 from shmio.layout.spelling import may_be_tia_spelling, topic_path
-from shmio.local.attach import Attachment
+from shmio.model.cell import Cell
 from shmio.version import __version__
 
 PROGRAM = "shmio"
@@ -38,16 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if verb is None:
             print(completion.script(arguments.shell))
             return 0
-        if arguments.host is not None:
-            os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what is wrong it tells us, too
-            with ended_by_interrupt():  # gRPC crashes when it is broken off while it is loaded
-                from shmio.cli.remote import connected  # noqa: PLC0415  for those who ask for it alone
-
-            with connected(arguments) as remote:
-                return verb(remote, _spelled(remote, arguments))
-        with Attachment(target(arguments).open(writable=arguments.writable)) as attachment:
-            local = Local(attachment)
-            return verb(local, _spelled(local, arguments))
+        with opened(arguments, writable=arguments.writable) as cell:
+            return verb(cell, _spelled(cell, arguments))
 
     return run(PROGRAM, command, arguments)
 
@@ -57,7 +45,7 @@ def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
     patterns, pairs = getattr(arguments, "patterns", None) or (), getattr(arguments, "pairs", None) or ()
     if not any(map(may_be_tia_spelling, [*patterns, *(path for path, _ in pairs)])):
         return arguments
-    layouts = {source: cell.layout(source) for source in cell.sources}
+    layouts = cell.layouts()
     default = next(iter(layouts)) if len(layouts) == 1 else None
     if patterns:
         arguments.patterns = [topic_path(path, layouts, default) for path in patterns]

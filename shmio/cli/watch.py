@@ -10,12 +10,12 @@ import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 
-from shmio.cli.cell import Cell, Change
-from shmio.cli.readings import as_json, as_line, choose
+from shmio.cli.readings import as_json, as_line
 from shmio.cli.run import add_full, at_least, dumps, room, seconds
 from shmio.errors import NotRunningError, PathError
-from shmio.local.reading import Reading
-from shmio.segment import Quality
+from shmio.model.cell import Cell
+from shmio.model.reading import Reading
+from shmio.model.values import Quality
 
 HELP = "Print the values of registers whenever they change, the present ones first; on a terminal a table of them."
 
@@ -40,13 +40,17 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     if not lines and sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb":
         return _table(cell, options)
     if options.every_s is None:
-        news = cell.news(options.patterns)
+        batches = _changes(cell, options.patterns)
     else:
-        news = (one for read in _rounds(cell, options.patterns, options.every_s) for one in read)
-    for printed, one in enumerate(news, 1):
-        print(_object(one) if options.json else _line(one, room(options)), flush=True)
-        if options.count is not None and printed >= options.count:
-            break
+        batches = _rounds(cell, options.patterns, options.every_s)
+    width = printed = 0
+    for batch in batches:
+        width = max(width, _width(batch))
+        for one in batch:
+            print(_object(one) if options.json else _line(one, width, room(options)), flush=True)
+            printed += 1
+            if printed == options.count:
+                return 0
     return 0
 
 
@@ -55,10 +59,10 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
     drawn = 0
     for read in _rounds(cell, options.patterns, options.every_s or TABLE_EVERY_S):
         columns, rows = shutil.get_terminal_size()
-        limit = room(options)
+        width, limit = _width(read), room(options)
         if limit is not None:
-            limit = min(limit, columns - CLOCK_CHARACTERS - read[0].width - 4)
-        lines = [_line(one, limit) for one in read]
+            limit = min(limit, columns - CLOCK_CHARACTERS - width - 4)
+        lines = [_line(one, width, limit) for one in read]
         if options.full:
             lines = [line[at : at + columns] for line in lines for at in range(0, len(line), columns)]
         if len(lines) >= rows:
@@ -72,7 +76,27 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
     return 0
 
 
-def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[list[Change]]:
+def _changes(cell: Cell, patterns: Sequence[str]) -> Iterator[Sequence[Reading]]:
+    """Yield the present readings of all that the patterns name, then those that have changed.
+
+    NotRunningError: The instance has ended, or a reload has removed a source or a register.
+    """
+    batch: Sequence[Reading] = cell.get(*patterns)
+    shown: dict[str, tuple[object, ...]] = {}
+    with cell.subscribe(*patterns) as updates:
+        while True:
+            # A stale reason holds the age: its text changes, the fact does not. repr: a NaN equals itself.
+            now = {one.path: (repr(one.value), one.quality, one.reason.partition(":")[0]) for one in batch}
+            yield [one for one in batch if shown.get(one.path) != now[one.path]]
+            shown |= now
+            update = next(updates)
+            if update.ended:
+                removed = "" if update.reason.endswith("by a reload") else ": a reload has taken it away"
+                raise NotRunningError(f"{update.reason}{removed}")
+            batch = update.readings
+
+
+def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Sequence[Reading]]:
     """Yield all that the patterns name, at once and then every ``every_s`` seconds.
 
     Raises:
@@ -80,27 +104,29 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[lis
         NotRunningError: The instance has stopped, or a reload has removed the registers.
 
     """
-    chosen = choose(cell, patterns)
     due_s = time.monotonic()
+    readings = cell.get(*patterns)
     while True:
-        width = max(len(one.path) for one in chosen)
-        readings = cell.readings(patterns, chosen)
-        yield [Change(one, now, width) for one, now in zip(chosen, readings, strict=True)]
+        yield readings
         due_s = max(due_s + every_s, time.monotonic())
         time.sleep(max(due_s - time.monotonic(), 0))
         try:
-            chosen = choose(cell, patterns)
+            readings = cell.get(*patterns)
         except PathError as error:
             raise NotRunningError(f"{error}: a reload has taken it away") from None
 
 
-def _object(news: Change) -> str:
-    return dumps({"path": news.what.path, **as_json(news.now, news.what.register)})
+def _width(readings: Sequence[Reading]) -> int:
+    """Return the length of the longest path."""
+    return max((len(one.path) for one in readings), default=0)
 
 
-def _line(news: Change, limit: int | None) -> str:
-    what, now, width = news
-    return f"{_clock(now)}  {as_line(what.path, now, what.register, width, limit)}"
+def _object(reading: Reading) -> str:
+    return dumps({"path": reading.path, **as_json(reading)})
+
+
+def _line(reading: Reading, width: int, limit: int | None) -> str:
+    return f"{_clock(reading)}  {as_line(reading, width, limit)}"
 
 
 def _clock(now: Reading) -> str:

@@ -20,7 +20,6 @@ from shmio.client.aio import client
 from shmio.client.calls import Stepped, Target
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
-from shmio.client.replay import Wish
 from shmio.client.sync.campaign import Campaign
 from shmio.client.sync.client import Client, Subscription
 from shmio.client.sync.injection import Shadow
@@ -31,7 +30,7 @@ from shmio.client.update import Piece, Snapshot, Update
 from shmio.model.clock import Clock
 from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
 from shmio.model.outcome import Outcome, OutcomeKind
-from shmio.model.replay_status import Playing
+from shmio.model.replay import Playing, Wish
 from shmio.model.values import Column, Provenance, Quality
 
 __all__ = [

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import msgspec
+
 from shmio.errors import RemoteError
 from shmio.messages import declaration_from_wire, declaration_to_wire
 from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
 from shmio.wire import shmio_v1_pb2 as wire
 
 
-def declare_request(declarations: Iterable[Mapping[str, Any]], *, keep: bool) -> Any:
+def declare_request(declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool) -> Any:
     """For Declare; ValueRangeError: a key or a value that none can have."""
-    tables = [declaration_to_wire(table, f"injection[{index}]") for index, table in enumerate(declarations)]
+    given = [one if isinstance(one, Mapping) else msgspec.to_builtins(one) for one in declarations]
+    tables = [declaration_to_wire(table, f"injection[{index}]") for index, table in enumerate(given)]
     return wire.DeclareRequest(declarations=tables, keep=keep)
 
 

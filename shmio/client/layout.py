@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from shmio.client.table import Array, Register, unknown
 from shmio.errors import RemoteError
+from shmio.layout.model import Layout
 
 _NUMBERS: Final = {
     "BYTE": "u1", "WORD": "u2", "DWORD": "u4", "LWORD": "u8", "USINT": "u1", "UINT": "u2", "UDINT": "u4", "ULINT": "u8",
@@ -20,28 +21,38 @@ _NUMBERS: Final = {
 MAX_REGISTERS: Final = 1 << 20
 
 
-@dataclass(frozen=True)
-class BlockLayout:
-    """A source's block. ``writable``: patterns; ``stale_ns``: age from which a frame is bad; ``size`` in bytes."""
+@dataclass(frozen=True, kw_only=True)
+class BlockLayout(Layout):
+    """Layout of a source's block, with what the endpoint says of it.
 
+    Attributes:
+        source: Name of the source.
+        section: Which of the blocks that the source has had: a reload may give it another.
+        hash: Hash of the layout.
+        period_ns: Time between two cycles.
+        stale_ns: Age above which a frame is bad.
+        writable: Patterns of the registers that may be written.
+        armed: Whether an injection may reach the device.
+    """
+
+    registers: tuple[Register, ...]
     source: str
     section: int
-    name: str
-    number: int | None
-    size: int
-    big_endian: bool
-    hash: bytes
+    hash: bytes = field()
     period_ns: int
     stale_ns: int
     writable: tuple[str, ...]
     armed: bool
-    optimized: bool
-    registers: tuple[Register, ...]
 
-    @cached_property
+    @property
+    def big_endian(self) -> bool:
+        """Whether numbers have their most significant byte first."""
+        return self.byte_order == "big"
+
+    @property
     def places(self) -> Mapping[str, int]:
         """Place of each register, by its path without the source."""
-        return {register.path: place for place, register in enumerate(self.registers)}
+        return self.by_path
 
     def array(self, image: bytes) -> Array:
         """A raw frame as a record of numpy, a field for each register, named by its path; nothing is copied.
@@ -99,18 +110,18 @@ def layouts(parts: Iterable[Any]) -> Iterator[BlockLayout]:
             if any(register.offset + register.size > part.size for register in registers):
                 raise RemoteError(f"source {part.source}: registers that are not in its {part.size} bytes")
             yield BlockLayout(
-                part.source,
-                part.section,
-                part.name,
-                part.number if part.HasField("number") else None,
-                part.size,
-                part.big_endian,
-                part.hash,
-                part.period_ns,
-                part.stale_ns,
-                tuple(part.writable),
-                part.armed,
-                part.optimized,
-                tuple(registers),
+                name=part.name,
+                number=part.number if part.HasField("number") else None,
+                size=part.size,
+                optimized=part.optimized,
+                registers=tuple(registers),
+                byte_order="big" if part.big_endian else "little",
+                source=part.source,
+                section=part.section,
+                hash=part.hash,
+                period_ns=part.period_ns,
+                stale_ns=part.stale_ns,
+                writable=tuple(part.writable),
+                armed=part.armed,
             )
             registers = []

@@ -2,36 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, Final, TypedDict
+from typing import Any, Final
 
-from shmio.model.replay_status import Playing
+from shmio.model.replay import Playing, Wish
 from shmio.wire import shmio_v1_pb2 as wire
 
 SEARCH_PATIENCE_S: Final = 600.0
 """So long a recording may be searched."""
-
-
-class Wish(TypedDict, total=False):
-    """What is to change. A time is seconds from the begin of what is played, or a date and time."""
-
-    paused: bool
-    speed: float
-    """Times as fast as the instance's clock, 0.01 to 1000."""
-    loop: bool
-    """Begin anew at the end."""
-    seek: float | str
-    """Be at a time."""
-    until: float | str
-    """Pause at a time, once."""
-    change: str
-    """Play to the next change of this register, and pause there."""
-    event: str
-    """The same with the next event of this kind."""
-    jump: bool
-    """With these, be there at once."""
-    sources: Iterable[str]
-    """Only these, and what else plays the same recording."""
 
 
 def request(wish: Wish) -> Any:

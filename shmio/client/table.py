@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from shmio.errors import PathError, RemoteError
+from shmio.layout import model
+from shmio.layout.types import ElementType, element_type
 from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -42,28 +44,26 @@ MAX_SLOTS: Final = 1 << 22
 
 
 @dataclass(frozen=True, slots=True)
-class Register:
-    """A register, or an array's element; ``path`` is without its source. ``slot``: its first in its column.
+class Register(model.Register):
+    """A register, or an array's element, as the wire describes it.
 
-    ``bit`` is None but for BOOLs. ``comment`` and ``initial`` are there with layouts only.
+    Attributes:
+        column: Column that has its values.
+        slot: Its first slot in that column.
+        comment: The source's comment; only in layouts.
+        initial: The source's text of the initial value; only in layouts.
     """
 
-    path: str
-    type: str
-    dims: tuple[tuple[int, int], ...]
-    offset: int
-    bit: int | None
-    size: int
-    count: int
-    column: Column
-    slot: int
-    comment: str = ""
-    initial: str | None = None
+    column: Column = field(kw_only=True)
+    slot: int = field(kw_only=True)
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of elements in each dimension."""
-        return tuple(high - low + 1 for low, high in self.dims)
+    def element(self) -> ElementType:
+        """The elementary type. RemoteError: the endpoint is newer, and this version does not know the type."""
+        found = element_type(self.type)
+        if found is None:
+            raise RemoteError(f"{self.path}: it has the type {self.type!r}, which this version does not know")
+        return found
 
     @classmethod
     def of(cls, found: Any) -> Register:
@@ -77,10 +77,10 @@ class Register:
                 found.bit if found.HasField("bit") else None,
                 found.size,
                 found.count,
-                Column(found.column),
-                found.slot,
                 found.comment,
                 found.initial if found.HasField("initial") else None,
+                column=Column(found.column),
+                slot=found.slot,
             )
         except ValueError as error:
             raise RemoteError(f"{found.path}: {error}") from None
@@ -135,6 +135,8 @@ class Table:
         """Registers, by their place, whose bytes are no value of their type."""
         self.injected = np.zeros(len(self.registers), bool)
         """Registers, by their place, of which an injection shows something else."""
+        self.state: object = None
+        """What the last update said of the whole frame: its quality, reason, provenance and incarnation."""
         self._everything = {column: np.arange(len(array), dtype=np.uint32) for column, array in self.arrays.items()}
 
     @cached_property

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 from shmio.client.arrays import SubscribeResponse
 from shmio.client.table import Array, Change, Table, unknown
 from shmio.errors import QualityError, RemoteError
+from shmio.layout import model
+from shmio.model.reading import Reading
 from shmio.model.values import Column, Provenance, Quality
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -32,7 +34,8 @@ class Update:
     """
 
     __slots__ = (
-        "_originals", "age_ns", "changes", "clock_ns", "cycle", "ended", "frame", "image", "incarnation", "marked",
+        "_everything", "_originals", "age_ns", "changes", "clock_ns", "cycle", "ended", "frame", "image", "incarnation",
+        "marked",
         "missed", "pieces", "provenance", "quality", "raw", "reason", "source_ns", "table", "whole",
     )  # fmt: skip
 
@@ -60,6 +63,9 @@ class Update:
             table.mark(found.invalid, table.invalid)
         if found.HasField("injected"):
             table.mark(found.injected, table.injected)
+        state = self.quality, self.reason.partition(":")[0], self.provenance, self.incarnation  # a reason holds an age
+        self._everything = self.whole or self.marked or table.state != state
+        table.state = state
         self._originals: Mapping[Column, Array] | None = None
         if found.HasField("originals"):
             self._originals = {change.column: change.values for change in table.read(found.originals)}
@@ -74,6 +80,31 @@ class Update:
         """Paths of the registers that this update is about, with the source."""
         registers = self.table.registers
         return [f"{self.source}/{registers[place].path}" for place in self.table.changed(self.changes)]
+
+    @property
+    def readings(self) -> list[Reading]:
+        """The registers that may have changed since the update before, with their values by now."""
+        if self.ended:
+            return []
+        table = self.table
+        places = range(len(table.registers)) if self._everything else table.changed(self.changes)
+        return [self.reading(place) for place in places]
+
+    def reading(self, place: int, register: model.Register | None = None) -> Reading:
+        """Return the state of a register by its place in the table. ``register``: what describes it in the reading."""
+        found = self.table.registers[place]
+        value: Any = self.table.value(place) if self.source_ns else None
+        quality, reason = self.quality_of(found.path)
+        return Reading(
+            self.source,
+            register or found,
+            value.tolist() if hasattr(value, "tolist") else value,
+            quality,
+            reason,
+            str(self.provenance_of(found.path)),
+            self.source_ns / 1e9 if self.source_ns else None,
+            round(self.age_ns / 1e9, 6) if self.age_ns or quality is not Quality.BAD else None,
+        )
 
     def __getitem__(self, path: str) -> Any:
         """A register's value by now, whatever the quality; see :meth:`Table.value`. PathError."""

@@ -9,11 +9,11 @@ linear in the path's length, whatever the pattern.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
-from shmio.layout.topic import Topic, canonical_path, decode_segment, encode_segment, look_up_each, shorten
+from shmio.layout.topic import Topic, canonical_path, decode_segment, encode_segment, look_up_each, parse_topic, shorten
 
 MAX_PATTERN = 1024
 
@@ -145,3 +145,29 @@ def named(layout: Layout, topic: Topic) -> list[Register]:
     if "*" in topic.path or layout.members(topic.path):
         return [layout.registers[index] for index in select(layout, [topic.path])]
     return look_up_each(layout, topic)
+
+
+def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple[str, Register]]:
+    """Return the registers that patterns name, each once and in order, with their sources.
+
+    Args:
+        patterns: Paths, array elements, slices, structures, globs, or names of sources.
+        layouts: Layouts by source; the patterns may omit the source if there is only one.
+
+    Raises:
+        PathError: A pattern names nothing, or ends in ``/in``.
+
+    """
+    chosen: dict[tuple[str, Register], None] = {}
+    default = next(iter(layouts)) if len(layouts) == 1 else None
+    for pattern in patterns:
+        topic = parse_topic(pattern, layouts, default)
+        if topic.direction == "in":
+            raise PathError(f"{pattern}: what goes into a source cannot be read; leave out /in")
+        if topic.source not in layouts:
+            raise PathError(f"{pattern}: nothing is served under {topic.source} in this version")
+        registers = named(layouts[topic.source], topic)
+        if not registers:
+            raise PathError(f"{pattern}: no register of {topic.source} has such a path")
+        chosen |= dict.fromkeys((topic.source, register) for register in registers)
+    return list(chosen)

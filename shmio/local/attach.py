@@ -17,20 +17,29 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import weakref
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import partial
+from typing import Any
+
+import msgspec
 
 from shmio.config import Declaration
 from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError
-from shmio.layout.model import Register
+from shmio.layout.glob import choose
+from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
-from shmio.local.declared_injections import DeclaredInjection, declare
-from shmio.local.injection import Diversion, Shadow, lift_all, written
-from shmio.local.reading import Reading, View, reading
+from shmio.local.declared_injections import Campaign
+from shmio.local.following import Following
+from shmio.local.injection import Diversion, Shadow, as_given, lift_all, written
+from shmio.local.reading import View, reading
+from shmio.local.subscription import Subscription
 from shmio.local.timekeeper import TimeMethods
 from shmio.local.writer import SourceWriter
+from shmio.model.injection import Injection, Lifted, Running
 from shmio.model.outcome import Outcome
+from shmio.model.reading import Reading
 from shmio.model.values import Quality
 from shmio.segment.block import Block
 from shmio.segment.commands import Direction
@@ -101,6 +110,7 @@ class Attachment(TimeMethods):
         self._turn = threading.Lock()
         self._guest: int | None = None
         self._source_writers: dict[str, SourceWriter] = {}
+        self._open: weakref.WeakSet[Following[Any]] = weakref.WeakSet()
 
     def _blocks(self) -> dict[str, Block]:
         if self._segment.closed:
@@ -122,6 +132,18 @@ class Attachment(TimeMethods):
     def current(self) -> bool:
         """Whether the attached instance still runs. Once it has stopped, attach again."""
         return self._segment.shared.current()
+
+    def _check_running(self) -> None:
+        if not self.current:
+            raise NotRunningError(f"instance {self.instance!r} has stopped")
+
+    def layouts(self, *sources: str) -> dict[str, Layout]:
+        """Return the layouts of these sources, or of all, by source. PathError: no such source."""
+        return {source: self.block(source).layout for source in dict.fromkeys(sources) or self._blocks()}
+
+    def real_sources(self) -> list[str]:
+        """Return the names of the sources that steps do not move, such as those with a device."""
+        return [source for source, block in self._blocks().items() if not block.attributes.stepped]
 
     def block(self, source: str | None = None) -> Block:
         """Return the block of a source.
@@ -156,6 +178,30 @@ class Attachment(TimeMethods):
             raise PathError(f"{path}: what goes into a source is not read but followed: written(); leave out /in")
         block = blocks[topic.source]
         return block, look_up(block.layout, topic)
+
+    def get(self, *patterns: str) -> list[Reading]:
+        """Read the registers that patterns name, whatever their quality: see :class:`shmio.Cell`.
+
+        Raises:
+            PathError: A pattern names nothing.
+            NotRunningError: The instance has stopped.
+        """
+        self._check_running()
+        blocks = self._blocks()
+        chosen = choose(patterns, {source: block.layout for source, block in blocks.items()})
+        frames = {source: blocks[source].latest() for source in {source for source, _ in chosen}}
+        return [reading(blocks[source], register, frames[source]) for source, register in chosen]
+
+    def subscribe(self, *patterns: str, every_frame: bool = False, max_rate_hz: float = 0.0) -> Subscription:
+        """Follow registers, their present values first: see :class:`shmio.Cell`.
+
+        Closing the subscription or the attachment ends it.
+        """
+        subscription = Subscription(
+            self.instance, self._blocks, self._check_running, patterns, every_frame=every_frame, max_rate_hz=max_rate_hz
+        )
+        self._open.add(subscription)
+        return subscription
 
     def read(self, path: str) -> Reading:
         """Read a register, whatever its quality.
@@ -281,6 +327,16 @@ class Attachment(TimeMethods):
             block = self._successor(block)
             cursor = block.cursor(after=0)
 
+    def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
+        """Write values as :meth:`write` does; the outcomes have the paths as they were given.
+
+        Raises:
+            PathError, ValueRangeError, CommandError: As :meth:`write`; nothing has been sent.
+            NotRunningError: The instance has stopped.
+        """
+        self._check_running()
+        return as_given(values, self.write(values, timeout_s))
+
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Write values to one source as one command, and wait for the outcomes.
 
@@ -360,28 +416,38 @@ class Attachment(TimeMethods):
         patterns = [topic.path or "**" for topic in topics]
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
-    def declare(self, declarations: Sequence[Declaration], *, keep: bool = False) -> list[DeclaredInjection]:
+    def declare(self, declarations: Iterable[Mapping[str, Any] | Declaration], *, keep: bool = False) -> Campaign:
         """Lay declared injections, which their sources run by themselves: all of them or none.
 
         An injection ends when it is over or lifted. The attachment must be ``writable``.
         See docs/reference/injections.md.
 
         Args:
-            declarations: What to inject.
+            declarations: What to inject: tables as ``[[injection]]`` has them, or declarations.
             keep: Whether the injections go on when this program ends.
 
         Returns:
-            One object for each declaration, with its number and a method to lift it.
+            What was laid. Iterate over it for the events; leaving its ``with`` block lifts the injections.
 
         Raises:
-            ConfigError: A declaration is wrong.
+            DeclarationError: A declaration is wrong.
             CommandError: A source refuses, or does not answer.
         """
-        return declare(declarations, self._blocks(), self._source_writer, keep=keep)
+        campaign = Campaign(declarations, self._blocks(), self._source_writer, self._check_running, keep=keep)
+        self._open.add(campaign)
+        return campaign
 
-    def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
-        """Return the present injections of each source, the innermost first."""
-        return {source: block.standing.read() for source, block in self._blocks().items()}
+    def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
+        """Return the present injections of these sources, or of all; of each source the innermost first.
+
+        Raises:
+            PathError: There is no such source.
+        """
+        return [
+            _with_source(source, one)
+            for source in dict.fromkeys(sources) or self._blocks()
+            for one in self.block(source).standing.read()
+        ]
 
     def lift(self, source: str, number: int) -> None:
         """Lift an injection, whoever laid it.
@@ -391,23 +457,27 @@ class Attachment(TimeMethods):
             number: Number of the injection.
 
         Raises:
-            PathError: There is no such source.
-            CommandError: There is no such injection, or the source does not answer.
+            PathError: There is no such source or injection.
+            CommandError: The source does not answer.
         """
-        self._source_writer(self.block(source)).lift(number)
+        block = self.block(source)
+        if not any(one.number == number and not one.lifted for one in block.standing.read()):
+            raise PathError(f"{source}: there is no injection {number}; injections() lists them")
+        self._source_writer(block).lift(number)
 
-    def lift_all(self) -> list[tuple[str, StandingInjection]]:
-        """Lift all injections of all sources, whoever laid them.
+    def lift_all(self, *sources: str) -> list[Lifted]:
+        """Lift all injections of these sources, or of all, whoever laid them.
 
         Returns:
-            The source and the injection for each one lifted.
+            What was lifted.
 
         Raises:
             CommandError: Some injections could not be lifted; the message gives the reasons.
         """
-        standing = [(source, one) for source, ones in self.injections().items() for one in ones if not one.lifted]
-        lift_all([(self._source_writer(self.block(source)), one.number) for source, one in standing])
-        return standing
+        blocks = [self.block(source) for source in dict.fromkeys(sources) or self._blocks()]
+        standing = [(block, one) for block in blocks for one in block.standing.read() if not one.lifted]
+        lift_all([(self._source_writer(block), one.number) for block, one in standing])
+        return [Lifted(block.source, one.number, one.name) for block, one in standing]
 
     def note(self, text: str, source: str | None = None) -> None:
         """Add a note to a source's events, and so to every recording.
@@ -443,6 +513,8 @@ class Attachment(TimeMethods):
         Raises:
             TimeError: A step had failed while time was played.
         """
+        for one in list(self._open):
+            one.end()
         try:
             self._time.close()
         finally:
@@ -453,6 +525,17 @@ class Attachment(TimeMethods):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _with_source(source: str, one: StandingInjection) -> Injection[Mapping[str, Any]]:
+    """Convert an injection from its segment's form to that of programs."""
+    now, running = one.running, None
+    if now is not None:
+        declaration = msgspec.to_builtins(now.declaration)
+        running = Running(declaration, now.state, now.seed, now.runs, now.cycle, now.time_ns)
+    return Injection(
+        one.number, one.direction, one.priority, one.keep, one.name, one.writer, one.pid, one.ranges, running, source
+    )
 
 
 def attach(instance: str | None = None, *, writable: bool = False) -> Attachment:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -85,8 +86,8 @@ class Shadow:
             timeout_s: How long the values may wait for a cycle of the source.
 
         Returns:
-            The outcome of each value: SHADOWED when consumers see it, or an outcome as of a write for
-            ``/in``; REJECTED when the shadow does not cover it or was lifted.
+            The outcome of each value, with its path as it was given: SHADOWED when consumers see it, or
+            an outcome as of a write for ``/in``; REJECTED when the shadow does not cover it or was lifted.
 
         Raises:
             PathError: A path names nothing.
@@ -95,7 +96,7 @@ class Shadow:
                 After any of these errors nothing has been sent.
         """
         paths = {parse_topic(path, (self.source,), self.source).path: value for path, value in values.items()}
-        return self._source_writer.shadow(self.number, paths, timeout_s)
+        return as_given(values, self._source_writer.shadow(self.number, paths, timeout_s))
 
     def diverted(self, timeout_s: float | None = None) -> Iterator[Diversion]:
         """Iterate over what this shadow has taken since it was laid, command by command, in order.
@@ -133,14 +134,22 @@ class Shadow:
         """
         self._source_writer.lift(self.number)
 
+    def close(self) -> None:
+        """Lift the shadow, unless it was laid with ``keep`` or somebody has lifted it.
+
+        Raises:
+            CommandError: The source does not answer.
+        """
+        if not self._keep:
+            lift_all([(self._source_writer, self.number)])
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not self._keep:
-            self.lift()
+        self.close()
 
 
 def written(
@@ -211,6 +220,11 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
     ]
     if left:
         raise CommandError(f"{len(left)} of {len(chosen)} injections still stand: {'; '.join(reasons)}")
+
+
+def as_given(paths: Iterable[str], outcomes: Iterable[Outcome]) -> list[Outcome]:
+    """Return outcomes with the paths as their caller gave them."""
+    return [dataclasses.replace(outcome, path=path) for path, outcome in zip(paths, outcomes, strict=True)]
 
 
 def _deadline(timeout_s: float | None) -> float | None:

@@ -11,6 +11,7 @@ from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import Value, codec
+from shmio.model.reading import Reading
 from shmio.model.values import Provenance, Quality
 from shmio.segment.block import Block
 from shmio.segment.frame import Frame
@@ -19,27 +20,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from shmio.layout.values.frame_codec import FrameCodec
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """The state of one register at the time it was read.
-
-    Attributes:
-        value: The last known value, even while the quality is bad; None if there never was one.
-        quality: Quality of the value.
-        reason: Why the quality is not good; empty if it is.
-        provenance: Where the value comes from: live, simulated, replayed or injected.
-        source_time: The source's time stamp, UTC in s; None if there never was a value.
-        age_s: Age of the value by the source's clock, in s; None if there never was a frame.
-    """
-
-    value: Value
-    quality: Quality
-    reason: str
-    provenance: str
-    source_time: float | None
-    age_s: float | None
 
 
 @dataclass(frozen=True)
@@ -134,7 +114,7 @@ def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
         frame: The frame; None if the source has not published one yet.
     """
     if frame is None:
-        return Reading(None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
+        return Reading(block.source, register, None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
     now_ns = block.now_ns()
     quality, reason = frame.assess(block.stale_ns, now_ns)
     known = frame.source_ns != 0
@@ -143,7 +123,8 @@ def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
         quality, reason = Quality.BAD, f"the bytes are no {register.type}"
     source_time = frame.source_ns / 1e9 if known else None
     provenance = Provenance.INJECTED if injected(block, (register,), frame) else frame.provenance
-    return Reading(value, quality, reason, str(provenance), source_time, round(frame.age_ns(now_ns) / 1e9, 6))
+    age_s = round(frame.age_ns(now_ns) / 1e9, 6)
+    return Reading(block.source, register, value, quality, reason, str(provenance), source_time, age_s)
 
 
 def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:

@@ -6,14 +6,14 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from typing import Final
+from typing import Any, Final, Unpack
 
 import msgspec
 
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.topic import look_up, parse_topic
 from shmio.local.recording_times import moment_ns
-from shmio.model.replay_status import Playing
+from shmio.model.replay import Playing, Wish
 from shmio.segment.block import Block
 from shmio.segment.playhead import (
     MAX_SPEED,
@@ -72,6 +72,14 @@ class Replays:
     def __init__(self, segment: Segment) -> None:
         """``segment`` must be writable to change anything."""
         self._segment = segment
+
+    def __call__(self, **wish: Unpack[Wish]) -> list[Playing]:
+        """Change replays, as ``replay`` of :class:`shmio.Cell`; without arguments, only return their status."""
+        keys: dict[str, Any] = {**wish, "sources": tuple(wish.get("sources", ()))}
+        for key in {"seek", "until"} & keys.keys():
+            keys[key] = str(keys[key])
+        wanted = ReplayRequest(**keys)
+        return self.status(wanted.sources) if wanted.nothing else self.change(wanted)
 
     def status(self, sources: Collection[str] = ()) -> list[Playing]:
         """Return the status of each replay.

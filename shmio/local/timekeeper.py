@@ -110,35 +110,45 @@ class TimeMethods:
         self._segment = segment
         self._time = Timekeeper(segment)
         self.replay = Replays(segment)
-        """The instance's replays. The attachment must be ``writable`` to change them."""
+        """The instance's replays: call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
+
+        The attachment must be ``writable`` to change them.
+        """
 
     @property
     def clock(self) -> Clock:
-        """State of the instance's clock: wall time, or virtual time with its last step."""
+        """State of the instance's clock: wall time, or virtual time with its last step.
+
+        It may be called, as ``clock()`` of :class:`shmio.Cell`.
+        """
         return self._segment.clock.read()
 
-    def step(self, dt_s: float | None = None) -> Step:
-        """Move time by one step, and wait until all sources that use the instance clock have done it.
+    def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
+        """Move time by steps, and wait until all sources that use the instance clock have done them.
 
         The first call of this method, :meth:`pause` or :meth:`play` takes over time: from then on only
         steps move it. This program owns time until it detaches or calls :meth:`release`.
         The attachment must be ``writable``.
 
         Args:
-            dt_s: Length of the step in s, from 1 us to 1 h; None: the step size.
+            dt_s: Length of each step in s, from 1 us to 1 h; None: the step size.
+            count: Number of steps.
 
         Returns:
-            The step that was done.
+            The state of the clock after the last step.
 
         Raises:
             TimeError: Another program owns time, or the step failed; the message says who failed or
                 did not answer.
             ValueRangeError: The length is not within 1 us and 1 h.
         """
-        return self._time.step(_ns(dt_s))
+        dt_ns = _ns(dt_s)
+        for _ in range(count):
+            self._time.step(dt_ns)
+        return self.clock
 
-    def play(self, rate: float = 1.0, dt_s: float | None = None) -> None:
-        """Step time in a thread until :meth:`pause`.
+    def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
+        """Step time in a thread until :meth:`pause`; returns the state of the clock.
 
         Args:
             rate: How many times as fast as real time; above 0, at most 1000.
@@ -149,17 +159,19 @@ class TimeMethods:
             ValueRangeError: The rate or the length is out of range.
         """
         self._time.play(rate, _ns(dt_s))
+        return self.clock
 
-    def pause(self) -> None:
-        """Stop time until it is stepped or played.
+    def pause(self) -> Clock:
+        """Stop time until it is stepped or played; returns the state of the clock.
 
         Raises:
             TimeError: Another program owns time, or a step failed while time was played.
         """
         self._time.pause()
+        return self.clock
 
-    def release(self) -> None:
-        """Return to real time, which goes on from the present virtual time.
+    def release(self) -> Clock:
+        """Return to real time, which goes on from the present virtual time; returns the state of the clock.
 
         This program gives up the ownership of time. If time is real, nothing happens.
 
@@ -168,6 +180,7 @@ class TimeMethods:
                 step failed while time was played.
         """
         self._time.release()
+        return self.clock
 
 
 def _ns(dt_s: float | None) -> int | None:

@@ -8,14 +8,15 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import count, cycle, product
-from typing import Final
+from typing import Any, Final
 
 from shmio.errors import CommandError, PathError, QualityError
 from shmio.local.attach import Attachment
+from shmio.model.injection import Injection
 from shmio.model.outcome import OutcomeKind
-from shmio.segment.standing_injections import StandingInjection
 from tests.faults.checker import Checker
 from tests.faults.checks import Counts, Source, word_at
 from tests.faults.inject_checks import QUIET_NS, SHOWN_NS, GuardCheck, LifeCheck
@@ -202,7 +203,7 @@ class Injecting:
         for one in self._standing(target.source.name):
             self._attachment.lift(target.source.name, one.number)
 
-    def _standing(self, source: str) -> list[StandingInjection]:
+    def _standing(self, source: str) -> list[Injection[Mapping[str, Any]]]:
         return standing(self._attachment, source, "n")
 
     def _tick(self, target: Target, order: Order | None = None) -> None:
@@ -234,9 +235,9 @@ class Injecting:
         target.guard.look(target.past[0])
 
 
-def standing(attachment: Attachment, source: str, initial: str) -> list[StandingInjection]:
+def standing(attachment: Attachment, source: str, initial: str) -> list[Injection[Mapping[str, Any]]]:
     """The injections over a source whose names begin so."""
-    return [one for one in attachment.injections()[source] if one.name.startswith(initial)]
+    return [one for one in attachment.injections(source) if one.name.startswith(initial)]
 
 
 def _shown(image: bytes) -> int:

@@ -113,7 +113,7 @@ def local(client: Client) -> None:
                 for value in diversion.values.values():
                     assert isinstance(value, int)
                     shadow.set({order.word: client.note(value + 1)})
-            if not any(one.number == shadow.number for one in cell.injections()[order.source]):
+            if not any(one.number == shadow.number for one in cell.injections(order.source)):
                 return
 
 

@@ -62,7 +62,7 @@ class Stepper:
         dt_ms = self._chance.choice(DTS_MS)
         before, begun_ns = cell.clock, time.monotonic_ns()
         try:
-            number = remote.step(dt_ms / 1000).step if remote else cell.step(dt_ms / 1000).number
+            number = (remote or cell).step(dt_ms / 1000).step
         except RemoteError as error:  # nobody knows what has become of it
             self._check.unclear(before, dt_ms * 10**6, cell.clock)
             raise SegmentError(str(error)) from None

@@ -133,7 +133,7 @@ def noise_of(cell: Cell, local: Attachment, seed: int) -> dict[int, tuple[object
         if frame.cycle >= begin.cycle:
             seen[frame.cycle - begin.cycle] = (frame.image[at], frame.image[at + 1])
     assert any(re.search(rf"cycle {begin.cycle}  {begin.injection} activated: noise", line) for line in told), told
-    assert local.injections()["cell"] == ()
+    assert local.injections("cell") == []
     return seen
 
 
@@ -207,7 +207,7 @@ def test_the_configuration_declares_and_a_reload_changes_without_a_restart(cell:
         until(lambda: local["cell/Outputs/98"] == 5, "lifted in an emergency")
         file.write_text(plain)
         assert "injection blind: lifted at cell" in cell.supervisor("reload").stdout
-        until(lambda: local.injections()["cell"] == (), "gone")
+        until(lambda: local.injections("cell") == [], "gone")
     assert cell.processes()["cell"]["pid"] == pid
     file.write_text(plain + CONFIGURED.replace("cell/Outputs/98", "cell/Outputs/9800"))
     refused = cell.supervisor("reload")

@@ -216,7 +216,7 @@ def test_a_program_steps_and_plays(line: Cell) -> None:
         begun = cell.clock
         assert not begun.playing
         made = cell.step(dt_s=0.02)
-        assert (made.number, made.time_ns) == (begun.step + 1, begun.time_ns + 20_000_000)
+        assert (made.step, made.time_ns) == (begun.step + 1, begun.time_ns + 20_000_000)
         cell.play(50)
         with pytest.raises(TimeError, match="pause it"):
             cell.step()
@@ -225,7 +225,7 @@ def test_a_program_steps_and_plays(line: Cell) -> None:
         cell.pause()
         stands = cell.clock
         assert not stands.playing
-        assert cell.step().number == stands.step + 1
+        assert cell.step().step == stands.step + 1
     with shmio.attach(line.instance) as reader, pytest.raises(TimeError, match="writable=True"):
         reader.step()
 
@@ -302,7 +302,7 @@ def test_a_model_that_is_killed_within_a_step_fails_it_and_goes_on_with_the_next
             f"step {number}: belt: its process was started anew within this step; it goes on with the next one\n"
         )
         cell.write({"belt/speed": 1.0})
-        assert cell.step().number == number + 1
+        assert cell.step().step == number + 1
         assert cell["belt/position"] == pytest.approx(position + 0.1)
 
 

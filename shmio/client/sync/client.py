@@ -4,33 +4,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Self, Unpack
 
 import grpc
+import msgspec
 
 from shmio.client import calls, injection, injections, replay
 from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
 from shmio.client.calls import Target
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S, RETRY_S, Rejoining
-from shmio.client.replay import Wish
 from shmio.client.sync.campaign import Campaign
 from shmio.client.sync.injection import Shadow
 from shmio.client.sync.model import Simulation
 from shmio.client.sync.steps import Steps
 from shmio.client.sync.transport import CLOSED, Channel, Duplex, Step, Stream, sleep
 from shmio.client.update import Snapshot, Tables, Update
-from shmio.errors import CommandError, ConflictError, RemoteError
+from shmio.errors import CommandError, ConflictError, PathError, RemoteError, TimeError
+from shmio.layout.glob import choose
+from shmio.layout.model import Layout
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted
 from shmio.model.outcome import Outcome
-from shmio.model.replay_status import Playing
+from shmio.model.reading import Reading
+from shmio.model.replay import Playing, Wish
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 
 
 class Client:
     """An instance at the other end of a connection. Several threads may use it. Close it, or use ``with``.
+
+    It has the methods of :class:`shmio.Cell`, and more.
 
     Errors are those of a local program: PathError, ValueRangeError, CommandError, QualityError; EndpointError: more
     than the endpoint gives to one client, or all; RemoteError: it cannot be reached, or does not let us.
@@ -40,6 +46,7 @@ class Client:
         """``timeout_s``: of calls that are answered at once."""
         self.target = target
         self._channel = Channel(target, timeout_s)
+        self._layouts: Mapping[str, Layout] | None = None
         connection = self._channel.grpc
         self._stub: Any = ShmioStub(connection)  # type: ignore[no-untyped-call]
         self._read = connection.unary_unary(
@@ -56,6 +63,36 @@ class Client:
         request = wire.GetLayoutsRequest(sources=sources)
         parts = Stream(self._channel, self._stub.GetLayouts, request, timeout_s=self._channel.timeout_s).to_list()
         return {block.source: block for block in layouts(parts)}
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the sources."""
+        return list(self.layouts())
+
+    def get(self, *patterns: str) -> list[Reading]:
+        """Read the registers that patterns name, whatever their quality: see :class:`shmio.Cell`.
+
+        The layouts are fetched with the first call, and when a reload has changed them. PathError: a pattern names
+        nothing; ValueRangeError: too much for one call.
+        """
+        if self._layouts is not None:
+            with suppress(PathError):  # as of the layouts before a reload
+                return self._get(patterns, self._layouts)
+        self._layouts = self.layouts()
+        return self._get(patterns, self._layouts)
+
+    def _get(self, patterns: tuple[str, ...], layouts: Mapping[str, Layout]) -> list[Reading]:
+        chosen = choose(patterns, layouts)
+        if not chosen:
+            return []
+        found = (self.read(*patterns)).updates
+        if {(source, path) for source, update in found.items() for path in update.table.places} != {
+            (source, register.path) for source, register in chosen
+        }:
+            raise PathError(f"{', '.join(patterns)}: a reload has changed what this names; try again")
+        return [
+            found[source].reading(found[source].table.places[register.path], register) for source, register in chosen
+        ]
 
     def status(self) -> dict[str, Any]:
         """How the instance and its processes are, as ``shmio-supervisor status --json`` has it."""
@@ -94,6 +131,10 @@ class Client:
         )
         return Subscription(Stream(self._channel, self._subscribe, request))
 
+    def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
+        """Write values to one source as one command, and wait for the outcomes: :meth:`write` without its options."""
+        return self.write(values, timeout_s)
+
     def write(
         self, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
     ) -> list[Outcome]:
@@ -131,7 +172,7 @@ class Client:
         )  # fmt: skip
         return Shadow.lay(self._channel, self._inject, first)
 
-    def declare(self, declarations: Iterable[Mapping[str, Any]], *, keep: bool = False) -> Campaign:
+    def declare(self, declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool = False) -> Campaign:
         """Lay injections that their sources run by themselves, all or none: tables as ``[[injection]]`` has them.
 
         They are lifted when it is closed, at the end of its ``with`` block, or when this program ends; with
@@ -205,13 +246,25 @@ class Client:
         """How time stands."""
         return calls.clock((self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
 
-    def step(self, dt_s: float | None = None) -> Clock:
-        """Take time over, and move it by one step; it returns when all streams have what has changed in it.
+    def real_sources(self) -> list[str]:
+        """Return the names of the sources that steps do not move, such as those with a device."""
+        return [one["name"] for one in (self.status())["processes"] if one.get("real_time")]
 
-        CommandError: the step failed, or another program owns time; ValueRangeError.
+    def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
+        """Take control of time, and move it by steps; it returns when all streams have what changed in them.
+
+        ``dt_s``: length of each step; None: the step size. Returns the clock after the last step. TimeError: a step
+        failed, or another program owns time; ValueRangeError.
         """
-        request = wire.StepRequest(dt_ns=calls.ns(dt_s))
-        return calls.clock(self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
+        if count == 1:
+            return self._move(self._stub.Step, wire.StepRequest(dt_ns=calls.ns(dt_s)), calls.STEP_PATIENCE_S)
+        try:
+            with self.steps(count, dt_s) as steps:
+                for _ in steps:
+                    pass
+        except CommandError as error:
+            raise TimeError(str(error)) from None
+        return self.clock()
 
     def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
         """Take time over, and move it by so many steps, by one call: see :class:`Steps`. ValueRangeError."""
@@ -219,20 +272,20 @@ class Client:
         return Steps(Duplex(self._channel, self._stub.Steps, *requests), count)
 
     def set_step_size(self, dt_s: float) -> Clock:
-        """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
-        return calls.clock(self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
+        """How far a step goes that does not say it; takes time over. TimeError, ValueRangeError."""
+        return self._move(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s)))
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Have time step by itself, ``rate`` times as fast as real time. CommandError, ValueRangeError."""
-        return calls.clock(self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
+        """Have time step by itself, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
+        return self._move(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate))
 
     def pause(self) -> Clock:
-        """Have time step no more by itself; takes it over. CommandError."""
-        return calls.clock(self._call(self._stub.Pause, wire.PauseRequest()))
+        """Have time step no more by itself; takes it over. TimeError."""
+        return self._move(self._stub.Pause, wire.PauseRequest())
 
     def release(self) -> Clock:
-        """Have time go by itself again, from where it stands; how it stands then. CommandError."""
-        return calls.clock(self._call(self._stub.Release, wire.ReleaseRequest()))
+        """Have time go by itself again, from where it stands; how it stands then. TimeError."""
+        return self._move(self._stub.Release, wire.ReleaseRequest())
 
     def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
         """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.
@@ -242,6 +295,13 @@ class Client:
         """
         found = self._call(self._stub.Replay, replay.request(wish), replay.patience_s(wish))
         return replay.told(found)
+
+    def _move(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Clock:
+        """Call what moves time. TimeError: the endpoint refuses, or a step failed."""
+        try:
+            return calls.clock(self._call(method, request, timeout_s))
+        except CommandError as error:
+            raise TimeError(str(error)) from None
 
     def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
         try:

@@ -11,11 +11,12 @@ from typing import cast
 import pytest
 
 from shmio.cli.campaign import run_campaign
-from shmio.cli.cell import CampaignEvent, Cell
 from shmio.cli.user import main
 from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
+from shmio.model.cell import Cell
 from shmio.model.clock import Clock, ClockMode
+from shmio.model.injection import Happening
 from shmio.segment import BlockSpec, ProcessSpec, Segment
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)))
@@ -59,10 +60,10 @@ class Still:
     """An instance whose time stands, and in which everything is over at once."""
 
     clock = Clock(ClockMode.VIRTUAL, time_ns=3_000_000_000)
-    stands = False
+    declared = ()
 
-    def news(self) -> list[CampaignEvent]:
-        return []
+    def __iter__(self) -> Iterator[Happening]:
+        return iter(())
 
     @contextmanager
     def declare(self, _declarations: Sequence[Declaration], *, keep: bool) -> Iterator[Still]:

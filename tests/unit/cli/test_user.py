@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from shmio.cli import target
-from shmio.cli.local import Local
 from shmio.cli.user import main
 from shmio.layout.model import Layout, Register
+from shmio.local.attach import Attachment
 from shmio.local.status import read_status
 from shmio.segment import BlockSpec, Segment
 from tests.unit.cli.terminal import Terminal
@@ -155,7 +155,7 @@ def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -
     def news(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Local, "news", news)
+    monkeypatch.setattr(Attachment, "subscribe", news)
     assert main(["watch", "--instance", running, "cell/a"]) == 130
 
 

@@ -75,7 +75,7 @@ def test_it_plays_until_it_is_paused_and_then_time_stands(cell: Attachment) -> N
     assert (stands.playing, stands.stepping) == (False, False)
     assert stands.time_ns == stands.step * 10 * MS
     made = cell.step()
-    assert (made.number, made.time_ns) == (stands.step + 1, stands.time_ns + 50 * MS)
+    assert (made.step, made.time_ns) == (stands.step + 1, stands.time_ns + 50 * MS)
 
 
 def test_who_plays_can_release_time(instance: str) -> None:
@@ -89,7 +89,7 @@ def test_who_plays_can_release_time(instance: str) -> None:
             other.release()
         cell.release()
         assert not other.clock.virtual
-        assert other.step().number > 0, "time is nobody's"
+        assert other.step().step > 0, "time is nobody's"
         other.release()
         segment.unlink()
 
@@ -111,7 +111,7 @@ def test_a_step_that_fails_ends_the_play_and_is_told_by_pause(cell: Attachment, 
     with pytest.raises(TimeError, match="step 3: sim: on fire"):
         cell.pause()
     assert (cell.clock.done, cell.clock.playing) == (2, False)
-    assert cell.step().number == 4
+    assert cell.step().step == 4
 
 
 def test_one_that_detaches_while_it_plays_leaves_time_to_others(

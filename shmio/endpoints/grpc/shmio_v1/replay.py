@@ -12,7 +12,7 @@ import grpc
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.errors import ShmioError, ValueRangeError
 from shmio.local.replays import ReplayRequest, Replays
-from shmio.model.replay_status import Playing
+from shmio.model.replay import Playing
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 

@@ -17,9 +17,10 @@ from shmio.connectors.schedule import Schedule
 from shmio.errors import CommandError, PathError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value
-from shmio.local.reading import Reading, reading
+from shmio.local.reading import reading
 from shmio.local.writer import SourceWriter
 from shmio.model.outcome import OutcomeKind
+from shmio.model.reading import Reading
 from shmio.segment import (  # fmt: skip
     Attributes,
     BlockSpec,

@@ -1,0 +1,201 @@
+"""Follow registers of a local instance: their present values, then each change."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+from shmio.errors import PathError, SegmentError
+from shmio.layout.glob import choose
+from shmio.layout.model import Register
+from shmio.layout.topic import parse_topic
+from shmio.local.following import Following
+from shmio.local.reading import reading
+from shmio.model.reading import Reading
+from shmio.model.values import Provenance, Quality
+from shmio.segment.block import Block
+from shmio.segment.changed_registers import ChangeScan
+from shmio.segment.frame import Frame
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """One frame of a source, and the registers that may have changed with it: see :class:`shmio.model.cell.Update`."""
+
+    source: str
+    frame: int
+    cycle: int
+    incarnation: int
+    clock_ns: int
+    source_ns: int
+    quality: Quality
+    reason: str
+    provenance: Provenance
+    missed: int
+    ended: bool
+    readings: tuple[Reading, ...]
+
+
+class Subscription(Following[Update]):
+    """A :class:`shmio.model.cell.Subscription` of a local instance."""
+
+    def __init__(
+        self,
+        instance: str,
+        blocks: Callable[[], Mapping[str, Block]],
+        check_running: Callable[[], None],
+        patterns: Sequence[str],
+        *,
+        every_frame: bool,
+        max_rate_hz: float,
+    ) -> None:
+        """Prepare to follow.
+
+        Args:
+            instance: Name of the instance, for messages.
+            blocks: Returns the instance's present blocks, by source.
+            check_running: Raises NotRunningError when the instance has stopped.
+            patterns: What to follow.
+            every_frame: Whether to give an update for each frame.
+            max_rate_hz: The most updates a second of each source; 0: no limit.
+        """
+        super().__init__(check_running)
+        self._instance = instance
+        self._blocks = blocks
+        self._patterns = patterns
+        self._wanted: dict[str, list[str]] = {}  # by source, each pattern with its source
+        self._every_frame = every_frame
+        self._interval_s = 1 / max_rate_hz if max_rate_hz > 0 and not every_frame else 0.0
+        self._followers: list[_Follower] = []
+        self._refusal: PathError | None = None
+        try:
+            self._begin()
+        except PathError as error:  # the first update raises it, as from a remote cell
+            self._refusal = error
+
+    def _take(self) -> Update | None:
+        if self._refusal is not None:
+            raise self._refusal
+        for follower in list(self._followers):
+            retired = follower.block.retired  # before looking: what was published before the end is still read
+            if (update := follower.take()) is not None:
+                self._followers.remove(follower)  # the others come first now
+                self._followers.append(follower)
+                return update
+            if retired and (update := self._succeed(follower)) is not None:
+                return update
+        self._due_s = min((follower.due_s for follower in self._followers), default=math.inf)
+        return None
+
+    def _begin(self) -> None:
+        """Follow the blocks that the patterns name. PathError: one names nothing."""
+        blocks = self._blocks()
+        layouts = {source: block.layout for source, block in blocks.items()}
+        wanted: dict[str, list[str]] = {}
+        for pattern in self._patterns:
+            choose([pattern], layouts)
+            topic = parse_topic(pattern, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
+            wanted.setdefault(topic.source, []).append(f"{topic.source}/{topic.path}".removesuffix("/"))
+        for source, patterns in wanted.items():
+            self._add(blocks[source], patterns)
+        self._wanted = wanted
+
+    def _add(self, block: Block, patterns: Sequence[str]) -> None:
+        """Follow a block. PathError: a pattern names nothing in it."""
+        registers = [register for _, register in choose(patterns, {block.source: block.layout})]
+        self._followers.append(_Follower(block, registers, every_frame=self._every_frame, interval_s=self._interval_s))
+        self._follow(block)
+
+    def _succeed(self, old: _Follower) -> Update | None:
+        """Follow the block that a reload has put in place of another; return the end if there is none."""
+        self._check_running()
+        self._followers.remove(old)
+        self._leave(old.block)
+        blocks, source = self._blocks(), old.block.source
+        if source in blocks:
+            try:
+                self._add(blocks[source], self._wanted[source])
+            except PathError as error:
+                return old.end(str(error))
+            return None
+        gone = sorted(self._wanted.keys() - blocks.keys())
+        named = f"source {gone[0]!r} was" if len(gone) == 1 else f"sources {', '.join(gone)} were"
+        return old.end(f"{named} removed from instance {self._instance!r} by a reload")
+
+    def close(self) -> None:
+        """End the subscription."""
+        self.end()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Follower:
+    """The registers of one block, and the frame that was given last."""
+
+    def __init__(self, block: Block, registers: Sequence[Register], *, every_frame: bool, interval_s: float) -> None:
+        self.block = block
+        self.due_s = math.inf
+        """When the next update may be given, if one waits for that."""
+        self._registers = registers
+        self._scan = ChangeScan(registers)
+        self._cursor = block.cursor(after=max(0, block.ring.head() - 1)) if every_frame else None
+        self._interval_s = interval_s
+        self._last_s = -math.inf
+        self._frame: Frame | None = None
+        self._state: object = None
+
+    def take(self) -> Update | None:
+        """Return the next update; None if there is none yet."""
+        frame, missed = self._next()
+        if frame is None and (frame := self._frame) is None:
+            return None
+        quality, reason = self.block.assess(frame)
+        # A stale reason holds the age: its text changes, the fact does not.
+        state = quality, reason.partition(":")[0], frame.provenance, frame.incarnation, self.block.standing.sequence
+        if self._frame is None or state != self._state:
+            changed: Sequence[int] = range(len(self._registers))
+        elif frame is self._frame:
+            return None
+        else:
+            changed = self._scan.changed(self._frame.image, frame.image)
+        self._frame, self._state = frame, state
+        if not changed and self._cursor is None:
+            return None
+        self._last_s = time.monotonic()
+        readings = tuple(reading(self.block, self._registers[index], frame) for index in changed)
+        return Update(
+            self.block.source, frame.number, frame.cycle, frame.incarnation, frame.clock_ns, frame.source_ns,
+            quality, reason, frame.provenance, missed, ended=False, readings=readings,
+        )  # fmt: skip
+
+    def _next(self) -> tuple[Frame | None, int]:
+        """Return the next frame, and how many were lost before it; None: there is none, or it is not due."""
+        if self._cursor is not None:
+            missed = self._cursor.missed
+            return self._cursor.poll(), self._cursor.missed - missed
+        self.due_s = math.inf
+        if self._frame is not None and self.block.ring.head() == self._frame.number:
+            return None, 0
+        if time.monotonic() < self._last_s + self._interval_s:
+            self.due_s = self._last_s + self._interval_s
+            return None, 0
+        try:
+            return self.block.latest(), 0
+        except SegmentError:  # it was overwritten during each read: there will be another
+            return None, 0
+
+    def end(self, what: str) -> Update:
+        """Return the last update of a source that a reload has removed."""
+        frame = self._frame
+        times = (0, 0, 0, 0, 0) if frame is None else (
+            frame.number, frame.cycle, frame.incarnation, frame.clock_ns, frame.source_ns,
+        )  # fmt: skip
+        provenance = Provenance.LIVE if frame is None else frame.provenance
+        return Update(self.block.source, *times, Quality.BAD, what, provenance, 0, ended=True, readings=())

@@ -1,0 +1,285 @@
+"""The interface of a running cell, on this host or another: docs/reference/cell.md."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
+
+if TYPE_CHECKING:
+    from shmio.layout.model import Layout
+    from shmio.model.clock import Clock
+    from shmio.model.injection import Declared, Happening, Injection, Lifted
+    from shmio.model.outcome import Outcome
+    from shmio.model.reading import Reading
+    from shmio.model.replay import Playing, Wish
+    from shmio.model.values import Provenance, Quality
+
+
+class Held(Protocol):
+    """A resource that a program holds until it closes it or leaves its ``with`` block."""
+
+    def close(self) -> None:
+        """Release it."""
+
+    def __enter__(self) -> Self:
+        """Return the object itself."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        """Close it."""
+
+
+class Update(Protocol):
+    """One frame of a source, and the registers that may have changed with it."""
+
+    @property
+    def source(self) -> str:
+        """Name of the source."""
+
+    @property
+    def frame(self) -> int:
+        """Number of the frame."""
+
+    @property
+    def cycle(self) -> int:
+        """Cycle of the source's schedule; in virtual time the number of the step."""
+
+    @property
+    def incarnation(self) -> int:
+        """Number of the source's process."""
+
+    @property
+    def clock_ns(self) -> int:
+        """The instance's clock when the frame was published."""
+
+    @property
+    def source_ns(self) -> int:
+        """The source's time stamp, UTC; 0 if there never were any values."""
+
+    @property
+    def quality(self) -> Quality:
+        """Quality of the frame, bad once it is stale."""
+
+    @property
+    def reason(self) -> str:
+        """Why the quality is not good, or what a reload has removed."""
+
+    @property
+    def provenance(self) -> Provenance:
+        """Where the source's own values come from."""
+
+    @property
+    def missed(self) -> int:
+        """With ``every_frame``: the frames lost between the update before and this one."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether a reload has removed the source, or all registers that were asked for."""
+
+    @property
+    def readings(self) -> Sequence[Reading]:
+        """The registers that may have changed since the update before: all of them with the first update.
+
+        Read them before you take the next update.
+        """
+
+
+class Subscription(Held, Protocol):
+    """Updates as they come, for one thread; any thread may close it, which ends the iteration."""
+
+    def __iter__(self) -> Iterator[Update]:
+        """Return the object itself."""
+
+    def __next__(self) -> Update:
+        """Wait for the next update.
+
+        Raises:
+            PathError: A pattern names nothing; only the first call raises it.
+            NotRunningError: The instance has ended.
+        """
+
+
+class Shadow(Held, Protocol):
+    """An injection whose values this program gives. Closing it lifts it, unless it was laid with ``keep``."""
+
+    @property
+    def number(self) -> int:
+        """Number of the injection, by which anybody may lift it."""
+
+    def set(self, values: Mapping[str, object]) -> list[Outcome]:
+        """Give values by path, and return the outcome of each.
+
+        Raises:
+            PathError: There is no such register.
+            ValueRangeError: A value does not fit its register.
+            CommandError: The injection was lifted, or the source does not answer.
+        """
+
+
+class Campaign(Held, Protocol):
+    """Declared injections that this program has laid, and their events.
+
+    Iterate over it for the events: the iteration ends when all injections are lifted. Closing it lifts
+    the rest, unless they were laid with ``keep``.
+    """
+
+    @property
+    def declared(self) -> tuple[Declared, ...]:
+        """The injections, in the order of the declarations."""
+
+    def __iter__(self) -> Iterator[Happening]:
+        """Return the object itself."""
+
+    def __next__(self) -> Happening:
+        """Wait for the next event. NotRunningError: the instance has ended."""
+
+
+class ReadsClock(Protocol):
+    """Reads the instance's clock."""
+
+    def __call__(self) -> Clock:
+        """Return its present state."""
+
+
+class Cell(Held, Protocol):
+    """A running cell.
+
+    :func:`shmio.attach` returns one on this host, :func:`shmio.connect` one behind gRPC. The methods
+    raise the errors of :mod:`shmio.errors`; every method raises NotRunningError if the instance has
+    ended or cannot be reached.
+    """
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the sources."""
+
+    def layouts(self, *sources: str) -> Mapping[str, Layout]:
+        """Return the layouts of these sources, or of all, by source. PathError: no such source."""
+
+    def get(self, *patterns: str) -> list[Reading]:
+        """Read registers, whatever their quality.
+
+        Args:
+            patterns: Paths, array elements, slices, structures, globs, or names of sources.
+
+        Returns:
+            A reading of each register that the patterns name, each once, in their order. Those of one
+            source come from one frame.
+
+        Raises:
+            PathError: A pattern names nothing.
+        """
+
+    def subscribe(self, *patterns: str, every_frame: bool = False, max_rate_hz: float = 0.0) -> Subscription:
+        """Follow registers: their present values, then each change.
+
+        Args:
+            patterns: As for :meth:`get`.
+            every_frame: Whether to give an update for each frame, in order, and count those that are
+                lost; otherwise a slow reader gets the newest values.
+            max_rate_hz: Without ``every_frame``: the most updates a second of each source; 0: no limit.
+        """
+
+    def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
+        """Write values to one source as one command, and wait for the outcomes.
+
+        Args:
+            values: Values by path: registers, whole arrays, elements, slices or bits.
+            timeout_s: How long the values may wait for a cycle of the source; None: 2 s, or three cycles.
+
+        Returns:
+            The outcome of each value, with its path as it was given, in the given order.
+
+        Raises:
+            PathError: A path names nothing, or the paths belong to several sources.
+            ValueRangeError: A value does not fit its register.
+            CommandError: A register is not writable, or the source's queue has no room.
+                After any of these errors nothing has been sent.
+        """
+
+    def inject(self, *patterns: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
+        """Lay an injection over registers of one source, all ``/out`` (the default) or all ``/in``.
+
+        Args:
+            patterns: As for :meth:`get`.
+            priority: Of several injections over a register the one with the highest is outermost.
+            keep: Whether the injection stays when this program ends, until somebody lifts it.
+            name: Name of the injection in events and lists.
+
+        Raises:
+            PathError: A pattern names nothing, or the patterns differ in source or direction.
+            CommandError: The source refuses, or does not answer.
+        """
+
+    def declare(self, declarations: Iterable[Any], *, keep: bool = False) -> Campaign:
+        """Lay injections that their sources run by themselves, all or none.
+
+        Args:
+            declarations: Mappings with the keys of an ``[[injection]]`` table, or
+                :class:`shmio.config.Declaration` objects.
+            keep: Whether the injections stay when this program ends, until they are over or lifted.
+
+        Raises:
+            ValueRangeError: A declaration is wrong; nothing was laid.
+            CommandError: A source refuses, or does not answer; nothing was laid.
+        """
+
+    def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
+        """Return the present injections of these sources, or of all; of each source the innermost first."""
+
+    def lift(self, source: str, number: int) -> None:
+        """Lift an injection, whoever laid it.
+
+        Raises:
+            PathError: There is no such source or injection.
+            CommandError: The source does not answer.
+        """
+
+    def lift_all(self, *sources: str) -> list[Lifted]:
+        """Lift all injections of these sources, or of all, whoever laid them; returns them.
+
+        Raises:
+            CommandError: Some could not be lifted; the message gives the reasons.
+        """
+
+    @property
+    def clock(self) -> ReadsClock:
+        """The state of the instance's clock: call it, ``clock()``."""
+
+    def real_sources(self) -> list[str]:
+        """Return the names of the sources that steps do not move, such as those with a device."""
+
+    def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
+        """Take control of time, move it by steps, and wait until all sources have done them.
+
+        Args:
+            dt_s: Length of each step in s, from 1 us to 1 h; None: the step size.
+            count: Number of steps.
+
+        Returns:
+            The state of the clock after the last step.
+
+        Raises:
+            TimeError: Another program owns time, or a step failed.
+            ValueRangeError: The length is out of range.
+        """
+
+    def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
+        """Let time step by itself, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
+
+    def pause(self) -> Clock:
+        """Take control of time, and stop it until it is stepped or played. TimeError."""
+
+    def release(self) -> Clock:
+        """Return to real time, which goes on from the present virtual time. TimeError."""
+
+    def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
+        """Move the sources that replay recordings; without arguments, only return their status.
+
+        Raises:
+            CommandError: The instance replays no recording, or a source does not answer.
+            PathError: There is no such source or register.
+            ValueRangeError: A speed or a time is out of range.
+        """
