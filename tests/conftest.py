@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import gc
+import inspect
 import os
 import secrets
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import CodeType, FunctionType, MethodType
 from typing import Any
 
 import pytest
@@ -21,9 +24,10 @@ from shmio.testing.mosquitto import missing
 # Tests interrupt themselves and others; who runs in the background, or beside others, begins with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# No deadline: the machine may be busy with other things. Each run has the same examples; --hypothesis-profile=search
-# looks for others.
+# No deadline: the machine may be busy with other things. Each run has the same examples, --fast fewer of them;
+# --hypothesis-profile=search looks for others.
 settings.register_profile("repeat", deadline=None, derandomize=True)
+settings.register_profile("fast", deadline=None, derandomize=True, max_examples=20)
 settings.register_profile("search", deadline=None, max_examples=1000)
 settings.load_profile("repeat")
 
@@ -45,6 +49,166 @@ ONE_AFTER_THE_OTHER = (
     ("tests/system/test_write.py",),
 )
 """Beginnings of the names of tests that share something, of which one process has to run all."""
+
+
+START_PROCESSES = (
+    "tests/native/",
+    "tests/system/",
+    "tests/unit/cli/test_completion.py",
+    "tests/unit/cli/test_models.py",
+    "tests/unit/cli/test_supervisor.py::test_a_fault_that_a_detached_one_finds_is_told_here",
+    "tests/unit/client/test_generated.py",
+    "tests/unit/endpoints/mqtt/broker/",
+    "tests/unit/simulation/test_a50.py::test_runs_as_a_source_on_db201",
+    "tests/unit/simulation/test_howto.py",
+)
+"""Beginnings of the names of tests that start processes without a word of STARTERS. The fast tier leaves them out."""
+
+STARTERS = {"ChildProcess", "Popen", "create_subprocess_exec", "fork", "forkpty", "pty", "subprocess"}
+"""The fast tier leaves out each test that has one of these names in its code, its helpers or its fixtures."""
+
+SLOW = (
+    "tests/unit/cli/test_dump_hostile.py",
+    "tests/unit/cli/test_dump_rewriting.py::test_a_flipped_bit_anywhere",
+    "tests/unit/cli/test_dump_rewriting.py::test_recover_of_a_file_cut_off_at_every_byte",
+    "tests/unit/cli/test_interrupt.py",
+    "tests/unit/config/test_faults.py::test_hostile_files",
+    "tests/unit/connectors/replay/test_recording.py::test_a_damaged_place_is_bad",
+    "tests/unit/connectors/s7/test_client.py::test_references_wrap_around",
+    "tests/unit/endpoints/grpc/commands/test_publish.py::test_many_streams",
+    "tests/unit/endpoints/grpc/commands/test_publish.py::test_ten_thousand",
+    "tests/unit/endpoints/grpc/server/test_call_guard.py::test_the_limits_hold",
+    "tests/unit/endpoints/grpc/services/test_simlog_v1.py::test_a_client_that_does_not_read",
+    "tests/unit/endpoints/grpc/services/test_subscribers.py",
+    "tests/unit/endpoints/grpc/shmio_v1/test_clock.py::test_a_stream_that_is_not_read",
+    "tests/unit/endpoints/grpc/test_inject_v2.py::test_a_subscriber_that_does_not_read",
+    "tests/unit/endpoints/grpc/test_rude.py",
+    "tests/unit/layout/test_compiler.py::test_bounds_on_files",
+    "tests/unit/layout/test_instances.py::test_many_",
+    "tests/unit/layout/test_structures.py::test_a_table_cannot_hide_more_registers",
+    "tests/unit/recorder/test_closing.py::test_it_may_end_anywhere",
+    "tests/unit/recording/reading/test_reader.py::test_changed_bytes",
+    "tests/unit/recording/test_check.py::test_no_",
+    "tests/unit/recording/test_dump.py::test_whatever_the_order",
+    "tests/unit/segment/test_segment.py::test_a_damaged_segment",
+)
+"""Beginnings of the names of tests that start no process but take seconds. The fast tier leaves them out."""
+
+APART = ("tests/system/test_benchmarks.py",)
+"""Beginnings of the names of tests that run only with --all, or when they are named."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    tiers = parser.getgroup("tiers").addoption
+    tiers("--fast", action="store_true", help="only quick tests that start no process")
+    tiers("--all", action="store_true", help="also the tests that are not run unless you name them")
+
+
+def left_out(config: pytest.Config) -> tuple[str, ...]:
+    """Beginnings of the names of tests that are not in the tier that was asked for."""
+    if config.option.fast:
+        return (*START_PROCESSES, *SLOW, *APART)
+    return () if config.option.all else tuple(name for name in APART if not any(name in given for given in config.args))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files of which no test is in the tier, without importing them."""
+    name = collection_path.relative_to(config.rootpath).as_posix() + "/" * collection_path.is_dir()
+    return name.startswith(left_out(config)) or None
+
+
+class StarterFinder:
+    """Finds the tests that start a process, by the names in their code, and in that of their helpers and fixtures."""
+
+    def __init__(self) -> None:
+        self._known: dict[object, bool] = {}
+
+    def starts_process(self, item: pytest.Item) -> bool:
+        """Whether a test or a fixture of it has one of STARTERS."""
+        if not isinstance(item, pytest.Function):
+            return False
+        test = getattr(item.obj, "hypothesis", None)
+        used = [test.inner_test if test else item.obj]
+        for fixtures in item._fixtureinfo.name2fixturedefs.values():
+            used += [fixture.func for fixture in fixtures]
+        return any(self._names(one) for one in used)
+
+    def _names(self, used: object) -> bool:
+        """Whether a function or class has one of STARTERS, itself or in a helper of the tests that it uses."""
+        used = inspect.unwrap(used) if callable(used) else used
+        if isinstance(used, MethodType):
+            used = used.__func__
+        if not (getattr(used, "__module__", None) or "").startswith(("tests.", "shmio.testing")):
+            return False
+        if used not in self._known:
+            self._known[used] = False  # until it is known, for those that use one another
+            if isinstance(used, type):
+                self._known[used] = any(self._names(one) for one in vars(used).values() if callable(one))
+            elif isinstance(used, FunctionType):
+                names = set(code_names(used.__code__))
+                helpers = [used.__globals__[name] for name in names if callable(used.__globals__.get(name))]
+                self._known[used] = not STARTERS.isdisjoint(names) or any(self._names(one) for one in helpers)
+        return self._known[used]
+
+
+def code_names(code: CodeType) -> Iterator[str]:
+    """Names that a function uses, and those of functions within it."""
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from code_names(constant)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests that are not in the tier."""
+    names, finder = left_out(config), StarterFinder()
+    out = {
+        item for item in items if item.nodeid.startswith(names) or (config.option.fast and finder.starts_process(item))
+    }
+    if out:
+        config.hook.pytest_deselected(items=list(out))
+        items[:] = [item for item in items if item not in out]
+
+
+NEW_PROCESS = {"os.exec", "os.fork", "os.forkpty", "os.posix_spawn", "os.system", "subprocess.Popen"}
+"""Audit events of the interpreter."""
+
+
+class NoProcesses:
+    """Fails each test that starts a process, and prevents the start."""
+
+    def __init__(self) -> None:
+        self._started: list[str] = []
+        self._testing = False
+        sys.addaudithook(self._audit)
+
+    def _audit(self, event: str, arguments: tuple[object, ...]) -> None:
+        if self._testing and event in NEW_PROCESS and arguments[:1] != ("lscpu",):  # import of numpy.testing before 2
+            self._started.append(f"{event} {arguments[0] if arguments else ''}")
+            raise RuntimeError("a test of the fast tier may start no process")
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self) -> Iterator[None]:
+        """Watch the test and its fixtures."""
+        self._testing = True
+        try:
+            return (yield)
+        finally:
+            self._testing = False
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_runtest_teardown(self) -> None:
+        """Fail the test even if the code under test took the exception for its own."""
+        started, self._started = self._started, []
+        if started:
+            pytest.fail(f"not for the fast tier, add the test to START_PROCESSES in {__file__}: it starts {started}")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Prepare the fast tier."""
+    if config.option.fast:
+        settings.load_profile("fast")
+        config.pluginmanager.register(NoProcesses())
 
 
 class Scheduling(LoadScopeScheduling):  # type: ignore[misc]

@@ -18,8 +18,6 @@ from shmio.testing.cell import BIN
 from tests.unit.cli.terminal import Terminal
 from tests.unit.recording.build import varied
 
-pytest.importorskip("argcomplete")
-
 LAYOUT = Layout(
     "DB1",
     1,

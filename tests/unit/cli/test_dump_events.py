@@ -124,7 +124,8 @@ def test_the_export_for_viewers_has_all_of_an_event(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 def test_a_table_of_events(form: str, capsys: pytest.CaptureFixture[str]) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet")
+    from pyarrow import parquet
+
     two = accepted(Write(8, 0, b"\0\6\0\7\0\x08\0"), 1)
     recorded(
         accepted(Write(0, 0, b"\0\5")), two._replace(offset=0, data=b"\0\1" + bytes(5), size=7), Record(EventKind.NOTED)

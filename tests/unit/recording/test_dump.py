@@ -380,7 +380,9 @@ def test_tables_of_other_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_pandas_and_polars(tmp_path: Path) -> None:
-    pandas, polars = pytest.importorskip("pandas"), pytest.importorskip("polars")
+    import pandas  # slow to import
+    import polars
+
     with shmio.open_dump(varied(tmp_path / "a.mem")) as dump:
         columns = dump.columns("cell")
     for table in (columns.to_pandas(), columns.to_polars()):

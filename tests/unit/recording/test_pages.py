@@ -34,8 +34,6 @@ def test_the_programs_are_found() -> None:
 
 @pytest.mark.parametrize(("page", "program"), snippets(), ids=["change", "columns", "pandas", "all"])
 def test_a_program_of_the_manual(page: str, program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if "to_pandas" in program:
-        pytest.importorskip("pandas")
     monkeypatch.chdir(tmp_path)
     source = ROOT / "shmio/cli/a50/db201.db"
     [layout] = compile_sources([Source(source.name, source.read_bytes())]).layouts
