@@ -17,8 +17,8 @@ from shmio.backoff import Backoff
 from shmio.connectors.base import Connector
 from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.declared_injections import Blocks
+from shmio.connectors.injection.output import Image, Output
 from shmio.connectors.injection.processor import OwnerOf
-from shmio.connectors.output import Image, Output
 from shmio.connectors.schedule import Schedule
 from shmio.connectors.source_status import Counters, QualityLog
 from shmio.errors import ConnectorError

@@ -41,7 +41,7 @@ GROUPS: Final = {
             "shmio/connectors/injection/layers.py",
             "shmio/connectors/injection/processor.py",
             "shmio/connectors/loop.py",
-            "shmio/connectors/output.py",
+            "shmio/connectors/injection/output.py",
             "shmio/layout/values/write.py",
             "shmio/local/step_answers.py",
             "shmio/local/writer.py",

@@ -17,9 +17,9 @@ from shmio.connectors.commands.batch import End, Item, coalesce, ends, one_each,
 from shmio.connectors.commands.finite import FiniteCheck
 from shmio.connectors.injection.declared_injections import Blocks
 from shmio.connectors.injection.layers import Layer, uncovered
+from shmio.connectors.injection.output import Output
 from shmio.connectors.injection.processor import InjectionProcessor, OwnerOf
-from shmio.connectors.injection.published import divert_command, pieces
-from shmio.connectors.output import Output
+from shmio.connectors.injection.published import pieces
 from shmio.layout.values.write import Write, cover
 from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
 
@@ -255,7 +255,7 @@ class CommandProcessor:
 
     def _accept(self, command: Command, layer: Layer | None) -> None:
         """Apply the injections below ``layer`` to a command, and queue the rest for the cycle."""
-        left, taken = divert_command(self._output, command, layer)
+        left, taken = _divert(self._output, command, layer)
         left = [pair for pair in left if not self._made_unfit(pair[0])]
         self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # every DIVERTED event was published before
         items = [item for item, _ in left]
@@ -315,3 +315,34 @@ class CommandProcessor:
         """Publish the ends of accepted items, one event for neighbours that ended alike."""
         for record in records(items, ends):
             self._writer.event(record)
+
+
+def _divert(
+    output: Output, command: Command, above: Layer | None
+) -> tuple[list[tuple[Item, Layer | None]], list[Item]]:
+    """Pass a command's items through the layers below ``above``, and publish what these change.
+
+    Returns:
+        The items with bits left for the device, each with the layer that sent or changed it last;
+        and the items of which nothing is left.
+
+    """
+    left: list[tuple[Item, Layer | None]] = []
+    taken: list[Item] = []
+    for place, write in enumerate(command.writes):
+        if not output.injections.layers:
+            left.append((Item(command, place), None))
+            continue
+        with output.turn:
+            met, bits, data, by = output.injections.divert(write, above)
+        for layer, parts in met:
+            for record in pieces(EventKind.DIVERTED, command, place, parts, layer):
+                output.writer.event(record)
+        if not met:
+            left.append((Item(command, place), above))
+        elif any(bits):
+            changed_by = (by.name or str(by.id)) if by and data != write.data else ""
+            left.append((Item(command, place, bits, data, changed_by), by or above))
+        else:
+            taken.append(Item(command, place))
+    return left, taken

@@ -19,8 +19,8 @@ from shmio.config import Declaration
 from shmio.config.declaration import contradictions
 from shmio.connectors.injection.declared_layer import MAX_HELD, DeclaredLayer, declared, resumed
 from shmio.connectors.injection.layers import Bits, CycleImage, Owner
+from shmio.connectors.injection.output import Image
 from shmio.connectors.injection.published import LayerPublisher, in_parts, layer_event, lost
-from shmio.connectors.output import Image
 from shmio.errors import ConfigError, SegmentError
 from shmio.injection import Program, compile_program
 from shmio.injection.activation import State

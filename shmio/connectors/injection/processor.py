@@ -11,8 +11,8 @@ import numpy as np
 from shmio.connectors.injection.declared_injections import Blocks, DeclaredInjections
 from shmio.connectors.injection.declared_layer import DeclaredLayer
 from shmio.connectors.injection.layers import Bits, Layer, LayerStack, Owner, covering, shadow
+from shmio.connectors.injection.output import Output
 from shmio.connectors.injection.published import LayerPublisher, layer_event, pieces
-from shmio.connectors.output import Output
 from shmio.layout.values.write import Write, apply
 from shmio.segment import Command, CommandKind, Direction, EventKind
 from shmio.segment.events import EVENT_SLOTS

@@ -8,10 +8,9 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from shmio.connectors.commands.batch import Item
 from shmio.connectors.injection.declared_layer import DeclaredLayer
 from shmio.connectors.injection.layers import Layer, LayerStack
-from shmio.connectors.output import Output
+from shmio.connectors.injection.output import Output
 from shmio.layout.values.write import Write
 from shmio.segment import NO_WRITER, Command, Direction, EventKind, Record
 from shmio.segment.events import EVENT_DATA_SIZE
@@ -147,37 +146,6 @@ class LayerPublisher:
             )  # fmt: skip
             shown = self._shown[layer.id] = running, msgspec.json.encode(standing)
         return shown[1]
-
-
-def divert_command(
-    output: Output, command: Command, above: Layer | None
-) -> tuple[list[tuple[Item, Layer | None]], list[Item]]:
-    """Pass a command's items through the layers below ``above``, and publish what these change.
-
-    Returns:
-        The items with bits left for the device, each with the layer that sent or changed it last;
-        and the items of which nothing is left.
-
-    """
-    left: list[tuple[Item, Layer | None]] = []
-    taken: list[Item] = []
-    for place, write in enumerate(command.writes):
-        if not output.injections.layers:
-            left.append((Item(command, place), None))
-            continue
-        with output.turn:
-            met, bits, data, by = output.injections.divert(write, above)
-        for layer, parts in met:
-            for record in pieces(EventKind.DIVERTED, command, place, parts, layer):
-                output.writer.event(record)
-        if not met:
-            left.append((Item(command, place), above))
-        elif any(bits):
-            changed_by = (by.name or str(by.id)) if by and data != write.data else ""
-            left.append((Item(command, place, bits, data, changed_by), by or above))
-        else:
-            taken.append(Item(command, place))
-    return left, taken
 
 
 def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:

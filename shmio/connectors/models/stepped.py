@@ -8,10 +8,10 @@ from typing import Final, Protocol
 
 from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.declared_injections import Blocks
+from shmio.connectors.injection.output import Image, Output
 from shmio.connectors.injection.processor import OwnerOf
 from shmio.connectors.models.computed import Computed
 from shmio.connectors.models.inputs import Inputs
-from shmio.connectors.output import Image, Output
 from shmio.connectors.schedule import Schedule
 from shmio.connectors.source_status import Counters, QualityLog
 from shmio.errors import ShmioError

@@ -9,9 +9,9 @@ from typing import Final
 
 from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.declared_injections import Blocks
+from shmio.connectors.injection.output import Output
 from shmio.connectors.injection.processor import OwnerOf
 from shmio.connectors.models.stepped import StepClock
-from shmio.connectors.output import Output
 from shmio.connectors.replay.player import OVER, STOPPED, Player, is_replayed
 from shmio.connectors.replay.recorded_source import Entry, RecordedSource
 from shmio.connectors.replay.recording import MAX_NS

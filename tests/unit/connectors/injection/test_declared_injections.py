@@ -15,7 +15,7 @@ from shmio.config import Declaration
 from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.declared_layer import MAX_HELD
 from shmio.connectors.injection.layers import Owner
-from shmio.connectors.output import Image, Output
+from shmio.connectors.injection.output import Image, Output
 from shmio.errors import CommandError
 from shmio.injection.draw import SeededRandom
 from shmio.layout.compiler import Source, compile_sources
