@@ -26,8 +26,8 @@ def inject(served: Endpoint, target: str, shadow: str, **options: Any) -> Any:
     return served.stub.Inject(request, **{"timeout": TIMEOUT_S, **options})
 
 
-async def laid(served: Endpoint, target: str, shadow: str) -> Any:
-    stream = inject(served, target, shadow)
+async def laid(served: Endpoint, target: str, shadow: str, **options: Any) -> Any:
+    stream = inject(served, target, shadow, **options)
     await stream.initial_metadata()
     return stream
 
@@ -328,7 +328,8 @@ def test_a_client_that_does_not_read_what_is_written_loses_its_injection_and_no_
     monkeypatch.setattr("shmio.endpoints.grpc.streams.outbox.EVENT_BOUND", 20)
 
     async def test(served: Endpoint, device: Plant) -> None:
-        originals = await laid(served, "cell/long/in", "s")
+        # The client's window is filled value by value, which takes a busy machine its time.
+        originals = await laid(served, "cell/long/in", "s", timeout=9 * TIMEOUT_S)
         sent: list[str] = []
         while standing(served):
             # One by one: on a busy machine more than the bound would come at once, before any of it could be sent.
