@@ -12,7 +12,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from shmio.errors import AlreadyRunningError, FormatError, NotRunningError, SegmentError, UnfinishedError
+from shmio.errors import (
+    AlreadyRunningError,
+    FormatError,
+    NotRunningError,
+    SegmentError,
+    UnfinishedError,
+    WrongInstanceError,
+)
 from shmio.layout.model import Layout, Register
 from shmio.segment import (
     Activity,
@@ -123,6 +130,18 @@ def test_a_ring_without_a_readable_frame_is_told_with_the_remedy(instance: str) 
 def test_an_instance_that_does_not_run_is_named_with_the_remedy(instance: str) -> None:
     with pytest.raises(NotRunningError, match=f"{instance}.*shmio-supervisor up"):
         Segment.open(instance)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_instance_of_another_configuration_is_refused_with_both_paths(
+    instance: str, tmp_path: Path, known: bool
+) -> None:
+    own, other = (tmp_path / folder / "supervisor.toml" for folder in ("own", "other"))
+    with Segment.create(instance, [], [], config=own if known else None) as segment:
+        started = str(own) if known else "an unknown file"
+        with pytest.raises(WrongInstanceError, match=rf"{started}.* not from {other}: .*--instance {instance}"):
+            Segment.open(instance, config=other)
+        segment.unlink()
 
 
 def test_no_room_is_said_at_creation_and_nothing_is_left(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
