@@ -78,7 +78,7 @@ static void map(const char *instance)
     if (memory == MAP_FAILED) fail("cannot map %s", object);
     base = memory;
     uint64_t magic = base ? get64(0) : 0; /* acquire: the magic is written last */
-    if (magic == 0) fail("instance %s is just starting, or died while it did", instance);
+    if (magic == 0) fail("instance %s is starting, or died during its start", instance);
     if (memcmp(&magic, "SHMIOSEG", 8) != 0) fail("%s is no segment of shmio", object);
     if (get32(8) != ABI || get32(12) != 4096) fail("%s has ABI %u, this program knows %d", object, get32(8), ABI);
 }

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Backoff:
-    """How long to wait between attempts. It is a value: the caller counts its failures.
+    """Rule for the waits between attempts; it has no state, and the caller counts failures.
 
     Attributes:
         first_s: The first wait, in s.

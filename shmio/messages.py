@@ -55,11 +55,11 @@ def value_to_wire(value: object, path: str) -> wire.Value:
         return wire.Value(text=value)
     if isinstance(value, (list, tuple)):
         return wire.Value(list=wire.List(values=[value_to_wire(item, path) for item in value]))
-    raise ValueRangeError(f"{path}: a {type(value).__name__} is no value of a register")
+    raise ValueRangeError(f"{path}: a {type(value).__name__} is not a value of a register")
 
 
 def value_from_wire(value: wire.Value, path: str) -> object:
-    """Convert a message to a Python value; ValueRangeError if it has none."""
+    """Convert a message to a Python value; ValueRangeError if the message has no value."""
     kind = value.WhichOneof("kind")
     if kind is None:
         raise ValueRangeError(f"{path}: no value is given")
@@ -84,7 +84,7 @@ def declaration_to_wire(table: Mapping[str, Any], key: str) -> wire.Declaration:
     operation = left.pop("operation", None)
     own = _OPERATIONS.get(operation) if isinstance(operation, str) else None
     if own is None:
-        raise ValueRangeError(f"{key}.operation: {operation!r} is none; there are: {', '.join(_OPERATIONS)}")
+        raise ValueRangeError(f"{key}.operation: {operation!r} is unknown; valid: {', '.join(_OPERATIONS)}")
     target = left.pop("target", [])
     try:
         found = wire.Declaration(name=left.pop("name", ""), targets=[target] if isinstance(target, str) else target)
@@ -117,7 +117,7 @@ def _set(part: Any, field: str, value: Any, key: str) -> None:
         part.bits.extend(value)
     elif field == "distribution":
         if value not in _DISTRIBUTIONS:
-            raise ValueRangeError(f"{key}: {value!r} is none; there are: {', '.join(_DISTRIBUTIONS)}")
+            raise ValueRangeError(f"{key}: {value!r} is unknown; valid: {', '.join(_DISTRIBUTIONS)}")
         part.distribution = _DISTRIBUTIONS[value]
     else:
         setattr(part, field, value)

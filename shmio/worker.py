@@ -41,7 +41,9 @@ class Worker:
         self.log = self._set_up_log(Path(spec["log_file"]))
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
-            raise SegmentError(f"the segment of instance {spec['instance']!r} is another run's; this process ends")
+            raise SegmentError(
+                f"the segment of instance {spec['instance']!r} belongs to another run; this process ends"
+            )
         self.slot = self.segment.processes.find(self.name)
         self._take_role()
         self.before = self.slot.report

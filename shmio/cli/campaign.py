@@ -46,8 +46,8 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
             print(told, flush=True)
         clock = cell.clock()
         if clock.virtual and not clock.playing and any(one.start_s or one.end_s for one in declarations):
-            stands = f"time stands at {clock.present_ns / 1e9:.3f} s"
-            print(f"{stands}: start_s and end_s wait for shmio step to move it", file=sys.stderr, flush=True)
+            stands = f"time is paused at {clock.present_ns / 1e9:.3f} s"
+            print(f"{stands}: start_s and end_s wait until shmio step moves it", file=sys.stderr, flush=True)
         _follow(campaign, over, options)
     return 0
 

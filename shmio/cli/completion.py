@@ -104,7 +104,7 @@ def _registers(prefix: str, parsed_args: argparse.Namespace, **_: object) -> lis
 
 
 def _paths(options: argparse.Namespace) -> dict[str, list[str]]:
-    """Return paths by source: of the recordings on the line, else of the instance on this host."""
+    """Return paths by source, from the recordings on the command line or from the instance."""
     files = getattr(options, "files", None) or [getattr(options, "file", None)]
     try:
         return _recorded(files) if hasattr(options, "output") or files[0] else _running(options)

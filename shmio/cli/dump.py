@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     around = arguments.verb == "record" and (arguments.before_s, arguments.after_s) != (None, None)
     if around and arguments.when is None:
-        parser.error("--before and --after are for --when: without a condition all is recorded, from now on")
+        parser.error("--before and --after need --when: without a condition, everything is recorded from now on")
 
     with ended_by_interrupt():
         verb = importlib.import_module(f"shmio.cli.recordings.{arguments.verb}")  # each needs other parts of shmio
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=PROGRAM, description="Record a running instance, and look into recordings.")
+    parser = argparse.ArgumentParser(prog=PROGRAM, description="Record a running instance, and examine recordings.")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
@@ -59,40 +59,52 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
     record.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     record.add_argument(
-        "-o", dest="directory", type=Path, default=Path("dumps"), metavar="DIR", help="where to (default: dumps)"
+        "-o",
+        dest="directory",
+        type=Path,
+        default=Path("dumps"),
+        metavar="DIR",
+        help="directory of the files (default: dumps)",
     )
-    record.add_argument("--for", dest="duration_s", type=_seconds, metavar="SECONDS", help="end by itself")
-    record.add_argument("--source", dest="sources", nargs="+", action="extend", metavar="NAME", help="only these")
+    record.add_argument("--for", dest="duration_s", type=_seconds, metavar="SECONDS", help="stop after this time")
     record.add_argument(
-        "--register", dest="registers", nargs="+", action="extend", metavar="PATH", help="only these: paths or globs"
+        "--source", dest="sources", nargs="+", action="extend", metavar="NAME", help="only these sources"
+    )
+    record.add_argument(
+        "--register",
+        dest="registers",
+        nargs="+",
+        action="extend",
+        metavar="PATH",
+        help="only these registers: paths or globs",
     )
 
-    record.add_argument("--when", metavar="CONDITION", help="only what happens around the times when this is true")
-    for option, what in (("--before", "before it is true"), ("--after", "after it was true last")):
+    record.add_argument("--when", metavar="CONDITION", help="record only around the times when this is true")
+    for option, what in (("--before", "before it becomes true"), ("--after", "after it was last true")):
         record.add_argument(
             option, dest=f"{option[2:]}_s", type=_amount, metavar="SECONDS",
-            help=f"with --when: so much {what} (default 10)",
+            help=f"with --when: time to record {what} (default 10)",
         )  # fmt: skip
 
-    add_json(record, "print what goes on as a JSON object a line")
+    add_json(record, "print events as one JSON object per line")
 
     note = verb("note", "put a note into the events of a running instance, and so into its recordings")
     note.add_argument("text", metavar="TEXT")
     note.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
     note.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     note.add_argument(
-        "--source", metavar="NAME", help="whose events (default: grpc.default_source, or the first source)"
+        "--source", metavar="NAME", help="source that gets the note (default: grpc.default_source, or the first source)"
     )
 
-    info = verb("info", "tell what is in recordings")
+    info = verb("info", "describe recordings")
     info.add_argument("files", nargs="+", type=Path, metavar="FILE")
     add_json(info, SOME_FILES)
 
-    verify = verb("verify", "read all of recordings, and tell what is damaged; exit status 1 if anything is")
+    verify = verb("verify", "read recordings completely, and report damage; exit status 1 if there is any")
     verify.add_argument("files", nargs="+", type=Path, metavar="FILE")
     add_json(verify, SOME_FILES)
 
-    recover = verb("recover", "write what is whole of a damaged recording to a new file")
+    recover = verb("recover", "write the intact parts of a damaged recording to a new file")
     recover.add_argument("file", type=Path, metavar="FILE")
     _output(recover, "the new file (default: FILE-recovered.mem)", required=False)
 
@@ -105,18 +117,22 @@ def _parser() -> argparse.ArgumentParser:
 
     export = verb("export", "write values for other programs: Parquet, CSV, or MCAP for viewers")
     export.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    _output(export, "the new file, or of tables the new folder with a file for each block")
+    _output(export, "the new file, or for tables a new folder with a file for each block")
     export.add_argument(
-        "--format", choices=("parquet", "csv", "mcap"), help="default: as the name of the new file ends; else parquet"
+        "--format",
+        choices=("parquet", "csv", "mcap"),
+        help="default: from the ending of the new file's name, else parquet",
     )
     _times(export)
     _some(export)
-    export.add_argument("--events", action="store_true", help="a table of the events in place of the values")
-    export.add_argument("--raw", action="store_true", help="what sources delivered, without what was injected")
+    export.add_argument("--events", action="store_true", help="write a table of the events instead of the values")
+    export.add_argument(
+        "--raw", action="store_true", help="write the values that sources delivered, without injections"
+    )
 
     add_json(export)
 
-    diff = verb("diff", "tell where two recordings differ; exit status 1 if they do")
+    diff = verb("diff", "compare two recordings; exit status 1 if they differ")
     diff.add_argument("files", nargs=2, type=Path, metavar="FILE")
     _some(diff)
     diff.add_argument(
@@ -126,30 +142,32 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         type=_ignorable,
         metavar="WHAT",
-        help=f"what may differ: {', '.join(IGNORABLE)}",
+        help=f"ignore differences in: {', '.join(IGNORABLE)}",
     )
     diff.add_argument("--tolerance", type=_amount, default=0.0, metavar="X", help="REAL and LREAL may differ by this")
-    diff.add_argument("--relative", type=_amount, default=0.0, metavar="X", help="or by this part of the larger one")
+    diff.add_argument(
+        "--relative", type=_amount, default=0.0, metavar="X", help="or by this fraction of the larger value"
+    )
     add_json(diff)
 
     merge = verb("merge", "write several recordings of one run to one new file")
     merge.add_argument("files", nargs="+", type=Path, metavar="FILE")
     _output(merge, "the new file")
 
-    campaign = verb("campaign", "write what was injected as a campaign, which shmio inject --file does again")
+    campaign = verb("campaign", "write the injections as a campaign, which shmio inject --file repeats")
     campaign.add_argument("files", nargs="+", type=Path, metavar="FILE")
     _output(campaign, "the new file, such as campaign.toml")
     campaign.add_argument(
-        "--from-zero", action="store_true", help="have the first one begin at 0, for shmio inject --from-now"
+        "--from-zero", action="store_true", help="let the first injection begin at 0, for shmio inject --from-now"
     )
 
-    cat = verb("cat", "print values as they changed, events, and what was missed")
+    cat = verb("cat", "print changes of values, events and gaps")
     cat.add_argument("file", type=Path, metavar="FILE")
     cat.add_argument("patterns", nargs="*", metavar="PATH", help="register, element, structure or glob (default: all)")
     _times(cat)
     add_full(cat)
     forms = cat.add_mutually_exclusive_group()
-    add_json(forms, "print a JSON object a line")
+    add_json(forms, "print one JSON object per line")
     forms.add_argument("--csv", action="store_true", help="print CSV")
     return parser
 
@@ -166,7 +184,7 @@ def _times(verb: argparse.ArgumentParser) -> None:
 
 
 def _some(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("--source", dest="sources", nargs="+", action="extend", metavar="NAME", help="only these")
+    verb.add_argument("--source", dest="sources", nargs="+", action="extend", metavar="NAME", help="only these sources")
     verb.add_argument(
         "--only", nargs="+", action="extend", metavar="PATH", help="only these registers, structures or globs"
     )
@@ -175,7 +193,7 @@ def _some(verb: argparse.ArgumentParser) -> None:
 def _ignorable(text: str) -> str:
     for word in text.split(","):
         if word not in IGNORABLE:
-            raise argparse.ArgumentTypeError(f"{word!r} is none of {', '.join(IGNORABLE)}")
+            raise argparse.ArgumentTypeError(f"{word!r} is unknown; valid: {', '.join(IGNORABLE)}")
     return text
 
 

@@ -26,22 +26,22 @@ if _HEEDED:
 
 
 def shmio() -> int:
-    """``shmio``."""
+    """Run the command ``shmio``."""
     return _run("shmio.cli.user")
 
 
 def shmio_dump() -> int:
-    """``shmio-dump``."""
+    """Run the command ``shmio-dump``."""
     return _run("shmio.cli.dump")
 
 
 def shmio_layout() -> int:
-    """``shmio-layout``."""
+    """Run the command ``shmio-layout``."""
     return _run("shmio.cli.layout")
 
 
 def shmio_supervisor() -> int:
-    """``shmio-supervisor``."""
+    """Run the command ``shmio-supervisor``."""
     return _run("shmio.cli.supervisor")
 
 

@@ -24,27 +24,27 @@ from shmio.layout.values.write import Write
 from shmio.logs import printable
 from shmio.model.cell import Cell
 
-HELP = "Have consumers, or with /in the device, get other values than they would, until Ctrl-C."
+HELP = "Give consumers, or with /in the device, other values until Ctrl-C."
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
     parser.epilog = (
-        "Over PATH or PATH/out consumers see VALUE; over PATH/in the device gets it, and nothing that others write. "
-        "VALUE is JSON or an S7 literal. Without any PATH: what is injected at present."
+        "Over PATH or PATH/out, consumers see VALUE. Over PATH/in, the device gets VALUE instead of what others write. "
+        "VALUE is JSON or an S7 literal. Without any PATH, the present injections are listed."
     )
     parser.add_argument("pairs", nargs="*", action=Pairs, metavar="PATH VALUE", help="register or array element")
     parser.add_argument("--file", type=Path, metavar="CAMPAIGN.toml", help="lay the injections that a file declares")
-    parser.add_argument("--seed", type=_seed, metavar="N", help="of those of the file that have none")
+    parser.add_argument("--seed", type=_seed, metavar="N", help="seed for injections that have none")
     parser.add_argument("--from-now", action="store_true", help="times in the file count from now, not from the start")
-    parser.add_argument("--list", action="store_true", help="what is injected at present, as without any PATH")
+    parser.add_argument("--list", action="store_true", help="list the present injections, as without any PATH")
     how_long = parser.add_mutually_exclusive_group()
-    how_long.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="lift after so many seconds")
+    how_long.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="lift after this many seconds")
     parser.add_argument("--priority", type=int, default=0, metavar="N", help="the highest is outermost (default: 0)")
-    parser.add_argument("--name", default="", help="what it is called in the list")
-    how_long.add_argument("--keep", action="store_true", help="leave it there, until it is lifted by its number")
-    parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one, whoever laid it")
-    parser.add_argument("--lift-all", action="store_true", help="lift all of them, of all sources")
+    parser.add_argument("--name", default="", help="its name in the list")
+    how_long.add_argument("--keep", action="store_true", help="keep it until it is lifted by its number")
+    parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one injection, whoever laid it")
+    parser.add_argument("--lift-all", action="store_true", help="lift all injections of all sources")
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:

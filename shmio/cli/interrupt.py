@@ -12,7 +12,7 @@ from types import FrameType
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that is set by the first of these signals; whoever heeded them before does so again afterwards.
+    """Yield an event that the first of these signals sets; restore the handlers at the end.
 
     SIGHUP counts unless it is ignored, as by nohup.
     """

@@ -33,9 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         help="further sources, with the PLC data types, function blocks and constants it uses",
     )
-    parser.add_argument(
-        "--block", metavar="NAME", help="this data block alone; what is wrong with others does not count"
-    )
+    parser.add_argument("--block", metavar="NAME", help="only this data block; ignore errors in others")
     parser.add_argument(
         "--type-bytes",
         metavar="TYPE=BYTES",
@@ -72,7 +70,7 @@ def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], 
         _complain(one for one in error.diagnostics if one.severity == "warning")  # its text has the errors
         raise
     _complain(compiled.warnings)
-    _complain(f"warning: --type-bytes: nothing is of the type {name!r}" for name in compiled.unused)
+    _complain(f"warning: --type-bytes: nothing has the type {name!r}" for name in compiled.unused)
     for layout in compiled.layouts:
         _complain(_unread(layout))
     _print(compiled.layouts, as_json=as_json)

@@ -14,16 +14,16 @@ from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.replay import Playing, Wish
 
-HELP = "Tell how recordings play, and move them: pause, play, seek, and more."
+HELP = "Show how recordings play, and control them: pause, play, seek, and more."
 
 _VERBS: Final = {
-    "status": "tell how they play (default)",
+    "status": "show how they play (default)",
     "pause": "stand",
-    "play": "go on; from the end at the beginning",
-    "seek": "TIME: be there",
+    "play": "continue; at the end, begin again",
+    "seek": "TIME: go there",
     "until": "TIME: play until then, and pause",
-    "speed": "X: times as fast as the instance's clock, 0.01 to 1000",
-    "loop": "on or off: begin anew at the end",
+    "speed": "X: speed relative to the instance's clock, 0.01 to 1000",
+    "loop": "on or off: begin again at the end",
     "to-change": "PATH: play to the next change of a register, and pause",
     "to-event": "KIND: play to the next event of a kind, such as accepted, quality, injected, or any, and pause",
 }
@@ -34,13 +34,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     lines = "\n".join(f"  {verb:<10} {text}" for verb, text in _VERBS.items())
-    parser.description = f"{HELP}\n\nACTION is one of\n{lines}\n\nTIME: seconds from the begin, or a date and time."
+    parser.description = f"{HELP}\n\nACTION is one of\n{lines}\n\nTIME: seconds from the start, or a date and time."
     parser.add_argument("action", choices=_VERBS, nargs="?", default="status", metavar="ACTION")
     parser.add_argument("value", nargs="?", metavar="VALUE")
     parser.add_argument("--speed", type=float, metavar="X", help="with play: how fast")
-    parser.add_argument("--jump", action="store_true", help="with to-change, to-event: be there at once")
+    parser.add_argument("--jump", action="store_true", help="with to-change, to-event: go there at once")
     parser.add_argument(
-        "--source", action="append", default=[], metavar="NAME", help="only what plays the recording of this source"
+        "--source", action="append", default=[], metavar="NAME", help="only the recording that has this source"
     )
     parser.set_defaults(refuse=parser.error)
 
@@ -84,7 +84,7 @@ def _number(options: argparse.Namespace) -> float:
     try:
         return float(options.value)
     except ValueError:
-        options.refuse(f"{options.value!r} is no number")
+        options.refuse(f"{options.value!r} is not a number")
         raise
 
 

@@ -30,10 +30,11 @@ class PartlyDoneError(CommandError):
 
 
 def run(program: str, command: Callable[[], int | None], options: argparse.Namespace) -> int:
-    """Run a command: 0 done, 1 failed with one line on standard error, 128 + n ended by signal n as shells have it.
+    """Run a command and return its exit status.
 
-    Wrong usage is argparse's, which exits with 2. With ``--json`` a failure is told on standard output, too, as
-    ``{"error": "…"}``, whatever the command.
+    The status is 0 for success, 1 for a failure, with a line on standard error, and 128 + n after
+    signal n, as in shells. argparse exits with 2 for wrong usage. With ``--json`` every command
+    also prints a failure on standard output, as ``{"error": "…"}``.
     """
     as_json = getattr(options, "json", False)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -41,7 +42,7 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
     try:
         status = command() or 0
         sys.stdout.flush()
-    except (ConfigError, ControlError, LayoutError) as error:  # which tell all that is wrong, a line each
+    except (ConfigError, ControlError, LayoutError) as error:  # a line for each problem
         _tell(str(error), as_json=as_json)
         return 1
     except ShmioError as error:
@@ -51,7 +52,7 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        _give_up_output()  # who read it went away (`| head`)
+        _give_up_output()  # the reader has gone (`| head`)
         return 141
     except OSError as error:
         _tell(f"{error.filename or program}: {error.strerror}", as_json=as_json)
@@ -87,7 +88,7 @@ def _tell(error: str, found: Mapping[str, object] = MappingProxyType({}), *, as_
 
 
 def _give_up_output() -> None:
-    """Keep the interpreter from failing once more when it flushes at its exit."""
+    """Discard the output, so that the interpreter's flush at its exit does not fail again."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -123,7 +124,9 @@ def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON obj
 
 def add_full(parser: argparse.ArgumentParser) -> None:
     """Add ``--full``."""
-    parser.add_argument("--full", action="store_true", help="long arrays and texts whole, on a terminal, too")
+    parser.add_argument(
+        "--full", action="store_true", help="print long arrays and texts completely, even on a terminal"
+    )
 
 
 def room(options: argparse.Namespace) -> int | None:

@@ -22,7 +22,7 @@ from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.outcome import Outcome, OutcomeKind
 
-HELP = "Write values of registers, and print what became of each."
+HELP = "Write values of registers, and print the result of each."
 MATCHES = 3
 """Number of matching registers that the error about a pattern names."""
 
@@ -39,13 +39,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--timeout",
         type=seconds,
         metavar="S",
-        help=f"give up when no cycle came to write in so many seconds (default {TIMEOUT_S:g}, or {MIN_PERIODS} cycles)",
+        help=f"give up if no cycle begins to write in this time in s (default {TIMEOUT_S:g}, or {MIN_PERIODS} cycles)",
     )
     parser.add_argument("pairs", nargs="+", action=Pairs, metavar="PATH VALUE", help="register or array element")
 
 
 def shield(words: Sequence[str]) -> list[str]:
-    """Put a space before words that begin as negative numbers, so argparse takes no option there.
+    """Put a space before words that begin like negative numbers, which argparse takes for options.
 
     argparse itself knows ``-1.5``, but not ``-1.5e-3``, ``-16#FF`` or ``-Infinity``.
     """
@@ -125,7 +125,7 @@ def read_value(text: str, register: Register) -> Value:
 
 def _literal(text: str, register: Register) -> Value:
     if register.dims:
-        # Once more with room for what is too much.
+        # The second, larger shape shows whether there are too many elements.
         given = [
             sum(count for _, count, _ in split_array(text, shape))
             for shape in (register.shape, tuple(length + 1 for length in register.shape))
@@ -176,7 +176,7 @@ def _print(outcomes: dict[str, Outcome], complaint: str) -> None:
 def _complaint(path: str, outcome: Outcome) -> str:
     """Return the error text for a failed write, with a remedy."""
     if outcome.kind == OutcomeKind.REJECTED:
-        return f"{path}: not written, the source took nothing: {outcome.text}; see shmio-supervisor status"
+        return f"{path}: not written, the source accepted nothing: {outcome.text}; see shmio-supervisor status"
     if outcome.kind == OutcomeKind.REFUSED:
         return f"{path}: the source refused it: {outcome.text}"
     if outcome.kind == OutcomeKind.EXPIRED:

@@ -16,26 +16,28 @@ from shmio.local.status import clock_status
 from shmio.local.time_control import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
 from shmio.model.cell import Cell
 
-HELP = "Step the instance's time: from the first step on nothing else moves it, until it is released."
+HELP = "Step the instance's time: after the first step only steps move it, until it is released."
 LOOK_S = 0.2
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
-    parser.add_argument("--dt-ms", type=_dt_ms, metavar="N", help="by how much (default: the step size, 50)")
+    parser.add_argument("--dt-ms", type=_dt_ms, metavar="N", help="length of a step (default: the step size, 50)")
     how = parser.add_mutually_exclusive_group()
-    how.add_argument("--count", type=at_least(1), default=1, metavar="N", help="so many steps (default: 1)")
+    how.add_argument("--count", type=at_least(1), default=1, metavar="N", help="number of steps (default: 1)")
     how.add_argument(
         "--play",
         type=_rate,
         nargs="?",
         const=1.0,
         metavar="RATE",
-        help="step at RATE times real time (default: 1) until Ctrl-C; then time stands",
+        help="step at RATE times real time (default: 1) until Ctrl-C; then time is paused",
     )
-    how.add_argument("--pause", action="store_true", help="have time stand, and do no step")
-    how.add_argument("--release", action="store_true", help="have time be real again, and do no step")
-    parser.add_argument("--yes", action="store_true", help="do not ask where time is real and sources have devices")
+    how.add_argument("--pause", action="store_true", help="pause time, without a step")
+    how.add_argument("--release", action="store_true", help="return to real time, without a step")
+    parser.add_argument(
+        "--yes", action="store_true", help="do not ask for confirmation if time is real and sources have devices"
+    )
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
@@ -70,9 +72,9 @@ def _ask(cell: Cell) -> None:
     if cell.clock().virtual or not (real := cell.real_sources()):
         return
     who = f"{real[0]} goes" if len(real) == 1 else f"{real[0]} and {len(real) - 1} more go"
-    what = f"the instance's time is real: a step makes it stand until it is released, while {who} on in real time"
+    what = f"the instance's time is real: a step pauses it until it is released, while {who} on in real time"
     if sys.stdin is None or not sys.stdin.isatty():
-        raise CommandError(f"{what}; to step all the same: --yes")
+        raise CommandError(f"{what}; --yes steps anyway")
     sys.stderr.write(f"{what}. Go on? [y/N] ")
     sys.stderr.flush()
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):

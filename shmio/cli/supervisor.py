@@ -57,25 +57,23 @@ def _parser() -> argparse.ArgumentParser:
     add_arguments(up)
     up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor on which a detached one tells its start
     verb("down", "stop the instance", target)
-    add_json(verb("status", "tell how the instance and its processes are", target))
-    text = "tell which instances run on this host, from which files, and where they listen"
+    add_json(verb("status", "show the state of the instance and its processes", target))
+    text = "list the instances on this host, their files and the addresses on which they listen"
     add_json(verb("list", text, argparse.ArgumentParser(add_help=False)), "print a JSON list")
-    add_json(verb("reload", "take what has changed in the configuration; leave alone what has not", target))
+    add_json(verb("reload", "apply changes of the configuration; leave everything else alone", target))
     verb("restart", "restart one process, as it was configured at the start or the last reload", target).add_argument(
         "name", metavar="NAME"
     )
     add_json(verb("check", "validate the configuration and its layouts; start nothing", file))
     logs = verb("logs", "print the end of the log files", target)
     logs.add_argument("name", metavar="NAME", nargs="?", help="a process, or supervisor (default: all)")
-    logs.add_argument("-f", "--follow", action="store_true", help="go on with what is added")
+    logs.add_argument("-f", "--follow", action="store_true", help="continue with new lines")
     logs.add_argument("-n", "--lines", type=at_least(0), default=20, metavar="LINES", help="default: 20")
-    add_json(logs, "print a JSON object a line")
+    add_json(logs, "print one JSON object per line")
     init = verb("init", "write a configuration: the A50 example, or one for the files given", file)
     init.usage = f"{PROGRAM} init [-h] [-c FILE] [--emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"
-    init.add_argument(
-        "--emulated", action="store_true", help="with an emulated PLC that holds the block, in place of the real one"
-    )
-    init.add_argument("--block", metavar="NAME", help="this data block alone (default: a source for each)")
+    init.add_argument("--emulated", action="store_true", help="with an emulated PLC in place of the real one")
+    init.add_argument("--block", metavar="NAME", help="only this data block (default: a source for each)")
     init.add_argument(
         "files", metavar="FILE", nargs="*", type=Path, help="the block's sources (.db, .udt, .scl), and a plc.ini"
     )

@@ -17,7 +17,7 @@ from shmio.version import __version__
 
 PROGRAM = "shmio"
 
-SHELL_HELP = "Print what makes a shell complete command lines: see docs/reference/cli-shmio.md."
+SHELL_HELP = "Print the code with which a shell completes command lines: see docs/reference/cli-shmio.md."
 
 Verb = Callable[[Cell, argparse.Namespace], int]
 
@@ -63,10 +63,14 @@ def _parser() -> argparse.ArgumentParser:
     add_json(common, "print JSON")
     common.add_argument("--host", metavar="HOST:PORT", help="an instance's gRPC endpoint, on any host; or unix:PATH")
     common.add_argument("--ca", type=Path, metavar="FILE", help="with --host: use TLS, and trust this authority (PEM)")
-    common.add_argument("--certificate", type=Path, metavar="FILE", help="our own certificate (PEM), if it asks for it")
+    common.add_argument(
+        "--certificate", type=Path, metavar="FILE", help="client certificate (PEM), if the endpoint needs one"
+    )
     common.add_argument("--key", type=Path, metavar="FILE", help="its key (PEM)")
     common.add_argument("--token-file", type=Path, metavar="FILE", help="what the endpoint knows us by")
-    common.add_argument("--token-in-plain-text", action="store_true", help="send it to another host without TLS, too")
+    common.add_argument(
+        "--token-in-plain-text", action="store_true", help="send the token to another host even without TLS"
+    )
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     modules = {
         "list": registers,

@@ -17,7 +17,7 @@ from shmio.model.cell import Cell
 from shmio.model.reading import Reading
 from shmio.model.values import Quality
 
-HELP = "Print the values of registers whenever they change, the present ones first; on a terminal a table of them."
+HELP = "Print registers whenever they change, the present values first; on a terminal, as a table."
 
 TABLE_EVERY_S = 0.2
 CLOCK_CHARACTERS = 12
@@ -27,9 +27,15 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
     parser.add_argument("patterns", nargs="+", metavar="PATH", help="path, array element, structure or glob")
     parser.add_argument(
-        "--every", dest="every_s", type=seconds, metavar="SECONDS", help="all of them so often, changed or not"
+        "--every",
+        dest="every_s",
+        type=seconds,
+        metavar="SECONDS",
+        help="print all of them at this interval, changed or not",
     )
-    parser.add_argument("--lines", action="store_true", help="on a terminal, too, a line for each change, no table")
+    parser.add_argument(
+        "--lines", action="store_true", help="print a line for each change instead of a table on a terminal"
+    )
     parser.add_argument("-n", dest="count", type=at_least(1), metavar="N", help="stop after N lines")
     add_full(parser)
 
@@ -66,11 +72,11 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
         if options.full:
             lines = [line[at : at + columns] for line in lines for at in range(0, len(line), columns)]
         if len(lines) >= rows:
-            more = f"… and {len(lines) - rows + 2} more lines: a higher window, or --lines, shows them"
+            more = f"… and {len(lines) - rows + 2} more lines: enlarge the window, or use --lines"
             lines = [*lines[: max(rows - 2, 0)], more]
         up = f"\x1b[{drawn}F" if drawn else ""
         text = "".join(f"{line}\x1b[K\n" for line in lines)
-        sys.stdout.write(f"{up}\x1b[?7l{text}\x1b[J\x1b[?7h")  # what is too long for the window is cut by it
+        sys.stdout.write(f"{up}\x1b[?7l{text}\x1b[J\x1b[?7h")  # the terminal cuts lines that are too long
         sys.stdout.flush()
         drawn = len(lines)
     return 0
@@ -113,7 +119,7 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Seq
         try:
             readings = cell.get(*patterns)
         except PathError as error:
-            raise NotRunningError(f"{error}: a reload has taken it away") from None
+            raise NotRunningError(f"{error}: a reload removed it") from None
 
 
 def _width(readings: Sequence[Reading]) -> int:

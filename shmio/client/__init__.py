@@ -80,11 +80,20 @@ def connect(
     token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
 ) -> Client:
-    """A client of the endpoint at ``HOST:PORT`` or ``unix:PATH``; the first call connects.
+    """Return a client of an endpoint; the first call connects.
 
-    ``ca``: PEM file of the authority to trust, which means TLS; ``certificate``, ``key``: our own. ``token``: what the
-    endpoint knows us by; it goes to other hosts by TLS, or with ``token_in_plain_text``. ``timeout_s``: of calls that
-    are answered at once. OSError: a file cannot be read. ValueRangeError: the token would go in plain text.
+    Args:
+        address: ``HOST:PORT`` or ``unix:PATH``.
+        ca: PEM file of the certificate authority to trust. With it, the client uses TLS.
+        certificate: PEM file of a client certificate, if the endpoint needs one.
+        key: PEM file of the certificate's key.
+        token: Token of this client, if the endpoint needs one.
+        token_in_plain_text: Whether to send the token to another host even without TLS.
+        timeout_s: Time limit in s for calls that are answered at once.
+
+    Raises:
+        OSError: A file cannot be read.
+        ValueRangeError: The token would go to another host in plain text.
     """
     return Client(Target(address, _path(ca), _path(certificate), _path(key), token, token_in_plain_text), timeout_s)
 
@@ -99,7 +108,10 @@ def connect_aio(
     token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
 ) -> client.Client:
-    """The same for asyncio, to be made and used within an event loop: its methods are awaited."""
+    """Return a client for asyncio, with the arguments of :func:`connect`.
+
+    Create and use it within an event loop; its methods are awaited.
+    """
     return client.Client(
         Target(address, _path(ca), _path(certificate), _path(key), token, token_in_plain_text), timeout_s
     )

@@ -1,8 +1,8 @@
 """The wire's messages with their packed arrays as bytes, for numpy.
 
-A packed field of elements of a fixed size and a ``bytes`` field are the same on the wire (protobuf.dev, "Encoding").
-So the messages are declared once more, from the generated description: where the API has numbers one by one, these
-have the bytes of a little-endian array.
+A packed field with elements of a fixed size and a ``bytes`` field look the same on the wire
+(protobuf.dev, "Encoding"). This module therefore declares the messages again, from the generated
+description: where the API has numbers, these messages have the bytes of a little-endian array.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the two clients share: requests from arguments, results from answers, errors from statuses. No I/O."""
+"""Shared by both clients: build requests, convert answers, translate gRPC statuses. No I/O."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WRITE_PATIENCE_S: Final = 30.0
 OPTIONS: Final = [
     ("grpc.max_receive_message_length", 64 << 20),
     ("grpc.keepalive_time_ms", 20_000),
-    # An endpoint that is started anew is found at once.
+    # A restarted endpoint is found at once.
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 1_000),
 ]
@@ -50,11 +50,10 @@ _ERRORS: Final[Mapping[grpc.StatusCode, type[ShmioError]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where an endpoint is, and how to get in.
+    """Address and credentials of an endpoint; arguments as of :func:`shmio.client.connect`.
 
-    ``address``: ``HOST:PORT``, or ``unix:PATH``. ``ca``: PEM file of the authority to trust, which means TLS;
-    ``certificate``, ``key``: our own, where the endpoint asks for them. ``token``: what it knows us by.
-    ValueRangeError: the token would go to another host in plain text, and ``token_in_plain_text`` does not allow it.
+    Raises:
+        ValueRangeError: The token would go to another host in plain text.
     """
 
     address: str
@@ -68,13 +67,13 @@ class Target:
         if self.token is None or self.ca is not None or self.token_in_plain_text or _is_here(self.address):
             return
         raise ValueRangeError(
-            f"{self.address}: a token is not sent to another host in plain text, for all on the network to read: "
+            f"{self.address}: a token is not sent to another host in plain text, where others could read it: "
             "name the CA of its certificate (ca, --ca), or allow it (token_in_plain_text, --token-in-plain-text)"
         )
 
     @property
     def credentials(self) -> grpc.ChannelCredentials | None:
-        """For a channel by TLS; None: plain text. OSError: a file cannot be read."""
+        """Return credentials for TLS, or None for plain text; OSError if a file cannot be read."""
         if self.ca is None:
             return None
         ca, key, certificate = (
@@ -84,13 +83,13 @@ class Target:
 
     @property
     def metadata(self) -> tuple[tuple[str, str], ...]:
-        """What goes with every call."""
+        """Return the metadata of every call."""
         return () if self.token is None else (("authorization", f"Bearer {self.token}"),)
 
     def error(self, error: Any) -> ShmioError:
-        """What the end of a call means."""
+        """Translate the error of a call."""
         code, details = error.code(), error.details() or ""
-        if "message larger than max" in details:  # gRPC's own words
+        if "message larger than max" in details:  # text of gRPC
             details = f"too much for one message: give or ask for fewer values at once ({details})"
         if kind := _ERRORS.get(code):
             return kind(details)
@@ -102,16 +101,16 @@ class Target:
         if closed and self.ca is None:
             details += ", or it speaks TLS: then name the CA of its certificate (ca, --ca)"
         elif closed and self.certificate is None:
-            details += ", or it wants a certificate of ours (certificate and key)"
+            details += ", or it needs a client certificate (certificate and key)"
         return told(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
 
     def fail(self, error: Any) -> NoReturn:
-        """Raise that."""
+        """Raise the translated error of a call."""
         raise self.error(error) from None
 
 
 def unanswered(target: Target) -> RemoteError:
-    """A call has begun, and the endpoint does not answer."""
+    """Return the error for a call that has begun without an answer from the endpoint."""
     return RemoteError(f"{target.address}: the endpoint has not answered within {WRITE_PATIENCE_S:g} s")
 
 
@@ -130,15 +129,15 @@ _PLAIN: Final = {
 _TLS: Final = {
     "Hostname Verification": "its certificate does not name this host: use a name or address that it has",
     "WRONG_VERSION_NUMBER": "it speaks plain text: leave the CA out (ca, --ca)",
-    "CERTIFICATE_VERIFY_FAILED": "its certificate is not of the CA that was named (ca, --ca), or has run out",
+    "CERTIFICATE_VERIFY_FAILED": "its certificate is not from the CA that was named (ca, --ca), or has expired",
 }
 """The same of TLS."""
 _UNIX: Final = "unix:"
 _MEANING: Final = {
     grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
     grpc.StatusCode.DEADLINE_EXCEEDED: "it did not answer in time",
-    grpc.StatusCode.UNAUTHENTICATED: "it does not know us",
-    grpc.StatusCode.PERMISSION_DENIED: "it does not let us",
+    grpc.StatusCode.UNAUTHENTICATED: "it does not know this client",
+    grpc.StatusCode.PERMISSION_DENIED: "it does not permit this",
     grpc.StatusCode.UNIMPLEMENTED: "it does not serve shmio.v1, it is older than this client",
 }
 
@@ -152,7 +151,11 @@ def _is_here(address: str) -> bool:
 
 
 def ns(dt_s: float | None) -> int:
-    """A step's size in ns; 0: the step size that there is. ValueRangeError."""
+    """Convert the size of a step to ns; 0 stands for the present step size.
+
+    Raises:
+        ValueRangeError: The size is out of range.
+    """
     if dt_s is None:
         return 0
     if not 0 < dt_s <= 3600:
@@ -161,14 +164,14 @@ def ns(dt_s: float | None) -> int:
 
 
 def read_request(patterns: Iterable[str], *, originals: bool, tables: Iterable[int]) -> Any:
-    """For Read."""
+    """Return the request for Read."""
     return wire.ReadRequest(patterns=patterns, originals=originals, tables=tables)
 
 
 def subscribe_request(
     patterns: Iterable[str], *, every_frame: bool, frames: bool, max_rate_hz: float, deadband: float
 ) -> Any:
-    """For Subscribe."""
+    """Return the request for Subscribe."""
     return wire.SubscribeRequest(
         patterns=patterns,
         mode=wire.MODE_EVERY_FRAME if every_frame else wire.MODE_LATEST,
@@ -179,18 +182,18 @@ def subscribe_request(
 
 
 def write_request(values: Mapping[str, object], timeout_s: float | None, *, until_accepted: bool) -> Any:
-    """For Write; ValueRangeError: a value of no kind that goes by wire."""
+    """Return the request for Write; ValueRangeError if a value has an unsupported Python type."""
     timeout_ms = round(1000 * (timeout_s or 0))
     return wire.WriteRequest(values=assignments(values), timeout_ms=timeout_ms, until_accepted=until_accepted)
 
 
 def assignments(values: Mapping[str, object]) -> list[Any]:
-    """Values by path; ValueRangeError."""
+    """Convert values by path to messages; ValueRangeError as for :func:`write_request`."""
     return [wire.Assignment(path=path, value=value_to_wire(value, path)) for path, value in values.items()]
 
 
 def outcomes(paths: Iterable[str], found: Any) -> list[Outcome]:
-    """Of an answer, in the order of the paths."""
+    """Return the outcomes in an answer, in the order of the paths."""
     ends = list(found)
     paths = list(paths)
     if len(ends) == 1:
@@ -213,26 +216,26 @@ def clock(found: Any) -> Clock:
 
 @dataclass(frozen=True, slots=True)
 class Stepped:
-    """A step that is done: its number, and the simulation time after it."""
+    """A finished step: its number, and the simulation time after it."""
 
     step: int
     time_ns: int
 
     @classmethod
     def of(cls, found: Any) -> Stepped:
-        """From the wire."""
+        """Convert from the wire."""
         return cls(found.number, found.time_ns)
 
 
 def steps_requests(count: int, dt_s: float | None) -> list[Any]:
-    """For Steps; ValueRangeError."""
+    """Return the requests for Steps; ValueRangeError if a number is out of range."""
     if not 0 <= count < 1 << 32:
-        raise ValueRangeError(f"{count} steps: from 0 to {(1 << 32) - 1} can be asked for at once")
+        raise ValueRangeError(f"{count} steps: from 0 to {(1 << 32) - 1} are allowed at once")
     return [wire.StepsRequest(dt_ns=ns(dt_s), count=count)] if count else []
 
 
 def status(found: Any) -> dict[str, Any]:
-    """Of an answer, as ``shmio-supervisor status --json`` has it."""
+    """Convert an answer to the object of ``shmio-supervisor status --json``."""
     return {
         "instance": found.instance,
         "mode": found.mode,

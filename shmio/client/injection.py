@@ -1,4 +1,4 @@
-"""Injections as their clients hold them: what goes up and what comes down, without the way it goes."""
+"""Messages between an endpoint and a client that injects values. No I/O."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def lay(
     for_s: float | None,
     originals: bool,
 ) -> bytes:
-    """The first message. ValueRangeError."""
+    """Return the first message, which lays an injection; ValueRangeError for an invalid argument."""
     if for_s is not None and not 0 < for_s <= 86_400:
         raise ValueRangeError(f"for_s: {for_s} is not a number of seconds above 0, at most 86400")
     lifetime_ms = 0 if for_s is None else max(1, round(1000 * for_s))
@@ -56,12 +56,12 @@ def lay(
 
 
 class Held:
-    """What is known of an injection that stands."""
+    """An injection of this client, with its table of registers."""
 
     def __init__(self, found: Any) -> None:
-        """``found``: the first answer, None if there was none. RemoteError: it is none."""
+        """Take the first answer, None if there was none; RemoteError if it is invalid."""
         if found is None or not found.HasField("laid"):
-            raise RemoteError("the endpoint's first answer to Inject is none")
+            raise RemoteError("the endpoint's first answer to Inject is invalid")
         self.number: int = found.laid.number
         self._tables = Tables()
         self.table = Table(found.laid.table)
@@ -72,7 +72,7 @@ class Held:
     def request(
         self, values: Mapping[str, object], arrays: Arrays | None, raw: Raw, *, answered: bool
     ) -> tuple[int, bytes]:
-        """A message with values, and its sequence number. ValueRangeError."""
+        """Return a message with values and its sequence number; ValueRangeError for a wrong value."""
         request = InjectRequest()
         shadow = request.shadow
         if answered:
@@ -101,19 +101,21 @@ class Held:
             part.values = np.asarray(values, DTYPES[column]).tobytes()
 
     def keep(self, found: Any) -> None:
-        """Keep the originals of a message until they are asked for. RemoteError: nobody does."""
+        """Keep the originals of a message until they are read; RemoteError if nobody reads them."""
         if found.originals:
             if len(self._waiting) >= MAX_WAITING:
-                raise RemoteError(f"{MAX_WAITING} messages with originals wait to be read: iterate, or do not ask")
+                raise RemoteError(
+                    f"{MAX_WAITING} messages with originals are waiting: iterate over them, or do not request originals"
+                )
             self._waiting.append(found.originals)
 
     @property
     def waits(self) -> bool:
-        """Whether originals wait."""
+        """Whether there are originals to read."""
         return bool(self._waiting)
 
     def originals(self) -> Iterator[Update]:
-        """Those of the oldest message that waits."""
+        """Yield the originals of the oldest message that was not read."""
         for update in self._waiting.popleft():
             if update.table != self.table.number:
                 raise RemoteError(f"an original of table {update.table}, which was not sent")
@@ -121,6 +123,6 @@ class Held:
 
 
 def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outcome]:
-    """An answer for each value; ``more``: one for all that went as arrays or raw bytes."""
+    """Return an outcome for each value, and with ``more`` one for all arrays and raw bytes."""
     paths = [*values, *([""] if more else [])]
     return calls.outcomes(paths, [outcome])

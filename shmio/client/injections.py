@@ -1,4 +1,4 @@
-"""Injections as the list and the record of declared ones have them, and what is declared as a request. No I/O."""
+"""Convert lists of injections, declarations and their events between Python and the wire. No I/O."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def declare_request(declarations: Iterable[Mapping[str, Any] | msgspec.Struct], 
 
 
 def declared(found: Any) -> tuple[Declared, ...]:
-    """Of Declare's first answer. RemoteError: it is none."""
+    """Convert the first answer to Declare; RemoteError if it is invalid."""
     if found is None or not found.HasField("declared"):
-        raise RemoteError("the endpoint's first answer to Declare is none")
+        raise RemoteError("the endpoint's first answer to Declare is invalid")
     return tuple(Declared(one.source, one.number, one.name, one.seed) for one in found.declared.injections)
 
 
 def happenings(found: Any) -> list[Happening]:
-    """Of Declare's answers."""
+    """Convert the events in an answer to Declare."""
     known = wire.Happening.Kind.values()
     return [
         Happening(
@@ -41,12 +41,12 @@ def happenings(found: Any) -> list[Happening]:
 
 
 def lifted(found: Any) -> list[Lifted]:
-    """Of an answer."""
+    """Convert the answer to LiftAll."""
     return [Lifted(one.source, one.number, one.name, one.failure) for one in found.lifted]
 
 
 def injections(found: Any) -> list[Injection[Mapping[str, Any]]]:
-    """Of a list's answer."""
+    """Convert the answer to ListInjections."""
     return [
         Injection(
             number=one.number,

@@ -1,4 +1,4 @@
-"""Layouts as an endpoint tells them, and raw frames decoded by them."""
+"""Layouts received from an endpoint, which decode raw frames."""
 
 from __future__ import annotations
 
@@ -55,17 +55,20 @@ class BlockLayout(Layout):
         return self.by_path
 
     def array(self, image: bytes) -> Array:
-        """A raw frame as a record of numpy, a field for each register, named by its path; nothing is copied.
+        """View a raw frame as a numpy record with a field for each register, named by its path.
 
-        Numbers are in the source's own byte order. A BOOL is the byte that holds it (:meth:`value` gives the bit);
-        arrays of BOOLs, texts and dates are bytes. ValueError: an image of another size.
+        Nothing is copied. Numbers have the source's byte order. A BOOL is the byte that holds it
+        (:meth:`value` returns the bit); arrays of BOOL, texts and dates are bytes.
+
+        Raises:
+            ValueError: The image has the wrong size.
         """
         if len(image) != self.size:
             raise ValueError(f"{self.source}: a frame has {self.size} bytes, this has {len(image)}")
         return np.frombuffer(image, self._dtype)[0]  # type: ignore[no-any-return]
 
     def value(self, image: bytes, path: str) -> Any:
-        """One register of a raw frame as :meth:`array` has it, a BOOL and arrays of them as bools. PathError."""
+        """Return one register of a raw frame as in :meth:`array`, but BOOLs as bools; PathError."""
         place = self.places.get(path.removeprefix(f"{self.source}/"), self.places.get(path))
         if place is None:
             paths = [f"{self.source}/{register.path}" for register in self.registers]
@@ -100,7 +103,7 @@ class BlockLayout(Layout):
 
 
 def layouts(parts: Iterable[Any]) -> Iterator[BlockLayout]:
-    """The blocks of GetLayouts' messages. RemoteError: they make no sense."""
+    """Yield the blocks in the messages of GetLayouts; RemoteError if they are invalid."""
     registers: list[Register] = []
     for part in parts:
         registers += map(Register.of, part.registers)

@@ -1,4 +1,4 @@
-"""A model as its program serves it: what comes down and what goes up, without the way it goes."""
+"""Messages between an endpoint and a program that serves a model. No I/O."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ log = logging.getLogger("shmio.client")
 
 
 class Values(Mapping[str, Any]):
-    """Values by the paths of their registers, without the source: scalars and arrays of numpy, texts.
+    """Values by path without the source: numpy scalars and arrays, and texts.
 
-    None: the bytes are no value of the type. The next step changes them.
+    None stands for bytes that are not a valid value. The next step changes the values in place.
     """
 
     def __init__(self, table: Table) -> None:
@@ -39,7 +39,7 @@ class Values(Mapping[str, Any]):
         """Paths of what came with the present step: all with the first one."""
 
     def __getitem__(self, path: str) -> Any:
-        """A register's value; PathError."""
+        """Return a register's value; PathError if there is no such register."""
         return self._table.value(self._table.place(path))
 
     def __contains__(self, path: object) -> bool:
@@ -53,9 +53,13 @@ class Values(Mapping[str, Any]):
 
 
 class Work:
-    """A step to be done. ``time_s``: simulation time after it; ``dt_s``: by how much it moves that.
+    """A step for the model to compute.
 
-    ``doubt``: why inputs may not be right; ``refused``: why the answer before counts for nothing; else both are empty.
+    Attributes:
+        time_s: Simulation time after the step.
+        dt_s: Length of the step.
+        doubt: Why inputs may be wrong; empty if they are right.
+        refused: Why the previous answer was refused; empty if it was accepted.
     """
 
     __slots__ = ("doubt", "dt_ns", "inputs", "refused", "step", "time_ns")
@@ -70,22 +74,22 @@ class Work:
 
     @property
     def time_s(self) -> float:
-        """In seconds."""
+        """Simulation time after the step, in s."""
         return self.time_ns / 1e9
 
     @property
     def dt_s(self) -> float:
-        """In seconds."""
+        """Length of the step, in s."""
         return self.dt_ns / 1e9
 
 
 class Part:
-    """What is known of a source that a program computes."""
+    """A source that a program computes, with its inputs and outputs."""
 
     def __init__(self, found: Any) -> None:
-        """``found``: the first answer, None if there was none. RemoteError: it is none."""
+        """Take the first answer, None if there was none; RemoteError if it is invalid."""
         if found is None or found.WhichOneof("what") != "joined":
-            raise RemoteError("the endpoint's first answer to Simulate is none")
+            raise RemoteError("the endpoint's first answer to Simulate is invalid")
         joined = found.joined
         self._inputs = Table(joined.inputs)
         self._outputs = Table(joined.outputs)
@@ -98,9 +102,9 @@ class Part:
         self.period_s: float = joined.period_ns / 1e9
 
     def take(self, found: Any) -> Work:
-        """What an answer asks for. RemoteError: it makes no sense."""
+        """Return the step that an answer requests; RemoteError if the answer is invalid."""
         if found.WhichOneof("what") != "work":
-            raise RemoteError("the endpoint asks for no step")
+            raise RemoteError("the endpoint has not asked for a step")
         work = found.work
         changes = self._inputs.apply(work.values) if work.HasField("values") else ()
         if work.HasField("invalid"):
@@ -110,7 +114,12 @@ class Part:
         return Work(work, self.inputs)
 
     def done(self, step: int, outputs: Mapping[str, object]) -> bytes:
-        """The answer with these outputs. PathError: there is no such one; ValueRangeError: a value does not fit."""
+        """Return the answer to a step.
+
+        Raises:
+            PathError: There is no such output.
+            ValueRangeError: A value does not fit its register.
+        """
         columns: dict[Column, tuple[list[int], list[Any]]] = {}
         for path, value in outputs.items():
             register = self._outputs.registers[self._place(path)]
@@ -129,20 +138,23 @@ class Part:
             return self._outputs.place(path)
         except PathError:
             there = ", ".join(self.outputs)
-            raise PathError(f"{path}: it is no output of {self.source}; there are: {_shorten(there)}") from None
+            raise PathError(f"{path}: it is not an output of {self.source}; there are: {_shorten(there)}") from None
 
     @staticmethod
     def failed(step: int, reason: str) -> bytes:
-        """The answer that it has failed."""
+        """Return the answer that a step has failed."""
         return wire.SimulateRequest(done=wire.Done(step=step, failure=_shorten(reason))).SerializeToString()
 
 
 class Member:
-    """What both kinds of clients give of a source that they have joined.
+    """A source that a client has joined as its model.
 
-    ``inputs``: what is given, by path; ``outputs``: what was shown when it joined; ``computed``: whether a model has
-    computed that, or it is initial values. ``clock``: how time stood then; ``period_s``: between two steps as long as
-    time is real.
+    Attributes:
+        inputs: Present inputs by path.
+        outputs: Outputs by path, as shown when the client joined.
+        computed: Whether a model computed these outputs; otherwise they are initial values.
+        clock: State of the clock when the client joined.
+        period_s: Time between two steps in s while time is real.
     """
 
     def __init__(self, part: Part) -> None:
@@ -156,9 +168,9 @@ class Member:
         self.period_s = part.period_s
 
     def _present(self) -> int:
-        """The step that is to be answered. RemoteError: none is."""
+        """The number of the step that waits for an answer; RemoteError if none does."""
         if self._work is None:
-            raise RemoteError(f"{self.source}: no step is to be answered")
+            raise RemoteError(f"{self.source}: there is no step to answer")
         return self._work.step
 
 
@@ -168,45 +180,48 @@ def join(source: str, name: str) -> bytes:
 
 
 class Rejoining:
-    """Whether who computes a source is to join once more, and what it has to say then."""
+    """Decides whether a model joins again after a lost connection, and keeps its outputs for that."""
 
     def __init__(self, patience_s: float) -> None:
         self._patience_s = patience_s
         self._lost_s: float | None = time.monotonic()
         self._joined = False
-        self._known: dict[str, object] = {}  # the outputs as they were given last
+        self._known: dict[str, object] = {}  # the latest outputs
         self._told = True  # whether the present endpoint knows them all
         self._failure = ""
 
     def joined(self) -> None:
-        """It has."""
+        """Note that the model has joined."""
         self._lost_s, self._told, self._joined = None, not self._joined, True
 
     def patient(self, error: ShmioError) -> bool:
-        """Whether it is to be tried again."""
+        """Return whether the model should try to join again after an error."""
         if self._lost_s is None:
             self._lost_s = time.monotonic()
-        # Who was cut off is for a while still taken for connected.
+        # The endpoint takes a client that was cut off for connected for a while.
         again = isinstance(error, LostError) or (self._joined and isinstance(error, ConflictError))
         return again and time.monotonic() - self._lost_s < self._patience_s
 
     def heed(self, part: Part, work: Work) -> None:
-        """The log tells what the endpoint says of the answer before."""
+        """Log what the endpoint says about inputs and the previous answer."""
         if work.refused:
             log.warning("%s: %s", part.source, work.refused)
 
     def answer(self, part: Part, work: Work, outputs: Mapping[str, object] | None) -> bytes:
-        """The answer with what was computed; after another joining with all that was before. Errors as of ``done``."""
+        """Return the answer with the outputs; after joining again, with all earlier ones.
+
+        Errors are those of :meth:`Part.done`.
+        """
         outputs = {} if outputs is None else outputs
         if not isinstance(outputs, Mapping):
-            raise ValueRangeError(f"step gave {_shorten(repr(outputs))}, and is to give outputs by their paths")
+            raise ValueRangeError(f"step gave {_shorten(repr(outputs))}, but must give outputs by their paths")
         answer = part.done(work.step, outputs if self._told else {**self._known, **outputs})
         self._known.update(outputs)
         self._told, self._failure = True, ""
         return answer
 
     def failed(self, part: Part, work: Work, error: Exception) -> bytes:
-        """The answer that a step has failed. The log tells each reason once."""
+        """Return the answer that a step has failed; log each reason once."""
         text = explain(error)
         if text != self._failure:
             self._failure = text
@@ -216,7 +231,7 @@ class Rejoining:
 
 
 def explain(error: Exception) -> str:
-    """What a program's code has raised, and at which line, in one line."""
+    """Describe an error of the program's code in one line, with its place."""
     if isinstance(error, ShmioError):
         return _shorten(" ".join(str(error).split()))
     where = ""
@@ -238,7 +253,7 @@ def _answer(step: int, columns: Mapping[Column, tuple[list[int], list[Any]]]) ->
 
 
 def _check(value: object, register: Register) -> None:
-    """ValueRangeError: protobuf does not take a value for its column."""
+    """Raise ValueRangeError if protobuf cannot hold the value in its column."""
     try:
         _answer(0, {register.column: ([], list(_flat(value, register)))})
     except (TypeError, ValueError, OverflowError):
@@ -246,7 +261,7 @@ def _check(value: object, register: Register) -> None:
 
 
 def _flat(value: object, register: Register) -> Iterable[object]:
-    """The elements of a value as its column has them. ValueRangeError: it has another shape."""
+    """Return the elements of a value in the order of its column; ValueRangeError for a wrong shape."""
     if not register.dims:
         return (_element(value, register.column),)
     array: Array = np.frombuffer(value, np.uint8) if isinstance(value, (bytes, bytearray)) else _array(value)

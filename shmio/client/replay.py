@@ -1,4 +1,4 @@
-"""Moving replays: what a client may wish, and how they play. No I/O."""
+"""Requests that control replays, and their answers. No I/O."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SEARCH_PATIENCE_S: Final = 600.0
 
 
 def request(wish: Wish) -> Any:
-    """For Replay; times go as text."""
+    """Return the request for Replay; times are sent as text."""
     keys: dict[str, Any] = {**wish}
     for key in {"seek", "until"} & keys.keys():
         keys[key] = str(keys[key])
@@ -20,7 +20,7 @@ def request(wish: Wish) -> Any:
 
 
 def told(found: Any) -> list[Playing]:
-    """From a ReplayResponse."""
+    """Convert the answer to Replay."""
     return [
         Playing(
             one.source, one.time_s, one.position_s, one.length_s, one.speed, one.paused, one.loop, one.over,
@@ -31,5 +31,5 @@ def told(found: Any) -> list[Playing]:
 
 
 def patience_s(wish: Wish) -> float | None:
-    """How long it may take; None: as any call."""
+    """Return the time limit for a request in s; None for that of any call."""
     return SEARCH_PATIENCE_S if "change" in wish or "event" in wish else None

@@ -1,4 +1,4 @@
-"""What a table of registers means, and the values that it has by now, as numpy arrays."""
+"""Tables of registers, with their latest values as numpy arrays."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Register(model.Register):
 
     @classmethod
     def of(cls, found: Any) -> Register:
-        """From the wire; RemoteError: it makes no sense."""
+        """Convert from the wire; RemoteError if the message is invalid."""
         try:
             return cls(
                 found.path,
@@ -87,14 +87,14 @@ class Register(model.Register):
 
 
 def unknown(path: str, paths: Sequence[str], what: str) -> PathError:
-    """The error about a path that is not among these."""
+    """Return an error for a path that is not among ``paths``."""
     near = difflib.get_close_matches(path, paths[:_NEAR_CANDIDATES], n=3)
     like = f"; near: {', '.join(near)}" if near else ""
     return PathError(f"{path[:_SHOWN]}: not among {what}{like}")
 
 
 class Change(NamedTuple):
-    """Elements of a column as they came: ``values[i]`` is that of ``slots[i]``. The arrays cannot be written to."""
+    """Received elements of a column: ``values[i]`` belongs to ``slots[i]``; read-only arrays."""
 
     column: Column
     slots: Array
@@ -102,10 +102,13 @@ class Change(NamedTuple):
 
 
 class Table:
-    """Registers of one source, and their values by now: one array for each type, an element or more a register."""
+    """Registers of one source with their latest values: one array for each type.
+
+    Each register takes one or more elements of the array of its type.
+    """
 
     def __init__(self, found: Any) -> None:
-        """From the wire; RemoteError: it makes no sense."""
+        """Convert from the wire; RemoteError if the message is invalid."""
         self.number: int = found.number
         self.source: str = found.source
         self.section: int = found.section
@@ -141,7 +144,7 @@ class Table:
 
     @cached_property
     def places(self) -> Mapping[str, int]:
-        """Place of each register, by its path without the source."""
+        """Index of each register, by its path without the source."""
         return {register.path: place for place, register in enumerate(self.registers)}
 
     @property
@@ -150,7 +153,7 @@ class Table:
         return [f"{self.source}/{register.path}" for register in self.registers]
 
     def place(self, path: str) -> int:
-        """Place of a register, by its path with or without the source. PathError."""
+        """Return the index of a register, by its path with or without the source; PathError."""
         found = self.places.get(path)
         if found is None:
             found = self.places.get(path.removeprefix(f"{self.source}/"))
@@ -159,7 +162,10 @@ class Table:
         return found
 
     def value(self, place: int, arrays: Mapping[Column, Array] | None = None) -> Any:
-        """A register's value: a scalar of numpy, an array of its shape, or text; None if its bytes are no value."""
+        """Return a register's value: a numpy scalar, an array of its shape, or text.
+
+        None stands for bytes that are not a valid value.
+        """
         register = self.registers[place]
         array = (self.arrays if arrays is None else arrays)[register.column]
         if register.dims:
@@ -167,7 +173,7 @@ class Table:
         return None if self.invalid[place] else array[register.slot]
 
     def changed(self, changes: tuple[Change, ...]) -> list[int]:
-        """Places of the registers that changes are about, ascending."""
+        """Return the indices of the registers that have changes, ascending."""
         found: set[int] = set()
         for change in changes:
             slots, places = self._starts[change.column]
@@ -176,7 +182,7 @@ class Table:
 
     @cached_property
     def _starts(self) -> Mapping[Column, tuple[Array, Array]]:
-        """First slots of the registers of each column, ascending, and their places."""
+        """First slots of the registers of each column, ascending, and the registers' indices."""
         found: dict[Column, list[tuple[int, int]]] = {}
         for place, register in enumerate(self.registers):
             found.setdefault(register.column, []).append((register.slot, place))
@@ -186,7 +192,7 @@ class Table:
         }
 
     def apply(self, values: Any) -> tuple[Change, ...]:
-        """Take a message's values over into the arrays; what they were. RemoteError: they make no sense."""
+        """Copy a message's values into the arrays, and return them; RemoteError if invalid."""
         try:
             changes = self.read(values)
             for column, slots, news in changes:
@@ -195,15 +201,15 @@ class Table:
                 else:
                     self.arrays[column][slots] = news
         except (IndexError, ValueError, KeyError) as error:
-            raise RemoteError(f"source {self.source}: an update that makes no sense: {error}") from None
+            raise RemoteError(f"source {self.source}: an invalid update: {error}") from None
         return changes
 
     def read(self, values: Any) -> tuple[Change, ...]:
-        """A message's values as they are. RemoteError: they make no sense."""
+        """Return a message's values; RemoteError if they are invalid."""
         try:
             return tuple(self._read(values))
         except (ValueError, KeyError) as error:
-            raise RemoteError(f"source {self.source}: an update that makes no sense: {error}") from None
+            raise RemoteError(f"source {self.source}: an invalid update: {error}") from None
 
     def _read(self, values: Any) -> Iterator[Change]:
         for column, name in FIELDS.items():
@@ -219,10 +225,10 @@ class Table:
                 yield Change(column, slots, news)
 
     def mark(self, marks: Any, into: Array) -> None:
-        """Take a message's marks over. RemoteError."""
+        """Copy a message's marks into ``into``; RemoteError if they are invalid."""
         places = np.frombuffer(marks.registers, np.uint32)
         into[:] = False
         try:
             into[places] = True
         except IndexError as error:
-            raise RemoteError(f"source {self.source}: an update that makes no sense: {error}") from None
+            raise RemoteError(f"source {self.source}: an invalid update: {error}") from None

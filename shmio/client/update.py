@@ -1,4 +1,4 @@
-"""Updates: what came of one block's frame, and the tables that they refer to."""
+"""Updates of a source's registers, and the tables that they refer to."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 
 class Piece(NamedTuple):
-    """Raw bytes of a frame from ``offset`` on. ``mask``: which bits of each are meant; in what is given 0 for all."""
+    """Raw bytes of a frame from ``offset`` on; ``mask`` selects bits of each byte (0 sends all)."""
 
     offset: int
     data: bytes
@@ -23,14 +23,22 @@ class Piece(NamedTuple):
 
 
 class Update:
-    """One frame of a source, or what has become of the one before; of a table of ``in``, what a command has written.
+    """One frame of a source, or a change of its quality.
 
-    ``changes`` has what came, ``table.arrays`` all values by now; ``update[path]`` is the value of a register by now.
-    Times in ns: ``clock_ns`` since the instance's start, ``source_ns`` UTC of the values, 0 if there never were any.
-    ``marked``: it says anew which registers are invalid, or injected. ``missed``: with every frame, frames lost between
-    the update before and this one. ``ended``: a reload has taken away the source, or all that was asked of it.
-    ``image``, ``raw``: with raw frames, as consumers see them, and as delivered. ``age_ns``: with reads.
-    ``pieces``: of an injection over ranges, what differs in these.
+    For a table of ``in`` it is what a command has written. ``update[path]`` is the latest value of
+    a register.
+
+    Attributes:
+        changes: The received values; ``table.arrays`` has the latest values of all registers.
+        clock_ns: Time since the instance's start.
+        source_ns: UTC of the values; 0 if there never were any.
+        marked: Whether the update also says which registers are invalid or injected.
+        missed: With every frame, the number of frames lost before this one.
+        ended: Whether a reload has removed the source, or all requested registers.
+        image: With raw frames, the frame as consumers see it.
+        raw: With raw frames, the frame as delivered.
+        age_ns: With reads, the age of the frame.
+        pieces: For an injection over ranges, the changes in these ranges.
     """
 
     __slots__ = (
@@ -40,7 +48,7 @@ class Update:
     )  # fmt: skip
 
     def __init__(self, table: Table, found: Any) -> None:
-        """From the wire; takes the values over into the table. RemoteError."""
+        """Convert from the wire, and copy the values into the table; RemoteError if invalid."""
         self.table = table
         self.frame: int = found.frame
         self.cycle: int = found.cycle
@@ -77,7 +85,7 @@ class Update:
 
     @property
     def changed(self) -> list[str]:
-        """Paths of the registers that this update is about, with the source."""
+        """Paths of the registers in this update, with the source."""
         registers = self.table.registers
         return [f"{self.source}/{registers[place].path}" for place in self.table.changed(self.changes)]
 
@@ -107,34 +115,39 @@ class Update:
         )
 
     def __getitem__(self, path: str) -> Any:
-        """A register's value by now, whatever the quality; see :meth:`Table.value`. PathError."""
+        """Return a register's latest value, whatever its quality; see :meth:`Table.value`."""
         return self.table.value(self.table.place(path))
 
     def good(self, path: str) -> Any:
-        """A register's value if it is good, or uncertain; QualityError with the reason, PathError."""
+        """Return a register's value if it is good or uncertain.
+
+        Raises:
+            QualityError: The value is bad; the error has the reason.
+            PathError: There is no such register.
+        """
         quality, reason = self.quality_of(path)
         if quality is Quality.BAD:
             raise QualityError(f"{self.source}/{path.removeprefix(f'{self.source}/')}: {reason}")
         return self[path]
 
     def original(self, path: str) -> Any:
-        """What the source delivered, whatever an injection shows; of reads with ``originals``. PathError."""
+        """Return the source's value beneath injections, after a read with ``originals``; PathError."""
         return self.table.value(self.table.place(path), self._originals)
 
     def quality_of(self, path: str) -> tuple[Quality, str]:
-        """Quality of one register, and the reason if it is not good. PathError."""
+        """Return the quality of a register, and the reason if it is not good; PathError."""
         place = self.table.place(path)
         if self.quality is not Quality.BAD and self.table.invalid[place]:
-            return Quality.BAD, f"the bytes are no {self.table.registers[place].type}"
+            return Quality.BAD, f"the bytes are not a valid {self.table.registers[place].type}"
         return self.quality, self.reason
 
     def provenance_of(self, path: str) -> Provenance:
-        """Where one register's value comes from. PathError."""
+        """Return the origin of a register's value; PathError."""
         return Provenance.INJECTED if self.table.injected[self.table.place(path)] else self.provenance
 
 
 def end_of(table: Table, reason: str) -> Update:
-    """The last update of a source that is not there any more."""
+    """Return the last update of a source that a reload has removed."""
     update = Update(table, _NOTHING)
     update.reason, update.ended = reason, True
     return update
@@ -146,15 +159,15 @@ _PROVENANCES = {int(provenance): provenance for provenance in Provenance}
 
 
 class Tables:
-    """Those of one stream, or of reads, by their numbers."""
+    """Tables of one stream, or of reads, by number."""
 
     def __init__(self) -> None:
         self.known: dict[int, Table] = {}
 
     def updates(self, found: Any) -> Iterator[Update]:
-        """The updates of a message that may bring tables, too. RemoteError: it makes no sense.
+        """Yield the updates of a message, which may also have tables; RemoteError if it is invalid.
 
-        Take one after the other: each changes its table's arrays.
+        Use each update before the next one: it changes its table's arrays in place.
         """
         for one in found.tables:
             news = Table(one)
@@ -167,12 +180,12 @@ class Tables:
             yield Update(table, update)
 
     def all_of(self, found: Any) -> Iterator[Update]:
-        """Both, of a stream's message."""
+        """Yield all updates of a stream's message, including those of removed sources."""
         yield from self.updates(found)
         yield from self.ended(found)
 
     def ended(self, found: Any) -> Iterator[Update]:
-        """What a message says of sources that are not there any more."""
+        """Yield the last updates of removed sources in a message."""
         for end in found.ended:
             direction = "in" if end.direction == wire.DIRECTION_IN else "out"
             for table in list(self.known.values()):
@@ -181,12 +194,12 @@ class Tables:
 
 
 def _same(old: Table, news: Table) -> bool:
-    """Whether a table takes another's place."""
+    """Return whether a table replaces another one."""
     return (old.source, old.direction) == (news.source, news.direction)
 
 
 class Snapshot:
-    """What one read gave: of each source one update. Registers by their paths with the source."""
+    """Result of one read, with an update for each source; registers by path with the source."""
 
     def __init__(self, updates: Iterable[Update]) -> None:
         self.updates = {update.source: update for update in updates}
@@ -196,7 +209,10 @@ class Snapshot:
             yield from update.table.paths
 
     def of(self, path: str) -> Update:
-        """The update that has this register; the source may be left out if there is only one. PathError."""
+        """Return the update that has a register; PathError if none has.
+
+        The path may omit the source if there is only one.
+        """
         update = self.updates.get(path.partition("/")[0])
         if update is None and len(self.updates) == 1:
             (update,) = self.updates.values()
@@ -205,5 +221,5 @@ class Snapshot:
         return update
 
     def __getitem__(self, path: str) -> Any:
-        """A register's good value; QualityError, PathError."""
+        """Return a register's good value; errors as of :meth:`Update.good`."""
         return self.of(path).good(path)

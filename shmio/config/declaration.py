@@ -58,7 +58,7 @@ def check_declarations(declarations: Sequence[Declaration]) -> None:
 
 
 def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
-    """Yield each fault that no layout can cure, with its key."""
+    """Yield each fault that can be found without a layout, with its key."""
     if len(declarations) > MAX_DECLARATIONS:
         yield f"injection: {len(declarations)} of them; at most {MAX_DECLARATIONS}"
         return
@@ -96,7 +96,7 @@ def contradictions(declaration: Declaration) -> Iterator[str]:
     if declaration.end_s is not None and declaration.end_s <= (declaration.start_s or 0):
         yield f"end_s: {declaration.end_s:g} is not after start_s, {declaration.start_s or 0:g}"
     if declaration.times is not None and declaration.when is None:
-        yield "times: how often it is active is for one with a condition, in `when`"
+        yield "times: this key is only for an injection with a condition, in `when`"
 
 
 def _fault(value: Any, depth: int = 0) -> str:
@@ -108,7 +108,7 @@ def _fault(value: Any, depth: int = 0) -> str:
     if isinstance(value, bool | str):
         return ""
     if isinstance(value, float) and not math.isfinite(value):
-        return f'{value} is no number; for a REAL write it as text, "NaN" or "Infinity"'
+        return f'{value} is not a number; for a REAL write it as text, "NaN" or "Infinity"'
     if isinstance(value, int) and not -(2**63) <= value < 2**64:
         return "a number of more than 64 bits"
     return "" if isinstance(value, int | float) else "expected numbers, text, true or false, or lists of them"

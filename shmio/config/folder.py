@@ -47,7 +47,7 @@ def unwritable(folder: Path) -> Obstacle | None:
     except OSError as error:  # a name too long, a folder above that cannot be searched
         return Obstacle(f"{folder}: {error.strerror}")
     if not place.is_dir():
-        return Obstacle(f"{place} is no folder")
+        return Obstacle(f"{place} is not a directory")
     try:
         _write(place)
     except OSError as error:

@@ -76,14 +76,14 @@ def _check_addresses(grpc: Grpc) -> None:
         _check_address(key, address.listen, parse_address, safe=address.insecure or grpc.tls is not None, remedy=remedy)
         if not address.roles and grpc.token and not takes_tokens(grpc, address):
             raise ConfigError(
-                f"{key}: {address.listen} is plain text that other hosts can reach, and would carry the tokens of "
-                "[[grpc.token]] for all to read: give it a [grpc.tls] table; or make it a [[grpc.address]] with roles "
-                "for clients without a token; or write tokens_in_plain_text = true beside it, if that is acceptable"
+                f"{key}: {address.listen} is plain text, so other hosts could read the tokens of [[grpc.token]]: "
+                "give it a [grpc.tls] table; or make it a [[grpc.address]] with roles for clients without a token; "
+                "or write tokens_in_plain_text = true beside it, if that is acceptable"
             )
         if not address.roles and not grpc.token and not encrypted(grpc, address):
             raise ConfigError(
-                f"{key}: {address.listen} knows no certificates, and so none of [[grpc.client]]: make it a "
-                "[[grpc.address]] with roles for all who reach it, or add a [[grpc.token]]"
+                f"{key}: {address.listen} uses no certificates, so no [[grpc.client]] can be recognised: make it "
+                "a [[grpc.address]] with roles for all who reach it, or add a [[grpc.token]]"
             )
     for index, address in enumerate(grpc.address):
         _check_roles(f"grpc.address[{index}]", address.roles)
@@ -123,6 +123,6 @@ def _check_roles(key: str, roles: Sequence[str]) -> None:
 
 def _check_secret(key: str, token: Token) -> None:
     if (token.token_file is None) == (token.sha256 is None):
-        raise ConfigError(f"{key}: give either token_file, a file with the token alone, or sha256, the token's hash")
+        raise ConfigError(f"{key}: give either token_file, a file with only the token, or sha256, the token's hash")
     if token.sha256 is not None and (len(token.sha256) != 64 or not _DIGITS.issuperset(token.sha256)):
         raise ConfigError(f"{key}.sha256: expected 64 digits, as by: printf %s TOKEN | sha256sum")

@@ -18,7 +18,7 @@ def load_pair(context: ssl.SSLContext, certificate: str, key: str, where: str) -
     try:
         context.load_cert_chain(certificate, key, password=_refuse_to_ask)
     except _EncryptedError:
-        raise ConfigError(f"{where}.key: {key}: needs a passphrase; give one that needs none") from None
+        raise ConfigError(f"{where}.key: {key}: needs a passphrase; use a key without one") from None
 
 
 def load_authority(context: ssl.SSLContext, name: str, key: str) -> None:

@@ -174,7 +174,7 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
         if len(sources) > MAX_SOURCES:
             faults.add(
                 f"source: {len(sources)} of them; an instance has at most {MAX_SOURCES} processes, "
-                "and no more are looked at"
+                "and the others are not checked"
             )
     sound, places = _Structure(faults, folder, broken).sections(tables)
     faults.places = places
@@ -297,7 +297,7 @@ class _Structure:
     def _first(self, value: list[Any], key: str) -> list[Any]:
         """Return the sections to check, at most ``MAX_SECTIONS``."""
         if len(value) > MAX_SECTIONS:
-            self._faults.add(f"{key}: {len(value)} of them; at most {MAX_SECTIONS} are looked at")
+            self._faults.add(f"{key}: {len(value)} of them; only {MAX_SECTIONS} are checked")
         return value[:MAX_SECTIONS]
 
     def _field(self, value: Any, key: str, kind: Any) -> bool:
@@ -371,7 +371,7 @@ def text_faults(value: Any, key: str) -> Iterator[str]:
     """Yield a fault for each text with control characters, at any depth."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
         path = "; a path with backslashes is written in single quotes" if _SLIPPED.search(value) else ""
-        yield f"{key}: must not hold control characters{path}"
+        yield f"{key}: must not contain control characters{path}"
     if isinstance(value, dict):
         for name, item in value.items():
             yield from text_faults(item, f"{key}.{name}".lstrip("."))
@@ -389,7 +389,7 @@ def _name_faults(config: Config) -> Iterator[str]:
             if folded in RESERVED_SOURCES:
                 yield f"{key}: {section.name!r} is reserved"
             elif folded in SECTION_PROCESSES:
-                yield f"{key}: {section.name!r} is the name of a process of ours"
+                yield f"{key}: {section.name!r} is the name of one of shmio's processes"
             elif folded in seen:
                 yield f"{key}: {section.name!r} is already the name of {seen[folded]} (case does not count)"
             seen[folded] = f"{table}[{index}]"
@@ -417,4 +417,4 @@ def _rotation_faults(config: Config) -> Iterator[str]:
     for key, least in (("rotate_min", 0.1), ("rotate_mb", 1)) if config.recorder else ():
         value: float = getattr(config.recorder, key)
         if 0 < value < least:
-            yield f"recorder.{key}: {value:g} is less than {least:g}, which would make files without number; 0: never"
+            yield f"recorder.{key}: {value:g} is less than {least:g}, which would create too many files; 0: never"

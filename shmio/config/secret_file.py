@@ -33,7 +33,9 @@ def read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes:
         if not stat.S_ISREG(mode):
             raise ConfigError(f"{key}: not a file")
         if mode & _OTHERS:
-            raise ConfigError(f"{key}: mode {stat.S_IMODE(mode):04o} lets others in: chmod 600, and {instead}")
+            raise ConfigError(
+                f"{key}: mode {stat.S_IMODE(mode):04o} lets other users read it: chmod 600, and {instead}"
+            )
         return os.read(fd, most_bytes)
     finally:
         os.close(fd)

@@ -46,7 +46,7 @@ def obstacle(path: str) -> str | None:
     except FileNotFoundError:
         return None
     if not stat.S_ISSOCK(mode):
-        return "there is a file of that name that is no socket: move it away, or choose another path"
+        return "a file of that name exists and is not a socket: move it away, or choose another path"
     if listened_on(path):
         return f"another program listens there; choose another path, or see which: ss -xlp src {path}"
     return None

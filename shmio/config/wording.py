@@ -61,7 +61,7 @@ def explain(error: ValidationError, key: str = "") -> str:
         text = f"expected a name: {NAME_RULE}"
     elif unknown := re.fullmatch(r"Invalid enum value ('.*')", text):
         words = get_args(_WORDS[path.rpartition(".")[2]])
-        text = f"{unknown[1]} is none; there are: {', '.join(words)}{meant(unknown[1].strip(_QUOTES), words)}"
+        text = f"{unknown[1]} is unknown; valid: {', '.join(words)}{meant(unknown[1].strip(_QUOTES), words)}"
     elif text.endswith("of length >= 1"):
         text = "must not be empty"
     text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)
@@ -98,7 +98,7 @@ def explain_toml(error: Exception, text: str) -> str:
     double = Lines(text).double
     if double and str(error).startswith(_DOUBLE):
         key, first, second = double
-        return f"{error}: {key[:MAX_LINE]} is there twice, in lines {first} and {second}; keep one of them"
+        return f"{error}: {key[:MAX_LINE]} is given twice, in lines {first} and {second}; keep one of them"
     return f"{error}: {shown}{_slip(str(error), line, column)}" if shown else str(error)
 
 
@@ -106,7 +106,7 @@ def _slip(message: str, line: str, column: int) -> str:
     if message.startswith("Illegal character '\\n'"):
         return "; a quote is missing at its end"
     if "\\" in line and message.startswith(_ESCAPE):
-        return "; in double quotes a backslash has a meaning of its own: write a path in single quotes, 'C:\\cell.db'"
+        return "; in double quotes a backslash has a special meaning: write a path in single quotes, 'C:\\cell.db'"
     word = next((word[0] for word in _BARE.finditer(line) if word.start() <= column < word.end()), "").strip("“”")
     if message.startswith("Expected '='") or not _TEXT.fullmatch(word):
         return ""

@@ -58,7 +58,7 @@ def run(worker: Worker) -> None:
     rate = _Rate()
     while not worker.stopping.wait(BEAT_S):
         if not thread.is_alive() or not commands.is_alive():
-            raise ConnectorError("the poll loop or the commands' thread ended by itself; its traceback is in the log")
+            raise ConnectorError("the poll loop or the command thread ended unexpectedly; its traceback is in the log")
         busy_s = _busy_s(loop.counters.busy_since_ns)
         if busy_s > part.timeout_s + HANG_MARGIN_S:
             continue  # without a heartbeat the supervisor replaces the process
@@ -122,7 +122,9 @@ def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
     segment = worker.segment
     source = Replay(options, worker.name)
     if source.layout.hash != segment.blocks[worker.name].layout.hash:
-        raise ConfigError(f"the recording of source {worker.name} has another layout by now: shmio-supervisor reload")
+        raise ConfigError(
+            f"the recording of source {worker.name} now has a different layout: run shmio-supervisor reload"
+        )
     block = segment.blocks[worker.name]
     beginning = begin(source, block, segment.header.started_ns, segment.blocks.values())
     clock = PageClock(segment.clock, worker.slot.index)

@@ -197,7 +197,7 @@ class SourceLoop:
             if took_ns > self._writer.block.stale_ns:  # the age of the image is unknown
                 limit_ms = self._writer.block.stale_ns / 1e6
                 raise ConnectorError(
-                    f"the answer took {took_ns / 1e6:.0f} ms: older than stale_ms ({limit_ms:.0f}) allows"
+                    f"the answer took {took_ns / 1e6:.0f} ms, longer than stale_ms ({limit_ms:.0f}) allows"
                 )
             self._publish(asked, raw)
             if self._clock.now_ns() >= until_ns:

@@ -126,6 +126,6 @@ def program(name: str, layout: Layout) -> Program:
         build = PROGRAMS[name]
     except KeyError:
         raise ConfigError(
-            f"program: {name!r} is none; there are: {', '.join(sorted(PROGRAMS))}{meant(name, PROGRAMS)}"
+            f"program: {name!r} is unknown; valid: {', '.join(sorted(PROGRAMS))}{meant(name, PROGRAMS)}"
         ) from None
     return build(layout)

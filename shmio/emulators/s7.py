@@ -1,4 +1,4 @@
-"""An S7 server for emulated controllers: python-snap7's, with what is wrong or missing in it mended.
+"""An S7 server for emulated controllers: python-snap7's server, with corrections and additions.
 
 Kept from python-snap7 3.3: the memory areas, the ISO-on-TCP handshake, system status lists, block lists, clock,
 and the start and stop of the emulated CPU. Added: the system status list that tells the operating mode. Replaced,
@@ -109,7 +109,7 @@ class S7Server(Server):
         connections.
         """
         if self.running or self._stopping.is_set():
-            raise ShmioError("an S7 server is started once")
+            raise ShmioError("an S7 server can be started only once")
         wanted = Address(self.host, self.port if tcp_port is None else tcp_port)
         try:
             family, kind, protocol, _, place = socket.getaddrinfo(
@@ -191,7 +191,7 @@ class S7Server(Server):
         address = client.getpeername()
         with self.client_lock:
             if self.client_count >= self.max_clients:
-                raise RuntimeError(f"{address[0]} would be one more than {self.max_clients} clients")
+                raise RuntimeError(f"{address[0]}: there are {self.max_clients} clients already")
             thread = threading.Thread(
                 target=self._handle_client, args=(client, address), name=f"s7-client-{address[1]}", daemon=True
             )

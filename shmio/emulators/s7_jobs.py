@@ -88,10 +88,9 @@ class _Item(NamedTuple):
 
 
 class Memory:
-    """The areas that a client can access, with the one lock for all access.
+    """Memory areas that a client can access, with one lock for all of them.
 
-    The single lock ensures that neither an answer nor a write of several items meets half a program
-    cycle.
+    Because of the lock, answers and writes of several items happen between program cycles.
     """
 
     def __init__(self, areas: Mapping[tuple[S7Area, int], bytearray]) -> None:

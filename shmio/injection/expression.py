@@ -215,7 +215,7 @@ class _Parser:
 
     def _nested(self, read: Callable[[], None]) -> None:
         if self._depth == MAX_DEPTH:
-            raise ConfigError(f"at character {self._start + 1}: more than {MAX_DEPTH} levels within each other")
+            raise ConfigError(f"at character {self._start + 1}: more than {MAX_DEPTH} nested levels")
         self._depth += 1
         read()
         self._depth -= 1
@@ -234,7 +234,7 @@ class _Parser:
             function = self._word
             self._advance()
             if not self._is("("):
-                raise self._expected(f"'(' behind {function}")
+                raise self._expected(f"'(' after {function}")
             self._parentheses()
             self._emit(_one(abs) if function == "abs" else _edge(_EDGES[function], len(self._steps)))
         elif self._kind == "number":
@@ -261,7 +261,7 @@ class _Parser:
         base, sharp, rest = digits.partition("#")
         if sharp:
             if not rest:
-                raise self._expected("digits behind the '#'")
+                raise self._expected("digits after the '#'")
             return int(rest, int(base))
         return float(digits) if set(digits) & set(".eE") else int(digits)
 

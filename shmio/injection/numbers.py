@@ -67,7 +67,7 @@ class ValueGroup:
         image[self.index] = fitting.view(np.uint8).reshape(self.index.shape)
 
     def put(self, image: Bytes, table: Bytes, choice: npt.NDArray[np.intp]) -> None:
-        """Put values from a table (k, size) into an image, each as ``choice`` (n,) says.
+        """Put values of a table (k, size) into an image; ``choice`` (n,) selects a row for each element.
 
         Bits are 0 or 1.
         """

@@ -233,7 +233,7 @@ def _delay(declaration: Declaration, _target: Target, layout: Layout, period_ns:
     held = cycles or -(-delay_ns // period_ns)
     most = min(MAX_DELAY_CYCLES, MAX_DELAY_BYTES // max(1, layout.size))
     if held > most:
-        raise ConfigError(f"{key}: {held} cycles of {layout.size} bytes, {most} are the most that a delay holds")
+        raise ConfigError(f"{key}: {held} cycles of {layout.size} bytes, but a delay holds at most {most}")
     return lambda _draw: Delay(layout.size, delay_ns, cycles)
 
 
@@ -284,7 +284,7 @@ def _numbers(declaration: Declaration, target: Target, layout: Layout) -> list[V
         if register.type == "BOOL" or not scalar_codec(register.element).plain:
             kinds = "numbers: REAL, LREAL, " + ", ".join(sorted(INTEGERS)) + ", TIME, LTIME"
             name = f"{target.source}/{register.path}"
-            raise ConfigError(f"target: {name} is {register.type}, and {declaration.operation} is for {kinds}")
+            raise ConfigError(f"target: {name} is {register.type}, but {declaration.operation} is for {kinds}")
     return _places(target, layout)
 
 

@@ -40,11 +40,13 @@ def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
     for text in texts:
         found += _registers(text, layouts)
         if len(found) > MAX_REGISTERS:
-            raise PathError(f"{text}: more than {MAX_REGISTERS} registers and elements: lay several over parts of it")
+            raise PathError(
+                f"{text}: more than {MAX_REGISTERS} registers and elements: lay several injections over parts of it"
+            )
     places = {(source, direction) for source, direction, _ in found}
     if len(places) != 1:
         named = ", ".join(sorted(f"{source} /{direction}" for source, direction in places))
-        raise PathError(f"one injection is over one direction of one source, this is over {named}")
+        raise PathError(f"an injection covers one direction of one source, but this covers {named}")
     source, direction = places.pop()
     cover = bytearray(layouts[source].size)
     registers = []
@@ -68,7 +70,7 @@ def single(text: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
     """
     topic = parse_topic(text, layouts, _default(layouts))
     if topic.direction == "in":
-        raise PathError(f"{text}: a condition reads what comes out of a source; leave out /in")
+        raise PathError(f"{text}: a condition reads outputs of a source; leave out /in")
     return topic.source, look_up(_layout(topic.source, text, layouts), topic)
 
 
@@ -93,5 +95,5 @@ def _default(layouts: Collection[str]) -> str | None:
 
 def _layout(source: str, text: str, layouts: Mapping[str, Layout]) -> Layout:
     if source not in layouts:
-        raise PathError(f"{text}: nothing is served under {source} in this version")
+        raise PathError(f"{text}: unknown source {source}")
     return layouts[source]

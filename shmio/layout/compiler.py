@@ -118,7 +118,7 @@ class Program:
                     self._table = tags.compile_tags(source.file, source.text, report)
                     self.blocks = (BlockName(self._table.name, None),)
                     return
-                report.add(Diagnostic(source.file, 1, 1, "a tag table stands alone, not together with other files"))
+                report.add(Diagnostic(source.file, 1, 1, "a tag table cannot be combined with other files"))
                 report.raise_errors()
         for source in sources:
             self._units.append(_read(source, report))

@@ -101,9 +101,9 @@ def _register(item: _Register) -> Register:
         raise LayoutError(f"layout: {item.path!r} has inverted bounds")
     shape = tuple(high - low + 1 for low, high in dims)
     if item.count != math.prod(shape) or item.size != array_size(element, shape):
-        raise LayoutError(f"layout: {item.path!r} has a size or count that is not its type's")
+        raise LayoutError(f"layout: {item.path!r} has a size or count that does not fit its type")
     if (item.bit is None) != (element.base != "BOOL") or (dims and item.bit):
-        raise LayoutError(f"layout: {item.path!r} has a bit that is not its type's")
+        raise LayoutError(f"layout: {item.path!r} has a bit that does not fit its type")
     try:
         path = canonical_path(item.path)
     except PathError as error:

@@ -61,7 +61,7 @@ def slice_of(layout: Layout, array: Register, leading: tuple[int, ...], low: int
     """
     path = "/".join((array.path, *map(str, leading), f"{low}..{high}"))
     if len(array.dims) != len(leading) + 1:
-        raise PathError(f"{path}: a range stands in place of an array's last index")
+        raise PathError(f"{path}: a range must take the place of an array's last index")
     if high < low:
         raise PathError(f"{path}: write the lower index first")
     first = layout.element(array, (*leading, low))

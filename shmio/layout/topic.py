@@ -75,7 +75,7 @@ def decode_segment(segment: str) -> str:
         return segment
     if PART.fullmatch(segment):  # none is a name: not one of them decodes
         raise PathError(
-            f"{shorten(segment)}: a bit or another part of a register ends the path of one register, and is not here"
+            f"{shorten(segment)}: a bit or another part of a register is allowed only at the end of a register's path"
         )
     data = bytearray()
     position = 0
@@ -114,7 +114,7 @@ def canonical_path(path: str, *, parts: bool = False) -> str:
         segments[-1], suffix = part["head"], f".%{part['kind']}{int(part['number'])}"
     canonical = "/".join(encode_segment(decode_segment(segment)) for segment in segments) + suffix
     if _CONTROL.search(canonical):
-        raise PathError(f"{shorten(path)!r}: a path must not hold control characters")
+        raise PathError(f"{shorten(path)!r}: a path must not contain control characters")
     return canonical
 
 
@@ -174,7 +174,7 @@ def _which(first: str, sources: Collection[str]) -> str:
         return "there is no source"
     some = [f"{source}/…" for source in sources][:_SOURCES_SHOWN]
     more = ", …" if len(sources) > len(some) else ""
-    return f"there are {len(sources)} sources, and {first!r} is none of them: write {' or '.join(some)}{more}"
+    return f"{first!r} is not one of the {len(sources)} sources: write {' or '.join(some)}{more}"
 
 
 def look_up(layout: Layout, topic: Topic) -> Register:
@@ -195,7 +195,7 @@ def _with_source_in_errors(layout: Layout, topic: Topic, search: Callable[[Layou
             raise PathError(f"{topic.source}/{error}") from None
         if topic.named:
             raise
-        raise PathError(f"{error}; looked for in source {topic.source}, as the path begins with no source") from None
+        raise PathError(f"{error}; searched in source {topic.source}, because the path names no source") from None
 
 
 def find(layout: Layout, path: str) -> Register:
@@ -214,7 +214,7 @@ def find(layout: Layout, path: str) -> Register:
         return part_of(layout, whole, part["kind"], int(part["number"]))
     if bounds := RANGE.fullmatch(last):
         if (found := _array(layout, head)) is None:
-            raise PathError(f"{shorten(path)}: a range stands in place of an array's last index")
+            raise PathError(f"{shorten(path)}: a range must take the place of an array's last index")
         return slice_of(layout, *found, int(bounds["low"]), int(bounds["high"]))
     if found := _array(layout, head):
         array, indices = found
@@ -277,7 +277,7 @@ def _unknown(layout: Layout, path: str) -> str:
         return f"{layout.name}: the path names a source, not a register"
     if below := layout.members(path):
         inside = ", ".join(layout.registers[i].path for i in below[:3])
-        return f"{shorten(path)}: a structure, not a register; it holds {inside}{', …' if below[3:] else ''}"
+        return f"{shorten(path)}: a structure, not a register; it contains {inside}{', …' if below[3:] else ''}"
     known, missing, names = _where_it_ends(layout, path)
     prefix = f"{known}/" if known else ""
     if names and all(map(_INDEX.fullmatch, names)):

@@ -88,7 +88,7 @@ def of_one_source(what: str, paths: Collection[str], blocks: Mapping[str, Block]
     topics = [parse_topic(path, blocks, default) for path in paths]
     for path, topic in zip(paths, topics, strict=True):
         if topic.source not in blocks:
-            raise PathError(f"{path}: nothing is served under {topic.source} in this version")
+            raise PathError(f"{path}: unknown source {topic.source}")
     sources = {topic.source for topic in topics}
     if len(sources) != 1:
         raise PathError(f"one {what} is for one source, these are for {', '.join(sorted(sources)) or 'none'}")
@@ -173,9 +173,9 @@ class Attachment(TimeMethods):
         blocks = self._blocks()
         topic = parse_topic(path, blocks, next(iter(blocks)) if len(blocks) == 1 else None)
         if topic.source not in blocks:
-            raise PathError(f"{path}: nothing is served under {topic.source} in this version")
+            raise PathError(f"{path}: unknown source {topic.source}")
         if topic.direction == "in":
-            raise PathError(f"{path}: what goes into a source is not read but followed: written(); leave out /in")
+            raise PathError(f"{path}: an input of a source cannot be read; follow it by written(), or leave out /in")
         block = blocks[topic.source]
         return block, look_up(block.layout, topic)
 
@@ -358,7 +358,7 @@ class Attachment(TimeMethods):
         block, topics = of_one_source("write", values, self._blocks())
         for path, topic in zip(values, topics, strict=True):
             if topic.direction == "out":
-                raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
+                raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
         return self._source_writer(block).write(
             {topic.path: value for topic, value in zip(topics, values.values(), strict=True)}, timeout_s
         )
@@ -387,7 +387,7 @@ class Attachment(TimeMethods):
         block, topics = of_one_source("injection", paths, self._blocks())
         directions = {topic.direction or "out" for topic in topics}
         if len(directions) != 1:
-            raise PathError("an injection is over /out or over /in, not over both")
+            raise PathError("an injection covers /out or /in, not both")
         direction = Direction.IN if "in" in directions else Direction.OUT
         source_writer = self._source_writer(block)
         events = block.events.cursor()  # from before it is laid: what it diverts at once is not missed
@@ -412,7 +412,7 @@ class Attachment(TimeMethods):
         block, topics = of_one_source("call", paths, self._blocks())
         for path, topic in zip(paths, topics, strict=True):
             if topic.direction == "out":
-                raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
+                raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
         patterns = [topic.path or "**" for topic in topics]
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 

@@ -63,7 +63,7 @@ def check(
     programs = []
     for index, declaration in enumerate(declarations):
         if not wanted():
-            raise CommandError("whoever declared it does not wait for it any more")
+            raise CommandError("its program no longer waits for it")
         try:
             programs.append(compile_program(declaration, layouts, periods_ns))
         except ConfigError as error:

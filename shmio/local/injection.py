@@ -219,7 +219,7 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
         if any(one.number == number and not one.lifted for one in source_writer.block.standing.read())
     ]
     if left:
-        raise CommandError(f"{len(left)} of {len(chosen)} injections still stand: {'; '.join(reasons)}")
+        raise CommandError(f"{len(left)} of {len(chosen)} injections were not lifted: {'; '.join(reasons)}")
 
 
 def as_given(paths: Iterable[str], outcomes: Iterable[Outcome]) -> list[Outcome]:

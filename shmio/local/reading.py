@@ -1,4 +1,4 @@
-"""What a local program reads: the value of a register, and frames with their layout."""
+"""Readings of a local program: values of registers, and frames with their layout."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class View:
         """
         topic = parse_topic(path, (self.source,), self.source)
         if topic.direction == "in":
-            raise PathError(f"{path}: a frame holds what comes out of its source; leave out /in")
+            raise PathError(f"{path}: a frame has only outputs of its source; leave out /in")
         return self._decode(topic.path, self.frame.image)
 
     def original(self, path: str) -> Value:
@@ -120,7 +120,7 @@ def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
     known = frame.source_ns != 0
     value = codec(register, block.layout.byte_order).decode(frame.image) if known else None
     if quality is not Quality.BAD and holds_none(value):
-        quality, reason = Quality.BAD, f"the bytes are no {register.type}"
+        quality, reason = Quality.BAD, f"the bytes are not a valid {register.type}"
     source_time = frame.source_ns / 1e9 if known else None
     provenance = Provenance.INJECTED if injected(block, (register,), frame) else frame.provenance
     age_s = round(frame.age_ns(now_ns) / 1e9, 6)

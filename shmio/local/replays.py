@@ -173,7 +173,7 @@ class Replays:
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
         if wanted.speed is not None and not (math.isfinite(wanted.speed) and MIN_SPEED <= wanted.speed <= MAX_SPEED):
-            raise ValueRangeError(f"a speed is from {MIN_SPEED:g} to {MAX_SPEED:g}, not {wanted.speed:g}")
+            raise ValueRangeError(f"the speed must be from {MIN_SPEED:g} to {MAX_SPEED:g}, not {wanted.speed:g}")
         plays = self._chosen(wanted)
         with self._held(plays) as heads:
             if wanted.change or wanted.event:
@@ -210,7 +210,7 @@ class Replays:
         meant = {_recording(plays[source]) for source in names or plays}
         if wanted.event and len(meant) > 1:  # their positions are unrelated
             raise CommandError(
-                f"several recordings are played: name one of the sources of the one that is meant ({', '.join(plays)})"
+                f"several recordings are playing: choose one by the name of one of its sources ({', '.join(plays)})"
             )
         return {source: play for source, play in plays.items() if _recording(play) in meant}
 
@@ -303,7 +303,7 @@ class Replays:
             if rest_ns <= 0:
                 raise CommandError(f"source {source} does not answer: {self._state(source)}")
             if given_up():
-                raise CommandError(f"source {source} has not answered: it was given up")
+                raise CommandError(f"source {source} has not answered in time")
             ring.wait(seen, min(rest_ns, TURN_NS))
 
     def _state(self, source: str) -> str:
@@ -338,7 +338,7 @@ def _position(play: PlayState, text: str) -> int:
         ) from None
     if not play.begin_ns <= position_ns <= play.end_ns:
         length_s = (play.end_ns - play.begin_ns) / 1e9
-        raise ValueRangeError(f"{text} is not within what is played, which is {length_s:.3f} s long")
+        raise ValueRangeError(f"{text} is outside the played part, which is {length_s:.3f} s long")
     return position_ns
 
 

@@ -169,8 +169,8 @@ def supervisor_silence(segment: Segment) -> str | None:
         return None
     pid = segment.supervisor[0]
     return (
-        f"supervisor pid {pid} has shown no sign of life for {silent_s:.0f} s: if it was stopped, kill -CONT {pid} "
-        f"lets it go on; else kill -KILL {pid}, then shmio-supervisor down --instance "
+        f"supervisor pid {pid} has not responded for {silent_s:.0f} s: if it was stopped, kill -CONT {pid} "
+        f"resumes it; otherwise kill -KILL {pid}, then shmio-supervisor down --instance "
         f"{segment.instance} clears what is left"
     )
 

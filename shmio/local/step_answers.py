@@ -10,9 +10,11 @@ from shmio.model.values import Quality
 from shmio.segment.block import Block
 from shmio.segment.segment import Segment
 
-_NOBODY: Final = "no source lives on the instance's clock: steps move none; those with a device go on in real time"
-_REAL: Final = "; shmio step --release brings real time back"
-_STANDS: Final = f"it stands until it is stepped{_REAL}"
+_NOBODY: Final = (
+    "no source uses the instance clock, so stepping has no effect; sources with a device continue in real time"
+)
+_REAL: Final = "; shmio step --release returns to real time"
+_STANDS: Final = f"it is paused until the next step{_REAL}"
 
 
 class StepWait(NamedTuple):

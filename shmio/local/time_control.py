@@ -100,7 +100,11 @@ class Coordinator:
             self._take_lock(time.monotonic_ns() + round(patience_s * 1e9))
             self._owns = True
             state = self.read()
-            note = f"step {state.step} was not finished: who asked for it has ended" if state.stepping else state.note
+            note = (
+                f"step {state.step} was not finished: the program that requested it has ended"
+                if state.stepping
+                else state.note
+            )
             state = state._replace(owner=os.getpid(), playing=False, stepping=False, note=note)
             if not state.virtual:
                 # A free-running source reads the page before each cycle, so none starts a cycle after this
@@ -142,7 +146,7 @@ class Coordinator:
         if self._segment.clock.stepped:
             raise TimeError(
                 f'the time of instance {self._segment.instance!r} is virtual from its start (clock = "stepped" in its '
-                'configuration): there is no real time to go back to; for that start it with clock = "wall"'
+                'configuration): there is no real time to go back to; to have real time, start it with clock = "wall"'
             )
 
     def set_step_size(self, dt_ns: int) -> None:
@@ -165,7 +169,7 @@ class Coordinator:
             TimeError: Another process owns time.
         """
         if not 0 < rate <= MAX_RATE:
-            raise ValueRangeError(f"a rate is above 0, at most {MAX_RATE:g}, not {rate:g}")
+            raise ValueRangeError(f"the rate must be above 0 and at most {MAX_RATE:g}, not {rate:g}")
         with self._turn:
             self.take_over()
             self._write(self.read()._replace(playing=playing, rate=rate))
@@ -209,7 +213,7 @@ class Coordinator:
         participants = self._participants()
         stands = unmoved_note(self._segment, participants)
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
-        problem = "it was broken off"
+        problem = "it was cancelled"
         try:
             self._segment.clock.write(asked, ring=False)  # delivering processes need to act only once it is done
             self._ring([block.source for block in participants])
@@ -255,7 +259,7 @@ class Coordinator:
             state = self.read()
             if rest_ns <= 0 or state.playing:
                 name = self._segment.instance
-                how = ", which plays it; stop that first" if state.playing else "; it is free when that ends"
+                how = ", which is playing it; stop that first" if state.playing else "; it is free when that ends"
                 raise TimeError(f"the time of instance {name!r} is moved by {self._owner(state.owner)}{how}")
             bell.wait(seen, min(rest_ns, TURN_NS))
 

@@ -35,7 +35,7 @@ class Timekeeper:
     def step(self, dt_ns: int | None = None) -> Step:
         """Move time by one step, as :meth:`Coordinator.step` does. TimeError: also while time is played."""
         if self._player is not None:
-            raise TimeError("time is played: pause it before it can be stepped")
+            raise TimeError("time is playing: pause it before you step it")
         self._take_over()
         return self._coordinator.step(dt_ns)
 

@@ -87,12 +87,14 @@ class CommandSender:
             if len(record) + 8 > queues.capacity:
                 most = queues.capacity - 8
                 raise CommandError(
-                    f"{source}: a command of {len(record)} bytes, {most} are the most: write fewer at once"
+                    f"{source}: a command of {len(record)} bytes, at most {most} are allowed: write fewer at once"
                 )
             if self._pid != os.getpid():
-                raise CommandError("this process is a copy, made by fork, of the one that attached: attach anew in it")
+                raise CommandError("this process was forked from the one that attached: attach again in this process")
             if not queues.push(self.writer, record):
-                raise CommandError(f"{source}: its command queue is full: it takes none at present, or too many come")
+                raise CommandError(
+                    f"{source}: its command queue is full: the source is not reading commands, or too many are queued"
+                )
             return number
 
 
@@ -252,7 +254,7 @@ class SourceWriter:
         try:
             size = len(text.encode())
         except UnicodeEncodeError as error:  # a terminal that is not UTF-8
-            raise ValueRangeError(f"a note is text in UTF-8, and character {error.start + 1} of this is none") from None
+            raise ValueRangeError(f"a note must be UTF-8 text, but character {error.start + 1} is not") from None
         if not 0 < size <= MAX_NAME_BYTES:
             raise ValueRangeError(f"a note has 1 to {MAX_NAME_BYTES} bytes in UTF-8, this has {size}")
         self._expect(self._send(("",), [], timeout_s, CommandKind.NOTE, name=text), EventKind.NOTED)
@@ -332,9 +334,9 @@ class SourceWriter:
     def check(self, register: Register) -> None:
         """Raise CommandError if a register is not writable."""
         if not self.is_writable(register):
-            remedy = "the configuration has to name it in the source's `writable`"
+            remedy = "name it in the source's `writable` in the configuration"
             if self.block.attributes.connector in _MODELS:
-                remedy += ", unless its model computes it: nobody writes that, and shmio inject shows another value"
+                remedy += ", unless its model computes it: then only shmio inject can show another value"
             raise CommandError(f"{self.block.source}/{register.path} is not writable; {remedy}")
 
     def _next(self, ticket: PendingCommand) -> Event | None:

@@ -10,7 +10,7 @@ STEP_SIZE_NS: Final = 50_000_000
 
 
 class ClockMode(IntEnum):
-    """Whether time is real or moved by steps."""
+    """Mode of the clock: real time, or time that is moved by steps."""
 
     WALL = 0
     VIRTUAL = 1

@@ -61,7 +61,7 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """A declared injection that was laid. ``seed``: its own, or the one that was drawn for it."""
+    """A declared injection that was laid; ``seed`` is its own, or a random one."""
 
     source: str
     number: int
@@ -98,7 +98,7 @@ class Happening:
 
 @dataclass(frozen=True, slots=True)
 class Lifted:
-    """An injection that was to be lifted. ``failure``: why it still stands; empty: it does not."""
+    """Result of lifting an injection; ``failure`` says why it was not lifted, else it is empty."""
 
     source: str
     number: int

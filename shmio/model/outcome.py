@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class OutcomeKind(StrEnum):
-    """What became of a value."""
+    """Kind of outcome of a value."""
 
     WRITTEN = "written"
     """The device confirmed the value."""
@@ -36,7 +36,7 @@ class Outcome:
 
     Attributes:
         path: Path of the register.
-        kind: What became of the value.
+        kind: Kind of outcome.
         text: The reason, if there is one.
     """
 

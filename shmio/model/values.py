@@ -1,4 +1,4 @@
-"""What a value is worth and where it comes from, as segment, wire and programs number it."""
+"""Quality and provenance of values, with the numbers that segment and wire use."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Quality(IntEnum):
 
 
 class Provenance(IntEnum):
-    """Where a value comes from."""
+    """Origin of a value."""
 
     LIVE = 0
     SIMULATED = 1

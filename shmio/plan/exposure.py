@@ -26,8 +26,8 @@ def exposure(config: Config) -> str | None:
     more = len(users) - MAX_NAMES
     names = ", ".join(users[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
     return (
-        f"note: other users of this host ({names}) may {'; and '.join(ways)}, for nobody is asked who it is: "
-        "a UNIX socket, tokens or accounts close that, see SECURITY.md"
+        f"note: other users of this host ({names}) may {'; and '.join(ways)} without logging in: "
+        "a UNIX socket, tokens or accounts prevent that, see SECURITY.md"
     )
 
 

@@ -56,7 +56,9 @@ def _check_in(program: Program, source: Source, layout: Layout) -> None:
         raise ConfigError(f"target: an injection toward a device needs `armed = true` in source {source.name!r}")
     writable = np.frombuffer(cover(layout, source.writable), np.uint8)
     if (program.cover & ~writable).any():
-        raise ConfigError(f"target: it covers what is not writable; name that in `writable` of source {source.name!r}")
+        raise ConfigError(
+            f"target: it covers registers that are not writable; name them in `writable` of source {source.name!r}"
+        )
 
 
 def _document(source: str, programs: list[Program]) -> bytes:
@@ -74,7 +76,7 @@ def _document(source: str, programs: list[Program]) -> bytes:
 
 
 def _standing(program: Program) -> StandingInjection:
-    """As its source's process will show it."""
+    """Return a declared injection in the form in which its source's process publishes it."""
     declaration = program.declaration
     return StandingInjection(
         2**64 - 1, program.direction, declaration.priority, True, declaration.name, NO_WRITER, 0,

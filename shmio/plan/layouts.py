@@ -79,7 +79,7 @@ class LayoutFiles:
             raise found
         compiled = found
         held = ", ".join(layout.name for layout in compiled.layouts)
-        self.odd += [f"{key}.type_bytes: nothing in {held} is of the type {name!r}" for name in compiled.unused]
+        self.odd += [f"{key}.type_bytes: nothing in {held} has the type {name!r}" for name in compiled.unused]
         return compiled.layouts
 
 
@@ -116,7 +116,7 @@ def _read(path: Path, key: str) -> compiler.Source:
     try:
         with open(path, "rb", opener=_open_at_once) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise ConfigError(f"{key}{path}: no regular file; name the file of a data block")
+                raise ConfigError(f"{key}{path}: not a regular file; name the file of a data block")
             return compiler.Source(str(path), file.read(MAX_SOURCE_BYTES + 4))
     except OSError as error:
         raise ConfigError(f"{key}{path}: {error.strerror}") from None

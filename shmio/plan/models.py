@@ -74,7 +74,7 @@ def _check_connection(
     if topic.source not in layouts:
         raise PathError(f"{text}: no source {topic.source!r}; there are: {', '.join(layouts)}")
     if topic.direction == "in":
-        raise PathError(f"{text}: an input is read from what comes out of a source; leave out /in")
+        raise PathError(f"{text}: an input reads an output of a source; leave out /in")
     register, own = find(layouts[topic.source], topic.path), find(layouts[source], path)
     value = codec(register).decode(bytes(layouts[topic.source].size))
     try:

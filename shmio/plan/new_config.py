@@ -1,4 +1,4 @@
-"""A configuration to start from, made of a controller's exported files."""
+"""Make a first configuration from the exported files of a controller."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MAX_FILES: Final = 500
 
 
 class NewConfig(NamedTuple):
-    """A configuration to start from."""
+    """A first configuration."""
 
     text: str
     missing: list[str]
@@ -148,8 +148,8 @@ def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layo
 
 
 def _refuse_foreign(path: Path) -> None:
-    """Raise ConfigError if a file is an export of TIA Portal that is no source."""
-    with suppress(OSError), path.open("rb") as stream:  # what cannot be read is told with the others
+    """Raise ConfigError if a file is an export of TIA Portal, but not a source."""
+    with suppress(OSError), path.open("rb") as stream:  # unreadable files are reported with the others
         if what := foreign(path.name, stream.read(HEAD_BYTES)):
             raise ConfigError(f"{path}: {what}")
 
@@ -257,7 +257,7 @@ def vacant_name(name: str, file: Path) -> str:
 
 
 def _configured(file: Path) -> Iterator[str]:
-    """Return the names in the configurations of the same folder, of those beside it, and of the one above."""
+    """Yield instance names of the configurations in this folder, its neighbours and its parent."""
     folder = file.resolve().parent
     found = chain(folder.glob("*.toml"), folder.parent.glob("*/supervisor.toml"), folder.parent.glob("*.toml"))
     for other in islice(found, MAX_FILES):

@@ -86,7 +86,7 @@ def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
     try:
         found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:  # UnicodeError: a part of the name is empty, or too long
-        why = error.strerror if isinstance(error, OSError) else "it is no name of a host"
+        why = error.strerror if isinstance(error, OSError) else "it is not the name of a host"
         raise ConfigError(
             f"{address}: {address.host!r} cannot be resolved ({why}); write an address or a name of this host"
         ) from None

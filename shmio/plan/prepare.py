@@ -70,7 +70,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     origin, notices = None, list[str]()
     if mode == "log" and config.recorder is None and not faults:
         raise ConfigError(
-            f"{file}: --mode log reads the sources and records them, and there is no [recorder] section: "
+            f"{file}: --mode log records the sources and needs a [recorder] section: "
             'add one, such as [recorder] with directory = "dumps", or leave out --mode log'
         )
     with Recordings() as recordings:
@@ -192,7 +192,7 @@ def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple
     key = f"emulator[{index}]"
     if emulator.kind not in EMULATOR_KINDS:
         raise ConfigError(
-            f"{key}.kind: {emulator.kind!r} is none; there are: {', '.join(EMULATOR_KINDS)}"
+            f"{key}.kind: {emulator.kind!r} is unknown; valid: {', '.join(EMULATOR_KINDS)}"
             + meant(emulator.kind, EMULATOR_KINDS)
         )
     if emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
@@ -213,9 +213,9 @@ def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
     """Raise ConfigError if a block has no number; the compiler ensures that numbers are unique."""
     for layout in layouts:
         if layout.number is None:
-            alone = f'; block = "{layout.name}" beside it, to serve that block alone' if len(layouts) > 1 else ""
+            alone = f'; block = "{layout.name}" beside it, to serve only that block' if len(layouts) > 1 else ""
             why = f"the data block {layout.name!r} has no number in its name"
-            raise ConfigError(f"{key}.dbNumber: this key is needed, for {why}{alone}")
+            raise ConfigError(f"{key}.dbNumber: this key is needed, because {why}{alone}")
 
 
 def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str]:
@@ -224,7 +224,7 @@ def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str
     for index, source in enumerate(config.source):
         key, layout = f"source[{index}]", layouts[source.name]
         if source.connector == "remote" and config.grpc is None:
-            odd.append(f"{key}.connector: no model can connect to {source.name}, for there is no [grpc] section")
+            odd.append(f"{key}.connector: no model can connect to {source.name}, because there is no [grpc] section")
         for name, patterns in (("writable", source.writable), ("allow_nonfinite", source.allow_nonfinite)):
             for pattern in patterns:
                 try:
@@ -255,7 +255,7 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
     for key, pattern, frames in _topics(config):
         if frames:
             if pattern not in layouts:
-                raise ConfigError(f"{key}: {pattern!r}: frames are those of a whole source, so name one")
+                raise ConfigError(f"{key}: {pattern!r}: frames need the name of a whole source")
             continue
         try:
             if names_part(pattern) and key.startswith("mqtt.topic"):
@@ -281,13 +281,13 @@ def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
     shown = mqtt.tls is not None and mqtt.tls.ca is not None
     if free and (mqtt.password_file or not (address.loopback or shown)):
         yield (
-            f"mqtt.listen: whoever reaches {mqtt.listen} may publish commands, also without an account: have a "
-            "password_file, and a name in each [[mqtt.account]] with the role write"
+            f"mqtt.listen: anyone who reaches {mqtt.listen} may publish commands without an account: set "
+            "mqtt.password_file, and give each [[mqtt.account]] with the role write a name"
         )
     if mqtt.password_file:
         named = {account.name for account in mqtt.account}
         if others := ", ".join(name for name in read_accounts(mqtt.password_file) if name not in named):
-            yield f"mqtt.password_file: {others} may read alone: [[mqtt.account]] gives it the role write"
+            yield f"mqtt.password_file: {others} may only read: [[mqtt.account]] can give the role write"
 
 
 def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
@@ -324,7 +324,7 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
             served = [emulator.dbNumber or layout.number for layout in emulated[emulator.name]]
             if wanted not in served:
                 held = ", ".join(f"DB{number}" for number in served)
-                yield f"source[{index}]: it reads DB{wanted} of emulator {emulator.name!r}, which serves {held} alone"
+                yield f"source[{index}]: it reads DB{wanted} of emulator {emulator.name!r}, which serves only {held}"
 
 
 def _not_emulated(config: Config) -> Iterator[str]:

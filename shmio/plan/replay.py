@@ -113,11 +113,11 @@ def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]
         if name not in names:
             yield f"source {name} is left out: the recording has none of it; it has {', '.join(names)}"
     for emulator in config.emulator:
-        yield f"emulator {emulator.name} is left out: a recording is played, not a device read"
+        yield f"emulator {emulator.name} is left out: a replay reads no device"
     if config.injection and section.injections == "keep":
         yield (
             "the configuration's injections are left out: those of the recording are kept; "
-            'replay.injections = "leave out" has it the other way round'
+            'replay.injections = "leave out" does the opposite'
         )
     if config.grpc and config.grpc.default_source not in (None, *names):
         yield f"grpc.default_source is left out: the recording has no source {config.grpc.default_source}"
@@ -129,8 +129,8 @@ def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]
     wanted = config.recorder.sources if section.record and config.recorder else []
     if wanted and not set(wanted) & set(names):
         raise ConfigError(
-            f"replay.record: nothing would be recorded: the recording has {', '.join(names)}, and recorder.sources "
-            f"{', '.join(wanted)} alone"
+            f"replay.record: nothing would be recorded: the recording has {', '.join(names)}, but recorder.sources "
+            f"names only {', '.join(wanted)}"
         )
 
 
@@ -172,7 +172,9 @@ def _check_names(names: list[str], file: str) -> None:
         try:
             msgspec.convert({"name": name, "connector": "replay"}, Source)
         except msgspec.ValidationError:
-            raise ConfigError(f"replay.file: {file} has a source {name!r}, which is no name: {NAME_RULE}") from None
+            raise ConfigError(
+                f"replay.file: {file} has a source {name!r}, which is not a valid name: {NAME_RULE}"
+            ) from None
         if name.lower() in RESERVED_SOURCES | SECTION_PROCESSES:
             raise ConfigError(f"replay.file: {file} has a source {name!r}, and that name is reserved")
 

@@ -156,7 +156,9 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
 
     for name in ("layout", "block", "type_bytes", "properties"):
         if getattr(source, name):
-            raise ConfigError(f"{key}.{name}: a replay has none: its registers are those of the recording")
+            raise ConfigError(
+                f"{key}.{name}: a replay does not take this key: its registers are those of the recording"
+            )
     options = msgspec.convert(source.options, Replay.Options)
     source.options["file"] = [str(config.path(file)) for file in files(options)]
     try:

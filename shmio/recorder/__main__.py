@@ -44,7 +44,7 @@ def run(worker: Worker) -> None:
         series = TriggeredRecorder(tap, settings, settings.trigger, SUPERVISED, attachments, going=going)
     else:
         series = RotatingRecorder(tap, settings, SUPERVISED, attachments)
-    goes_on = ", going on where its predecessor ended" if known else ""
+    goes_on = ", continuing where its predecessor ended" if known else ""
     worker.log.info("recording %s%s%s", _note(series), goes_on, elsewhere)
     keeper = Housekeeper(segment.instance, settings, SUPERVISED, series.present)
     keeper.start()
@@ -62,7 +62,7 @@ def _elsewhere(before: Report, directory: Path) -> str:
     name = before.note.removeprefix(NOTE)
     if before.note in (name, WAITS) or (directory / name).exists():
         return ""
-    return f"; {name} of the recorder before is not in this folder: what the rings no longer hold is there alone"
+    return f"; the previous recorder's {name} is not in this folder: only that file has what the rings no longer hold"
 
 
 def _record(worker: Worker, series: RotatingRecorder | TriggeredRecorder) -> None:

@@ -120,7 +120,7 @@ class RecordingEnd:
         for record in self._records.walk():
             opcode = record.opcode
             if over and opcode in (Opcode.CHUNK, Opcode.ATTACHMENT):
-                raise self._damaged(record.start, "something follows its end")
+                raise self._damaged(record.start, "there is data after its end")
             if opcode == Opcode.DATA_END:
                 over = True
             if over:
@@ -149,7 +149,7 @@ class RecordingEnd:
         opcode, length = HEAD.unpack(self._records.read(self.cut, HEAD.size))
         cut_short = opcode != BROKEN and size - HEAD.size < length <= MAX_CHUNK_BYTES
         if not cut_short and not self._zeros():
-            raise self._damaged(self.cut, "it makes no sense from there on")
+            raise self._damaged(self.cut, "it is damaged from there on")
 
     def _zeros(self) -> bool:
         end = self._records.size

@@ -36,7 +36,7 @@ def own_files(directory: Path, instance: str) -> list[Path]:
                 (found if is_own(file.lstat()) else strange).append(file)
     if strange:
         more = f", and {len(strange) - 1} others," if len(strange) > 1 else ""
-        log.warning("%s%s passed over: no regular file of this user", strange[0], more)
+        log.warning("%s%s ignored: not a regular file of this user", strange[0], more)
     return found
 
 

@@ -69,7 +69,7 @@ class Housekeeper:
             try:
                 self.look()
             except Exception:  # an error here must not end the recording
-                log.exception("looking after the recordings before failed")
+                log.exception("cleaning up earlier recordings failed")
             self._stop.wait(LOOK_S)
 
     def look(self) -> None:
@@ -96,7 +96,7 @@ class Housekeeper:
             with Reader(file.path, own=True) as reader:
                 closed = reader.records.footer() is not None
             if not closed and finalise(file.path):
-                log.info("%s is closed: its recorder did not come to that", file.path)
+                log.info("%s is closed now: its recorder died before it could do that", file.path)
                 file, closed = _file(file.path) or file, True
             self._own[file] = closed
         except (OSError, RecordingError) as error:

@@ -238,7 +238,7 @@ class Output:
             os.fsync(self._fd)
         except OSError as error:
             reason = error.strerror or str(error)
-            self.doubt = self.doubt or f"fsync: {reason}: what was written behind byte {self.synced} may be lost"
+            self.doubt = self.doubt or f"fsync: {reason}: what was written after byte {self.synced} may be lost"
         else:
             if not self.doubt:
                 self.synced = self.written

@@ -68,7 +68,7 @@ def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], 
             if about.get("epoch") == epoch:
                 found.append((int(about["recording_ns"]), file))
         except (OSError, RecordingError, KeyError, ValueError) as error:
-            log.warning("%s is passed over: %s", file, error)
+            log.warning("%s is ignored: %s", file, error)
     return [file for _, file in sorted(found, reverse=True)]
 
 

@@ -206,7 +206,7 @@ class TriggeredRecorder:
             return
         if sum(series.waiting for series in self._ending) > self._settings.buffer_bytes:
             if not self._held:
-                log.error("%s: no file is begun while those before wait for the disk", self._trigger.when)
+                log.error("%s: no new file is begun while earlier ones wait for the disk", self._trigger.when)
             self._held = True
             return
         self._held = False

@@ -106,7 +106,7 @@ class _Source:
         declaration = None
         if event.writer == NO_WRITER:
             self._found.left_out.append(
-                f"{event.text}: no command has laid it: the configuration, or a replayed recording, does"
+                f"{event.text}: no client laid it, but the configuration or a replayed recording"
             )
             return
         if "operation" in how:
@@ -117,7 +117,7 @@ class _Source:
                 return
         elif explained.direction == "in":
             self._found.left_out.append(
-                f"{event.text or event.injection}: a client gave it values over /in, which depended on what was written"
+                f"{event.text or event.injection}: a client gave it values over /in that depended on other writes"
             )
             return
         priority = how.get("priority", 0)
@@ -194,7 +194,9 @@ def _named(found: Derived) -> Iterator[Declaration]:
             continue
         name = f"{one.name}-{count}"
         if one.seed is not None and one.operation != "set":
-            found.left_out.append(f"{name}: a second one named {one.name}; what is random in it follows from its name")
+            found.left_out.append(
+                f"{name}: renamed, because {one.name} exists already; its random values depend on the name and change"
+            )
         yield msgspec.structs.replace(one, name=name)
 
 

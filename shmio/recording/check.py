@@ -133,7 +133,7 @@ class _Check:
         self._found.messages += len(times)
         self._chunk = record
         if times and (min(times), max(times)) != (first_ns, last_ns):
-            self._problem(f"the chunk at byte {record.at}: its times are not those of its messages")
+            self._problem(f"the chunk at byte {record.at}: its times differ from those of its messages")
 
     def _message(self, channel: Channel, data: memoryview) -> None:
         if channel.encoding in (EVENT, FRAME) and len(data) >= U64.size:  # even if the rest cannot be decoded
@@ -152,7 +152,7 @@ class _Check:
 
     def _compare_indexes(self) -> None:
         if self._chunk is not None and self._indexes != self._counts:
-            self._problem(f"the chunk at byte {self._chunk.at}: its indexes are not of what is in it")
+            self._problem(f"the chunk at byte {self._chunk.at}: its indexes do not match its content")
 
     # ---- the rest ----------------------------------------------------------------------------------------------------
 
@@ -198,6 +198,6 @@ class _Numbers:
 
     def _broken(self, key: tuple[str, int, str], last: int, number: int) -> None:
         source, block, what = key
-        missing = f"{what} {last + 1} to {number - 1} are neither there nor in a gap"
+        missing = f"{what} {last + 1} to {number - 1} are missing, and in no gap"
         again = f"{what}: {number} comes after {last}"
         self._problem(f"{source}, block {block}: {missing if number > last else again}")

@@ -73,7 +73,7 @@ class Columns(Mapping[str, Array]):
         """Convert to a pyarrow table: time (UTC, ns), source time, number, cycle, quality, provenance, registers.
 
         Types are native: arrays are lists of fixed size, POINTER and ANY are bytes. Null means that
-        the bytes are no value of the type, or that the source never had an image. A register with
+        the bytes are not a valid value of the type, or that the source never had an image. A register with
         the name of another column is prefixed by its source.
 
         Raises:
@@ -167,7 +167,7 @@ class Collector:
             return
         if self._codec is not None and self._codec.dtype != codec.dtype:
             raise RecordingError(
-                f"{self._source}: a reload changed the registers that were asked for: ask for a time before or after it"
+                f"{self._source}: a reload changed these registers within the range: choose a range before or after it"
             )
         self._flush()
         self._codec, self._registers = codec, tuple(registers)

@@ -175,7 +175,7 @@ def compare(
     if sources is not None:
         unknown = [source for source in sources if source not in names]
         if unknown:
-            raise PathError(f"no source {unknown[0]!r} in them; there are: {', '.join(names)}")
+            raise PathError(f"no source {unknown[0]!r} in the recordings; there are: {', '.join(names)}")
         names = list(sources)
     for name in names:
         yield _Source(first, second, name, how, chosen, progress).compare()
@@ -329,7 +329,7 @@ class _Alone:
 
 
 class _Common:
-    """In each of the two, from the first to the last entry that both have."""
+    """Span, in each recording, from the first to the last entry that both have."""
 
     def __init__(self) -> None:
         self._ends: list[tuple[_Position, _Position]] = []
@@ -342,14 +342,14 @@ class _Common:
         ]
 
     def begins_after(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
-        """Whether what only one of them has lies before the first entry of both."""
+        """Return whether an entry of only one recording is before the first common entry."""
         return bool(self._ends) and any(
             entry is not None and _position(entry) < first
             for entry, (first, _) in zip((one, other), self._ends, strict=True)
         )
 
     def has(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
-        """Whether what only one of them has lies within."""
+        """Return whether an entry of only one recording is within the span."""
         return bool(self._ends) and all(
             entry is None or first <= _position(entry) <= last
             for entry, (first, last) in zip((one, other), self._ends, strict=True)
@@ -360,7 +360,7 @@ _Position = tuple[int, int, bool]
 
 
 def _position(entry: Entry[Any]) -> _Position:
-    """Where a frame or event is in its recording: virtual time, which stands still, does not say it alone."""
+    """Return the position of an entry: its time and number, because virtual time may be paused."""
     item = entry.item
     return (entry.time_ns, item.frame, True) if isinstance(item, Event) else (entry.time_ns, item.number, False)
 

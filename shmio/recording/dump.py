@@ -77,7 +77,7 @@ class Dump:
         for part in self._parts[1:]:
             for key in ("instance", "epoch"):
                 if part.reader.about.get(key) != self.about.get(key):
-                    raise RecordingError(f"{first.file} and {part.file} are of different runs: open them one by one")
+                    raise RecordingError(f"{first.file} and {part.file} come from different runs: open them separately")
         blocks: dict[tuple[str, int, str], DumpBlock] = {}
         self._contents = [contents(part, blocks) for part in self._parts]
         self.blocks = tuple(blocks.values())

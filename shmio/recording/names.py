@@ -41,7 +41,7 @@ class Names:
         for path in paths:
             topic = parse_topic(path, self.sources, default)
             if topic.direction == "in":
-                raise PathError(f"{path}: a recording holds what comes out of a source; leave out /in")
+                raise PathError(f"{path}: a recording has only outputs of a source; leave out /in")
             for block, registers in self._named(path, topic).items():
                 chosen.setdefault(block, {}).update((register.path, register) for register in registers)
         return {block: list(chosen[block].values()) for block in self._blocks if block in chosen}

@@ -1,4 +1,4 @@
-"""Make new recordings out of others: parts of them, several as one, or what is whole of a damaged one."""
+"""Write new recordings from others: a part, several as one, or the intact parts of a damaged one."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class _Track:
 
 
 class Rewriter:
-    """Writes entries to a new file as a recorder does: each number of a block is there, or in a gap."""
+    """Writes entries to a new file as a recorder does: each number of a block is in it or in a gap."""
 
     def __init__(self, stream: IO[bytes], dump: Dump, made: str, *, whole: bool) -> None:
         """Arguments as of :func:`rewrite`."""
@@ -188,9 +188,10 @@ def rewrite(
     Args:
         dump: The recording, with its attachments and metadata.
         path: The new file.
-        made: What makes it, for its metadata.
+        made: Name of the command that makes it, for its metadata.
         entries: The entries, in order: ``dump.items()``, or those of :func:`part`.
-        whole: Whether what is missing at the beginning of a block was damaged; else it is not wanted.
+        whole: Whether missing entries at the beginning of a block count as a gap; else they were
+            not selected.
         progress: Called with the ns of the recording that are done.
 
     Returns:
@@ -279,7 +280,7 @@ class _Parts:
 
 
 def _reduced(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, RecordedRegisters]:
-    """Return a block with only these registers, and what reduces its frames."""
+    """Return a block with only these registers, and an object that reduces its frames to them."""
     paths = {holder(block.layout, register) for register in registers}
     whole = tuple(register for register in block.layout.registers if register.path in paths)
     layout = replace(block.layout, registers=whole)

@@ -181,7 +181,7 @@ class Block:
         if self.ring.head() == 0:
             return None
         raise SegmentError(
-            f"source {self.source}: its ring turns faster than a frame can be read; raise instance.ring_mb"
+            f"source {self.source}: its ring is overwritten faster than a frame can be read; raise instance.ring_mb"
         )
 
     def read(self, number: int) -> Frame | None:

@@ -204,7 +204,7 @@ def _word(memory: memoryview, offset: int) -> int:
 
 def _cell(memory: memoryview, offset: int) -> DoubleBuffer:
     first, second = _COPIES_AT
-    complaint = "the clock page makes no sense: restart the instance: shmio-supervisor down, up"
+    complaint = "the clock page is invalid: restart the instance: shmio-supervisor down, up"
     return DoubleBuffer(memory, (offset + first, offset + second), complaint)
 
 

@@ -105,7 +105,7 @@ class Header:
             FormatError: Another version made the segment, or the header is inconsistent.
         """
         if len(memory) < HEADER_SIZE or _atomics.load64(memory, 0) != MAGIC:
-            raise UnfinishedError(f"{name} is not a whole shmio segment: it is just being made, or its maker died")
+            raise UnfinishedError(f"{name} is not a complete shmio segment: it is being created, or its creator died")
         # fmt: off
         (_, abi, header_size, epoch, size, utc_ns, started_ns, _, _, sections, section_capacity, section_size,
          processes, process_capacity, slot_size, _, mode, instance, version, control) = _HEADER.unpack_from(memory)

@@ -88,7 +88,7 @@ def model_ports(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -
     computed, both = (_named(layout, *item) for item in (("outputs", outputs), ("inouts", inouts)))
     if twice := sorted(computed & both):
         path = layout.registers[twice[0]].path
-        raise ConfigError(f"inouts: {path} is among outputs, too: what is both is named here alone")
+        raise ConfigError(f"inouts: {path} is in outputs, too: name an in-out register only in inouts")
     registers = list(enumerate(layout.registers))
     return ModelPorts(
         tuple(register for index, register in registers if index not in computed),
@@ -105,7 +105,7 @@ def _named(layout: Layout, key: str, patterns: Sequence[str]) -> set[int]:
             raise ConfigError(f"{key}: {error}") from None
         if not some:
             alike = "" if "*" in pattern else ", ".join(path for path in near(layout, pattern) if path != pattern)
-            what = f"{key}: {pattern!r} names no register of {layout.name}; it takes whole registers"
+            what = f"{key}: {pattern!r} names no register of {layout.name}; only whole registers are allowed"
             raise ConfigError(f"{what}; near: {alike}" if alike else what)
         found.update(some)
     return found

@@ -193,7 +193,7 @@ class Playhead:
         self._shared = shared
         self._memory = memory
         first, second = _COPIES_AT
-        complaint = "a playhead makes no sense: restart its source: shmio-supervisor restart NAME"
+        complaint = "a playhead is invalid: restart its source: shmio-supervisor restart NAME"
         self._state = DoubleBuffer(memory, (offset + first, offset + second), complaint)
         self._ask_at = offset + _ASK_AT
         self._lock_byte = lock_byte

@@ -157,11 +157,11 @@ class Segment:
             shared = SharedObject.create(name, group)
         except FileExistsError:
             refuse_second(instance)
-            raise AlreadyRunningError(f"a segment of instance {instance!r} is left over or just being made") from None
+            raise AlreadyRunningError(f"a segment of instance {instance!r} is left over or being created") from None
         try:
             # A process that opens the name before this lock is taken finds no magic: an unfinished segment.
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
-                raise AlreadyRunningError(f"another supervisor is just starting instance {instance}")
+                raise AlreadyRunningError(f"another supervisor is starting instance {instance}")
             try:
                 build_segment(
                     shared, instance, blocks, processes, mode, control, config=config, stepped=stepped, origin=origin
@@ -200,7 +200,7 @@ class Segment:
             ) from None
         try:
             if shared.size < HEADER_SIZE:
-                raise UnfinishedError(f"instance {instance!r} is just starting, or died while it did")
+                raise UnfinishedError(f"instance {instance!r} is starting, or died during its start")
             segment = cls(shared, instance)
             if config is not None:
                 segment.require_config(config)
@@ -222,10 +222,10 @@ class Segment:
         """
         if header.has_config(self.memory, file.resolve()):
             return
-        used = "an unknown file, by a shmio that does not tell which" if self.config is None else self.config
+        used = "an unknown file, by a version of shmio that does not say which" if self.config is None else self.config
         raise WrongInstanceError(
             f"the running instance {self.instance!r} was started from {used}, not from {file.resolve()}: "
-            f"to act on it all the same, name it: --instance {self.instance}"
+            f"to use that instance anyway, add --instance {self.instance}"
         )
 
     def _find_blocks(self) -> dict[str, Block]:

@@ -49,7 +49,7 @@ def claim(instance: str) -> SharedObject | None:
         if not shared.try_lock(SUPERVISOR_LOCK):
             refuse_second(instance)
             raise AlreadyRunningError(
-                f"another supervisor is just starting instance {instance!r}, or it is of another version of shmio: "
+                f"another supervisor is starting instance {instance!r}, or it is of another version of shmio: "
                 "end it with the version that started it"
             )
         if shared.current():
@@ -64,7 +64,7 @@ def claim(instance: str) -> SharedObject | None:
 def read(shared: SharedObject, instance: str) -> Segment:
     """Open a claimed segment. UnfinishedError: its creator died; FormatError: another version made it."""
     if shared.size < HEADER_SIZE:
-        raise UnfinishedError(f"{shared.name} is not a whole shmio segment")
+        raise UnfinishedError(f"{shared.name} is not a complete shmio segment")
     segment = Segment(shared, instance)
     if segment.header.version != __version__:
         raise FormatError(f"{shared.name} was made by shmio {segment.header.version}, this is {__version__}")
@@ -145,7 +145,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
     if held:
         names = ", ".join(slot.name for slot in held.values())
         raise SegmentError(
-            f"instance {segment.instance!r} has processes that cannot be told from others: {names}; end them first"
+            f"instance {segment.instance!r} has processes that cannot be identified: {names}; end them first"
         )
     return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]
 
@@ -211,7 +211,7 @@ def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
 
 
 def _maps(pid: int, inode: int, right: str = "") -> bool:
-    """Whether a process maps the object with this right."""
+    """Return whether a process maps the shared memory with this permission."""
     device = shm.DIRECTORY.stat().st_dev
     wanted = f"{os.major(device):02x}:{os.minor(device):02x}", str(inode)
     with suppress(OSError):
@@ -268,8 +268,12 @@ def survivor(pid: int) -> str:
     state = ""
     with suppress(OSError, IndexError):  # "pid (name) state …", where the name may be anything: proc_pid_stat(5)
         state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0]
-    held = "waits in the kernel (state D), as for a disk or a device that hangs" if state == "D" else "lives on"
-    return f"pid {pid} was killed and {held}: free what it waits for, or restart the host"
+    held = (
+        "is blocked in the kernel (state D), for example by a disk or a device that hangs"
+        if state == "D"
+        else "lives on"
+    )
+    return f"pid {pid} was killed and {held}: remove the cause, or restart the host"
 
 
 def _ended(pidfds: Collection[int], timeout_s: float) -> set[int]:

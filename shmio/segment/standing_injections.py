@@ -78,7 +78,7 @@ def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
     """Join JSON items to a document. ValueError: with ``growth`` more bytes it would be too long."""
     document = b"[" + b",".join(items) + b"]"
     if len(document) + growth > STANDING_SIZE:
-        raise ValueError("too much for the injections of one source: lay fewer, over whole structures or arrays")
+        raise ValueError("the injections of one source are too large: lay fewer, or cover whole structures or arrays")
     return document
 
 

@@ -148,7 +148,7 @@ def place_declarations(model: str, declarations: Iterable[Declaration]) -> Layou
         except ShmioError as error:
             raise ModelError(f"model {model}: {declaration.name}: {error}") from None
         if twice := own.keys() & tags.keys():
-            raise ModelError(f"model {model}: {declaration.name}: the path {min(twice)!r} is there already")
+            raise ModelError(f"model {model}: {declaration.name}: the path {min(twice)!r} is used twice")
         tags.update(own)
     try:
         return place_tags(model, tags)

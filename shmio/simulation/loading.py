@@ -38,7 +38,7 @@ def load(text: str, folder: str | Path | None = None) -> type[Model]:
         ]
         raise ConfigError(f"{name} has no {attribute}; its models are: {', '.join(there) or 'none'}")
     if not _is_model(found):
-        raise ConfigError(f"{text} is no subclass of shmio.simulation.Model")
+        raise ConfigError(f"{text} is not a subclass of shmio.simulation.Model")
     if inspect.isabstract(found):
         raise ConfigError(f"{text} has no method step(self, time_s, dt_s)")
     return found

@@ -40,7 +40,7 @@ class Model(ABC):
         cls.declarations = {name: value for name, value in found.items() if isinstance(value, Declaration)}
         for name in cls.declarations:
             if name in _OWN or name.startswith("_"):
-                raise ModelError(f"model {cls.__qualname__}: {name}: call it otherwise, and give it this name as path")
+                raise ModelError(f"model {cls.__qualname__}: {name}: choose another name, and give it this one as path")
         for kinds in ((Input, Output, InOut), (Parameter,)):
             place_declarations(cls.__qualname__, declared(cls, *kinds))
 

@@ -5,7 +5,7 @@ request                                   answer                                
 ========================================  =================================================  =======================
 ``{"do": "stop"}``                        ``{"ok": true}``                                   all is stopped
 ``{"do": "restart", "name": "cell"}``     ``{"ok": true}``                                   the process runs again
-``{"do": "reload"}``                      ``{"ok": true, "done": [lines], …}``               the change is over
+``{"do": "reload"}``                      ``{"ok": true, "done": [lines], …}``               the change is done
 ``{"do": "where"}``                       ``{"ok": true, "config": …, "read_ns": …, …}``     at once
 anything else                             ``{"error": "…"}``                                 at once
 ========================================  =================================================  =======================
@@ -302,7 +302,7 @@ def request(
     try:
         answer = msgspec.json.decode(received, type=dict[str, Any])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        raise ControlError("the supervisor's answer makes no sense; is it of this version?") from None
+        raise ControlError("invalid supervisor reply (version mismatch?)") from None
     if "error" in answer:
         raise ControlError(str(answer["error"]))
     return answer

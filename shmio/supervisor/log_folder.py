@@ -38,4 +38,4 @@ class LogFolder:
 
     def _look(self) -> None:
         obstacle = unwritable(self._folder)
-        self._found = f"log_dir: {obstacle.reason}; what is logged meanwhile is lost" if obstacle else ""
+        self._found = f"log_dir: {obstacle.reason}; log lines are lost until that is fixed" if obstacle else ""

@@ -172,9 +172,9 @@ class Supervisor:
                 for key, _ in self._selector.select(self._pause_s()):
                     key.data()
         except Exception as error:  # noqa: BLE001 - the last place to report it
-            log.exception("the supervisor failed; what runs goes on")
+            log.exception("the supervisor failed; running processes continue")
             why = f"the supervisor failed: {brief(error)}"
-            raise ShmioError(f"{why}; its processes go on, and shmio-supervisor up takes them over") from None
+            raise ShmioError(f"{why}; its processes continue, and shmio-supervisor up takes them over") from None
 
     def _create(self, path: str) -> Segment:
         plan = self._plan
@@ -204,7 +204,7 @@ class Supervisor:
 
     def _hasten(self) -> None:
         """Kill what has not stopped, after a second request."""
-        log.warning("killing what has not stopped yet")
+        log.warning("killing the processes that have not stopped yet")
         for managed in self._fleet:
             self._fleet.apply(managed, Event.HASTEN)
 
@@ -240,7 +240,7 @@ class Supervisor:
 
     def _reload(self, answer: Answer) -> None:
         log.info("asked to reload %s", self._reloader.plan.config_file)
-        reason = self._busy() or (None if self._started else "the instance is just starting: ask again when it runs")
+        reason = self._busy() or (None if self._started else "the instance is starting: try again when it is running")
         if reason:
             answer.error(reason)
         else:
@@ -252,7 +252,7 @@ class Supervisor:
         for name, pid in self._adopted.items():
             managed = self._fleet.named(name) if name in self._fleet.names else None
             if managed is None:
-                lines.append(f"{name}, pid {pid}, was stopped at once: the configuration has it no more")
+                lines.append(f"{name}, pid {pid}, was stopped at once: it is no longer in the configuration")
             elif managed.child is None or managed.child.pid != pid:
                 lines.append(f"{name}, pid {pid}, was replaced at once: its configuration has changed")
         return lines
@@ -289,14 +289,14 @@ class Supervisor:
         if there and all(managed.life.stuck for managed in there):
             stuck = "; ".join(f"{managed.name}: {managed.life.note}" for managed in there)
             for answer in self._stop_answers:
-                answer.error(f"all else is stopped, but {stuck}; the stop goes on as soon as it has ended")
+                answer.error(f"all else is stopped, but {stuck}; the stop continues as soon as it has ended")
             self._stop_answers.clear()
 
     def _follow_name(self) -> None:
         """Stop if the segment's name is gone: nobody could find or stop the instance any more."""
         if not self._segment.shared.current():
             name = self._segment.shared.name
-            self._failure = f"the shared memory {name} was removed while the instance ran: all is stopped"
+            self._failure = f"the shared memory {name} was removed while the instance ran: stopping all processes"
             log.error("%s", self._failure)
             self._stop()
 

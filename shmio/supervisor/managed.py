@@ -95,7 +95,7 @@ class ManagedProcess:
         lost = ("dropped", "changes") if self.slot.kind == "mqtt" else ("missed", "frames and events")
         missed = self.slot.counters.get(lost[0], 0) if running else 0  # a process counts from its start
         if self.complaint and running and not complaint:
-            log.info("%s is well again; %d %s were lost", self.name, max(0, missed - self._missed), lost[1])
+            log.info("%s has recovered; %d %s were lost", self.name, max(0, missed - self._missed), lost[1])
         if not complaint:
             self._missed = missed
         self.complaint = complaint

@@ -136,7 +136,7 @@ def _open_log(file: Path) -> int:
 def describe_end(code: int | None) -> str:
     """Return an exit code in words; ``code`` is None if it is unknown."""
     if code is None:
-        return "ended; its exit status is not known, for an earlier supervisor had started it"
+        return "ended; its exit status is unknown, because an earlier supervisor started it"
     if code >= 0:
         return f"exit status {code}" if code else "ended by itself"
     try:

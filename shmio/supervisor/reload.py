@@ -61,7 +61,7 @@ class InstanceChange:
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
-        """Do what is possible now; return whether the change is over.
+        """Do what is possible now; return whether the change is done.
 
         It is over when each new process runs or has failed once.
         """
@@ -119,7 +119,7 @@ class InstanceChange:
     def outcome(self) -> tuple[list[str], list[str]]:
         """Return what was done and which problems there are, one line each."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
-        done += [f"{name}: told to take its tokens and roles anew" for name in self._signalled]
+        done += [f"{name}: told to reload its tokens and roles" for name in self._signalled]
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)
@@ -207,8 +207,8 @@ class Reloader:
         if self._change is None:
             return None
         if stuck := self._change.stuck:
-            return f"the instance is just being changed, which waits for what does not end: {stuck}"
-        return "the instance is just being changed: ask again when that is over"
+            return f"another change of the instance is in progress and waits for a process that does not end: {stuck}"
+        return "another change of the instance is in progress: try again when it is done"
 
     def follow(self) -> None:
         """Bring what was taken over to the plan; SegmentError if there is no room."""
@@ -216,7 +216,7 @@ class Reloader:
 
     def reload(self, answer: Answer) -> None:
         """Make a new plan and apply it; refused while another reload is in progress."""
-        reason = self.busy() or (self._planning and "another reload is just being planned: ask again when it is over")
+        reason = self.busy() or (self._planning and "another reload is being prepared: try again when it is done")
         if reason:
             answer.error(reason)
             return
@@ -254,7 +254,9 @@ class Reloader:
     def _follow(self, change: InstanceChange) -> None:
         if not change.step():
             if stuck := change.stuck:
-                self._answer_client(lambda answer: answer.error(f"{stuck}; the reload goes on as soon as it has ended"))
+                self._answer_client(
+                    lambda answer: answer.error(f"{stuck}; the reload continues as soon as it has ended")
+                )
             return
         done, problems = change.outcome()
         for line in done:
@@ -262,7 +264,7 @@ class Reloader:
         for line in problems:
             log.error("%s", line)
         kept = list(change.changes.kept)
-        log.info("the change is over", extra=fields(kept=len(kept)))
+        log.info("the change is done", extra=fields(kept=len(kept)))
         self._change = None
         result = {"warnings": list(change.plan.warnings), "done": done, "problems": problems, "kept": kept}
         self._answer_client(lambda answer: answer.ok(**result))

@@ -116,7 +116,7 @@ def _adopt_or_end(
             for pidfd in (*(worker.pidfd for worker in unfit), *(child.pidfd for _, child in fit)):
                 os.close(pidfd)
             raise SegmentError(
-                f"instance {segment.instance!r} has processes that cannot be told from others: "
+                f"instance {segment.instance!r} has processes that cannot be identified: "
                 f"{', '.join(living)}; end them first"
             )
         time.sleep(0.01 if living else 0)

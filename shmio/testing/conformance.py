@@ -1,8 +1,8 @@
-"""The suite that every connector inherits; for connectors of other packages too. Needs pytest.
+"""Test suite for connectors, also those of other packages. It needs pytest.
 
-A subclass brings a :class:`Rig`, a real device behind a fault proxy; the suite breaks the connection in all the ways in
-which cells break it, and holds the loop to its promises: quality bad with a reason, recovery without a restart, never a
-value that the device did not have.
+A subclass provides a :class:`Rig`: a real device behind a fault proxy. The suite breaks the
+connection in all ways that occur in cells, and checks that quality is bad with a reason, that the
+source recovers without a restart, and that it never shows a value that the device did not have.
 """
 
 from __future__ import annotations
@@ -26,20 +26,23 @@ PERIOD_NS = 5_000_000
 
 
 class Rig(Protocol):
-    """A device whose block changes all the time, behind a proxy."""
+    """A device behind a proxy, whose block changes all the time."""
 
     proxy: FaultProxy
     layout: Layout
 
     def connector(self) -> Connector:
-        """A new connector that reaches the device through the proxy, with a time-out of some 200 ms."""
+        """Return a new connector to the device through the proxy, with a time-out of about 200 ms."""
 
     def generation(self, raw: bytes) -> int:
-        """When the device had this image, as a number that never falls; AssertionError if it never had it."""
+        """Return a number for an image of the device that never decreases over time.
+
+        AssertionError: The device never had this image.
+        """
 
 
 class Run:
-    """A source's loop at work on a connector, watched through its block."""
+    """A source's running loop, observed through its block."""
 
     def __init__(self, segment: Segment, rig: Rig, writable: tuple[str, ...] = ()) -> None:
         self.block = block = segment.blocks["device"]
@@ -65,15 +68,15 @@ class Run:
         raise AssertionError(f"not seen in time; last frame: {self.frames[-1:]}")
 
     def good(self) -> Frame:
-        """The next good frame."""
+        """Wait for the next good frame."""
         return self.until(lambda frame: frame.quality is Quality.GOOD)
 
     def bad(self) -> Frame:
-        """The next bad frame."""
+        """Wait for the next bad frame."""
         return self.until(lambda frame: frame.quality is Quality.BAD)
 
     def stop(self) -> None:
-        """End the loop, then hold all frames to what holds always."""
+        """Stop the loop, and check the rules that hold for all frames."""
         self._clock.stop()
         self.loop.commands.stop()
         for thread in self._threads:
@@ -96,14 +99,17 @@ class Run:
 
 
 class ConnectorConformance:
-    """Inherit, and give a fixture ``rig``. Who can write inherits :class:`shmio.testing.write_conformance`'s, too."""
+    """Tests of reading: inherit from this class, and define a fixture ``rig``.
+
+    Connectors that can write use :class:`shmio.testing.write_conformance.WriteConformance`.
+    """
 
     writable: ClassVar[tuple[str, ...]] = ()
     """Patterns of what the source may write."""
 
     @pytest.fixture
     def run(self, rig: Rig, instance: str) -> Iterator[Run]:
-        """A running loop, stopped and checked at the end."""
+        """Provide a running loop, which is stopped and checked at the end."""
         block = BlockSpec("device", rig.layout, PERIOD_NS, 10**9, 1 << 24)
         with Segment.create(instance, [block], [ProcessSpec("device", "source")]) as segment:
             run = Run(segment, rig, self.writable)
@@ -117,7 +123,7 @@ class ConnectorConformance:
 
     @pytest.fixture
     def absent(self, rig: Rig) -> None:
-        """The device is not there when the loop starts."""
+        """Make the device unreachable before the loop starts."""
         rig.proxy.refuse()
 
     def test_values_come_and_change(self, run: Run, rig: Rig) -> None:
@@ -148,7 +154,7 @@ class ConnectorConformance:
         run.good()
 
     def test_cut_in_the_middle_of_an_answer(self, run: Run, rig: Rig) -> None:
-        """Half an answer is no answer."""
+        """Half an answer counts as none."""
         run.good()
         rig.proxy.cut_after(30)
         run.bad()
@@ -156,7 +162,7 @@ class ConnectorConformance:
         run.good()
 
     def test_half_open(self, run: Run, rig: Rig) -> None:
-        """The connection stands but nothing comes: bad after the time-out, then good."""
+        """The connection is open but nothing comes: bad after the time-out, then good."""
         run.good()
         rig.proxy.freeze()
         assert "answer" in run.bad().reason
@@ -165,7 +171,7 @@ class ConnectorConformance:
 
     @pytest.mark.parametrize("garbage", [b"\0" * 64, b"\xff" * 64, b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x03"])
     def test_garbage(self, run: Run, rig: Rig, garbage: bytes) -> None:
-        """What is no answer is never a value."""
+        """Bytes that are not an answer never become a value."""
         run.good()
         rig.proxy.garble(garbage)
         run.bad()
@@ -173,7 +179,7 @@ class ConnectorConformance:
         run.good()
 
     def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Rig) -> None:
-        """An answer comes when nobody waits for it any more, on a new connection."""
+        """A late answer arrives on a new connection, where nobody waits for it."""
         run.good()
         rig.proxy.hold(frames=1)
         run.bad()
@@ -181,12 +187,12 @@ class ConnectorConformance:
         run.good()
 
     def test_a_loop_ends_while_the_device_hangs(self, run: Run, rig: Rig) -> None:
-        """Stopping waits for no device longer than its time-out; the fixture checks it."""
+        """Stopping never takes longer than the device's time-out; the fixture checks that."""
         run.good()
         rig.proxy.freeze()
 
     def test_close_may_come_at_any_time(self, rig: Rig) -> None:
-        """Before the first connect, and twice."""
+        """The connector may be closed before the first connect, and twice."""
         connector: Any = rig.connector()
         connector.close()
         connector.connect()

@@ -1,7 +1,8 @@
-"""A TCP relay that misbehaves on demand: the network between a program and its peer, for tests and benchmarks.
+"""TCP proxy with faults on demand between a program and its peer, for tests and benchmarks.
 
-One thread and ``select`` (whose time-outs, unlike those of ``epoll``, resolve microseconds). Every method that changes
-the behaviour returns when the change has taken place, so tests need not wait.
+It has one thread and uses ``select``, whose time-outs resolve microseconds, unlike those of
+``epoll``. Every method that changes the behaviour returns when the change is in effect, so that
+tests need not wait.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with RST
 
 
 class Link:
-    """A client's connection and the one to the server on its behalf."""
+    """A client's connection, with the connection to the server that belongs to it."""
 
     def __init__(self, client: socket.socket, server: socket.socket) -> None:
         self._sockets = (client, server)
@@ -38,13 +39,13 @@ class Link:
 
     @property
     def open(self) -> bool:
-        """Whether bytes may still pass."""
+        """Return whether bytes may still pass."""
         if self._sockets[0].fileno() >= 0 and all(pipe.finished for pipe in self.pipes):
             self.close()
         return self._sockets[0].fileno() >= 0
 
     def close(self, *, reset: bool = False) -> None:
-        """Close both ends; ``reset``: as a crashed peer does."""
+        """Close both ends; with ``reset`` as a crashed peer does."""
         for end in self._sockets:
             if end.fileno() >= 0 and reset:
                 end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
@@ -67,16 +68,16 @@ class Pipe:
 
     @property
     def hungry(self) -> bool:
-        """Whether to take more from the source."""
+        """Return whether to read more from the sender."""
         return not self.ended and self._queued < _MAX_QUEUED
 
     @property
     def next_s(self) -> float:
-        """When the next bytes are due, on the monotonic clock; infinity if there are none."""
+        """Return when the next bytes are due, on the monotonic clock; infinity if there are none."""
         return self._later[0][0] if self._later else float("inf")
 
     def enqueue(self, data: bytes, delay_s: float) -> None:
-        """Take bytes that become due after a delay."""
+        """Queue bytes that become due after a delay."""
         due_s = time.monotonic() + delay_s
         if self._later:
             due_s = max(due_s, self._later[-1][0])  # a shorter delay must not overtake
@@ -84,19 +85,19 @@ class Pipe:
         self._queued += len(data)
 
     def collect_due(self, now_s: float) -> None:
-        """Move to ``due`` what has waited long enough."""
+        """Move bytes that have waited long enough to ``due``."""
         while self._later and self._later[0][0] <= now_s:
             self.due += self._later.popleft()[1]
 
     def end_when_drained(self) -> None:
-        """Hand on the end of the stream after its last byte."""
+        """Pass on the end of the stream after its last byte."""
         if self.ended and not self.due and not self._later and not self.finished:
             self.finished = True
             with contextlib.suppress(OSError):
                 self.sink.shutdown(socket.SHUT_WR)
 
     def send(self, limit: int | None) -> None:
-        """Send what is due, at most ``limit`` bytes."""
+        """Send the bytes that are due, at most ``limit``."""
         self.last_sent = 0
         with contextlib.suppress(BlockingIOError):
             self.last_sent = self.sink.send(self.due if limit is None else self.due[:limit])
@@ -109,12 +110,12 @@ Framing = Callable[[bytes | bytearray], int]
 
 
 def tpkt(data: bytes | bytearray) -> int:
-    """Length of the frame that ``data`` begins with, ISO-on-TCP (RFC 1006); 0 if not known yet."""
+    """Return the length of the ISO-on-TCP frame (RFC 1006) at the start of ``data``; 0 if unknown yet."""
     return data[2] << 8 | data[3] if len(data) >= 4 else 0
 
 
 def reference_edit(change: Callable[[int], int]) -> Edit:
-    """An edit of the PDU reference of S7 answers."""
+    """Return an edit that changes the PDU reference of S7 answers."""
 
     def edit(frame: bytes) -> bytes:
         reference = change(int.from_bytes(frame[11:13], "big")) & 0xFFFF
@@ -124,10 +125,13 @@ def reference_edit(change: Callable[[int], int]) -> Edit:
 
 
 class Tampering:
-    """The edit that is in force, and the frames kept back. Used by the relay's thread, but for ``frame_held``."""
+    """The present edit, and the frames on hold; only the proxy's thread uses it.
+
+    ``frame_held`` may be used by all threads.
+    """
 
     def __init__(self, framing: Framing | None) -> None:
-        """``framing``: tells where a frame ends; None: what comes at once is a frame."""
+        """Take the function that finds the end of a frame; with None each ``recv`` is a frame."""
         self._framing = framing
         self._edit: Edit | None = None
         self._held: list[bytes] = []
@@ -135,7 +139,7 @@ class Tampering:
         """Set while a frame is kept back."""
 
     def begin(self, edit: Edit, frames: int | None) -> None:
-        """Pass frames through a function; ``frames``: end after so many."""
+        """Pass frames through a function, for ``frames`` frames or until the end."""
         left = frames
 
         def counted(frame: bytes) -> bytes | None:
@@ -149,19 +153,19 @@ class Tampering:
         self._edit = counted
 
     def keep(self, frame: bytes) -> None:
-        """The edit that keeps frames back."""
+        """Put a frame on hold; this method is an edit."""
         self._held.append(frame)
         self.frame_held.set()
 
     def end(self) -> list[bytes]:
-        """Let all pass as it is; what was kept back."""
+        """End the edit, and return the frames that were on hold."""
         self._edit = None
         self.frame_held.clear()
         held, self._held = self._held, []
         return held
 
     def passing(self, waiting: bytearray, data: bytes) -> Iterator[bytes]:
-        """What passes when more bytes come; those of a frame that is not whole yet are left waiting."""
+        """Yield the bytes to pass on after new data; an incomplete frame stays in ``waiting``."""
         waiting += data
         while waiting:
             size = len(waiting)
@@ -181,19 +185,22 @@ _TIMEOUT_S = 10
 
 
 class FaultProxy:
-    """Relays between clients and one server. Use ``with``, or ``stop`` at the end.
+    """TCP proxy between clients and one server; a context manager, or call ``stop`` at the end.
 
-    Faults last until changed; ``pass_all`` takes back all but the delay. Those on frames are of the direction from
-    server to client.
+    Faults last until they are changed; ``pass_all`` ends all except the delay. Faults of frames
+    apply to the direction from server to client.
     """
 
     def __init__(
         self, target: Address, *, up_s: float = 0.0, down_s: float = 0.0, framing: Framing | None = tpkt
     ) -> None:
-        """Listen on a free port of the loopback, for connections to ``target``.
+        """Listen on a free loopback port for connections to ``target``.
 
-        ``up_s``, ``down_s``: delay of each byte toward the server and back; throughput is not limited.
-        ``framing``: tells where a frame ends; None: what one ``recv`` returns is a frame.
+        Args:
+            target: Address of the server.
+            up_s: Delay of each byte to the server, in s; throughput is not limited.
+            down_s: Delay of each byte from the server, in s.
+            framing: Function that returns the length of a frame; with None each ``recv`` is a frame.
         """
         self._target = target
         self._up_s, self._down_s = up_s, down_s
@@ -225,13 +232,13 @@ class FaultProxy:
         if self._thread.is_alive():
             self._do(self._end)
             self._thread.join(_TIMEOUT_S)
-        self._wake_in.close()  # here, since whoever calls _do still holds them when the thread is through
+        self._wake_in.close()  # here, because callers of _do still use them when the thread has ended
         self._wake_out.close()
 
     # -- faults --------------------------------------------------------------------------------------------------------
 
     def delay(self, up_s: float, down_s: float) -> None:
-        """Change the delay of what comes from now on."""
+        """Change the delay of bytes that arrive from now on."""
 
         def change() -> None:
             self._up_s, self._down_s = up_s, down_s
@@ -239,7 +246,7 @@ class FaultProxy:
         self._do(change)
 
     def pass_all(self) -> None:
-        """End all faults but the delay, which has its own method. Frames on hold are discarded."""
+        """End all faults except the delay, and discard frames on hold."""
 
         def change() -> None:
             self._tampering.end()
@@ -267,7 +274,7 @@ class FaultProxy:
         self._do(change)
 
     def freeze(self) -> None:
-        """Relay nothing, but keep connections and take new ones: a peer that hangs, or an unplugged cable."""
+        """Pass nothing, but keep connections and accept new ones, like a peer that hangs."""
 
         def change() -> None:
             self._frozen = True
@@ -275,11 +282,11 @@ class FaultProxy:
         self._do(change)
 
     def thaw(self) -> None:
-        """Go on where ``freeze`` stopped."""
+        """Continue where ``freeze`` stopped."""
         self._do(self._melt)
 
     def refuse(self) -> None:
-        """Cut all connections and refuse new ones, keeping the port: a peer whose program is not running."""
+        """Cut all connections and refuse new ones, like a peer whose program does not run."""
 
         def change() -> None:
             for link in self._links:
@@ -291,11 +298,11 @@ class FaultProxy:
         self._do(change)
 
     def admit(self) -> None:
-        """Take connections again after ``refuse``."""
+        """Accept connections again after ``refuse``."""
         self._do(self._listen)
 
     def edit(self, change_frame: Edit, *, frames: int | None = None) -> None:
-        """Pass frames through a function; None drops one. ``frames``: end after so many."""
+        """Pass frames through a function, which returns None to drop one; end after ``frames``."""
         self._do(lambda: self._tampering.begin(change_frame, frames))
 
     def garble(self, data: bytes) -> None:
@@ -307,7 +314,7 @@ class FaultProxy:
         self.edit(reference_edit(change), frames=frames)
 
     def hold(self, *, frames: int | None = None) -> None:
-        """Keep frames back, to be let go by ``release``: answers that come late."""
+        """Put frames on hold until ``release``, so that answers come late."""
         self.edit(self._tampering.keep, frames=frames)
 
     def wait_held(self, timeout_s: float = _TIMEOUT_S) -> bool:
@@ -315,7 +322,7 @@ class FaultProxy:
         return self._tampering.frame_held.wait(timeout_s)
 
     def release(self) -> None:
-        """Stop holding, and send what was held to the newest connection, whichever it was meant for."""
+        """Send the frames on hold to the newest connection, whichever they were meant for."""
 
         def change() -> None:
             for frame in self._tampering.end():
@@ -367,7 +374,7 @@ class FaultProxy:
                 plain.close()
 
     def _turn(self) -> None:
-        """Wait for the next thing to do, and do it."""
+        """Wait for the next event, and handle it."""
         pipes = [] if self._frozen else [pipe for link in self._links for pipe in link.pipes]
         readers = {pipe.source: pipe for pipe in pipes if pipe.hungry}
         writers = {pipe.sink: pipe for pipe in pipes if pipe.due}

@@ -1,7 +1,7 @@
-"""The suite that connectors inherit that can write, after that of reading. Needs pytest.
+"""Test suite for connectors that can write, in addition to that of reading. It needs pytest.
 
-What is said to be written is there; what is surely not, is not; a bit is written without its neighbours; and whatever
-breaks, no confirmation is ever taken for that of another write.
+It checks that reported outcomes are true, that a bit is written without its neighbours, and that
+after any fault no confirmation is taken for that of another write.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SPARE = 8
 
 
 class WriteRig(Rig, Protocol):
-    """A device that lets itself be written."""
+    """A device that accepts writes."""
 
     spare: int
     """Offset of ``SPARE`` bytes that the device leaves as they were written. Zero at first."""
@@ -38,7 +38,7 @@ class WriteRig(Rig, Protocol):
 
 
 class Writer:
-    """Sends commands to a running source, and sees what becomes of them."""
+    """Sends commands to a running source, and waits for their outcomes."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -46,7 +46,7 @@ class Writer:
         self._events = run.block.events.cursor()
 
     def write(self, *writes: Write) -> Event:
-        """Send one command; the event that ends its first item, when each item has exactly one end."""
+        """Send a command; return the event that ends its first item once all items have ended."""
         number = self._sender.submit(writes, time.monotonic_ns() + round(FAR_S * 1e9))
         ends: list[Event] = []
         deadline_s = time.monotonic() + PATIENCE_S
@@ -61,17 +61,17 @@ class Writer:
         return min(ends, key=lambda event: event.item)
 
     def written(self, *writes: Write) -> Frame:
-        """The same, confirmed; the first frame that was asked for afterwards."""
+        """Send a command that must succeed; return the first frame requested after it."""
         end = self.write(*writes)
         assert end.kind == EventKind.WRITTEN, end
         return self.after(end)
 
     def after(self, end: Event) -> Frame:
-        """The first good frame that was asked for after a command's end."""
+        """Return the first good frame that was requested after a command's end."""
         return self._run.until(lambda frame: frame.quality is Quality.GOOD and frame.source_ns > end.utc_ns)
 
     def once_open(self, *writes: Write) -> Event:
-        """Send again for as long as the source is not connected and takes nothing."""
+        """Send a command, again and again while the source is not connected."""
         deadline_s = time.monotonic() + PATIENCE_S
         while True:
             try:
@@ -82,38 +82,38 @@ class Writer:
 
 
 class WriteConformance(ConnectorConformance):
-    """Inherit, and give a fixture ``rig`` that is a :class:`WriteRig`."""
+    """Tests of writing: inherit from this class, and define a fixture ``rig``, a :class:`WriteRig`."""
 
     writable: ClassVar[tuple[str, ...]] = ("**",)
 
     @pytest.fixture
     def writer(self, run: Run) -> Writer:
-        """A writer of commands to the running source, which is connected."""
+        """Provide a writer of commands to the running source, which is connected."""
         run.good()
         return Writer(run)
 
     def test_a_value_written_is_in_the_next_frame(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """Confirmed means that whoever asks from then on gets the new value."""
+        """After the confirmation, every request gets the new value."""
         for turn in range(1, 20):
             value = bytes([turn]) * SPARE
             frame = writer.written(Write(rig.spare, 0, value))
             assert frame.raw[rig.spare : rig.spare + SPARE] == value
 
     def test_several_writes_in_one_command(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """Bytes and bits together, each done."""
+        """A command that writes bytes and bits has an outcome for each of them."""
         frame = writer.written(
             Write(rig.spare, 0, b"ab"), Write(rig.spare + 4, 0x40, b"\xff"), Write(rig.spare + 4, 0x02, b"\xff")
         )
         assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
 
     def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """The device counts in the other bits meanwhile; that it loses no count is checked in every frame."""
+        """The device counts in the other bits meanwhile; every frame is checked for lost counts."""
         for turn in range(50):
             frame = writer.written(Write(rig.flags, 1, bytes([turn & 1])))
             assert frame.raw[rig.flags] & 1 == turn & 1
 
     def test_a_refused_item_among_good_ones(self, rig: WriteRig) -> None:
-        """One refusal, in words; the others are done, and the connection stands."""
+        """One item is refused with a reason; the others are done, and the connection stays open."""
         connector = rig.connector()
         try:
             connector.connect()
@@ -125,7 +125,7 @@ class WriteConformance(ConnectorConformance):
             connector.close()
 
     def test_a_late_confirmation_is_not_taken_for_the_next(self, rig: WriteRig) -> None:
-        """The confirmation of a write comes on the next connection: never as that of what is refused there."""
+        """A late confirmation on the next connection never confirms a write that is refused there."""
         connector = rig.connector()
         try:
             connector.connect()
@@ -134,7 +134,7 @@ class WriteConformance(ConnectorConformance):
                 connector.write([Write(rig.spare, 0, b"late")])
             assert rig.proxy.wait_held()
             connector.close()
-            rig.proxy.edit(lambda frame: frame)  # what is held stays held
+            rig.proxy.edit(lambda frame: frame)  # frames on hold stay on hold
             connector.connect()
             rig.proxy.release()
             with contextlib.suppress(ConnectorError):
@@ -144,7 +144,7 @@ class WriteConformance(ConnectorConformance):
 
     @pytest.mark.parametrize("count", [1, 30])
     def test_lost_in_mid_write(self, run: Run, writer: Writer, rig: WriteRig, count: int) -> None:
-        """The connection breaks somewhere around a write: what is said of the write is true."""
+        """The connection breaks around a write: the reported outcome is true."""
         for turn in range(1, 5):
             rig.proxy.cut_after(count * turn)
             value = bytes([turn]) * SPARE
@@ -160,9 +160,9 @@ class WriteConformance(ConnectorConformance):
 
     @pytest.mark.parametrize("fault", ["cut before", "cut in the answer", "no answer"])
     def test_of_each_lost_write_what_is_said_is_true(self, rig: WriteRig, fault: str) -> None:
-        """Several writes at once, and the connection breaks: what was written is there, what was not sent is not.
+        """The connection breaks during several writes: each reported outcome is true.
 
-        A connector that raises another ConnectorError than WriteLostError says nothing of any.
+        A connector that raises a ConnectorError other than WriteLostError reports none.
         """
         writes = [Write(rig.spare + place, 0, bytes([place + 1])) for place in range(SPARE)]
         connector = rig.connector()
@@ -188,7 +188,7 @@ class WriteConformance(ConnectorConformance):
                     assert (found[offset : offset + 1] == data) == (outcome == ""), (offset, outcome)
 
     def test_without_a_connection_nothing_is_sent(self, rig: WriteRig) -> None:
-        """Before the first connect, and after a close: an error, and the device is as it was."""
+        """Writing before the first connect, or after a close, fails and changes nothing."""
         connector = rig.connector()
         try:
             for _ in range(2):

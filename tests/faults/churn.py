@@ -17,7 +17,7 @@ ON_FASTEST = 4
 """So many of them follow the fastest source, since each of its frames is a line to be looked at here."""
 TURN_S = 0.1
 LINE = re.compile(rb"(\d+) cycle (\d+) missed (\d+) (good|uncertain|bad) (\d+) (.*)")
-GONE = re.compile(r"no instance|.* is just starting|.* has stopped|source \S+ was changed")
+GONE = re.compile(r"no instance|.* is starting|.* has stopped|source \S+ was changed")
 """What a reader may say when its instance is not there or stops."""
 
 

@@ -109,10 +109,10 @@ class Instance:
             raise RuntimeError(f"up failed: {done.stderr}")
 
     def ask(self, verb: str, *arguments: str) -> None:
-        """Have the instance do something; again, when it is just being changed, as the supervisor says then."""
+        """Have the instance do something; repeat that while another change is in progress."""
         until_s = time.monotonic() + COMMAND_S
         while (done := self.supervisor(verb, *arguments)).returncode:
-            if "ask again" not in done.stderr or time.monotonic() > until_s:
+            if "try again" not in done.stderr or time.monotonic() > until_s:
                 raise RuntimeError(f"{verb} {' '.join(arguments)} failed: {done.stderr}")
 
     def down(self) -> None:

@@ -77,7 +77,7 @@ def test_a_page_that_tells_something_else_is_found(after: Clock, problem: str, f
 @pytest.mark.parametrize(
     ("text", "after", "problem"),
     [
-        ("step 8: it was broken off", AFTER._replace(done=7), "names nobody"),
+        ("step 8: it was cancelled", AFTER._replace(done=7), "names nobody"),
         ("step 8: lead: ?", AFTER._replace(step=9, done=7), "more than its number"),
         ("step 8: lead: ?", BEFORE._replace(done=6), "not asked for is done"),
         ("step 8: lead: ?", AFTER._replace(done=7, time_ns=0), "does not lead there"),

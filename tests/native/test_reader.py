@@ -249,7 +249,7 @@ def test_wrong_use_is_one_clear_line(reader: Path, instance: str) -> None:
 
 def test_a_half_made_segment_is_an_error(reader: Path, instance: str) -> None:
     file = SHM / f"shmio-{instance}"
-    early = f"instance {instance} is just starting, or died while it did\n"
+    early = f"instance {instance} is starting, or died during its start\n"
     for content, message in (
         (b"", early),
         (bytes(100), early),

@@ -54,11 +54,11 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
     assert nobody.returncode == 1
     assert "UNAUTHENTICATED: Subscribe needs the role read" in nobody.stderr
     get = ("get", "--host", address, "cell/Inputs")
-    assert guarded.run("shmio", *get).stderr.endswith("; here by --token-file FILE, which has the token alone\n")
+    assert guarded.run("shmio", *get).stderr.endswith("; here: --token-file FILE, a file with only the token\n")
     assert guarded.run("shmio", *get, "--token-file", "dash").returncode == 0
     assert "--token-file" not in guarded.run("shmio", *get, "--token-file", "other").stderr
     assert subscribe(guarded, address, "--token-file", "dash").returncode == 0
-    assert "none of [[grpc.token]]" in subscribe(guarded, address, "--token-file", "other").stderr
+    assert "not in [[grpc.token]]" in subscribe(guarded, address, "--token-file", "other").stderr
     pid = guarded.processes()["grpc"]["pid"]
     with grpc.insecure_channel(address) as channel:
         stream = channel.unary_stream(
@@ -69,7 +69,7 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
         before = file.read_text()
         file.write_text(before + MORE)
         reload = guarded.supervisor("reload")
-        assert (reload.returncode, "grpc: told to take its tokens and roles anew" in reload.stdout) == (0, True)
+        assert (reload.returncode, "grpc: told to reload its tokens and roles" in reload.stdout) == (0, True)
         until(lambda: subscribe(guarded, address, "--token-file", "other").returncode == 0, "the new token taken")
         assert next(stream).value, "the stream of a token that stays goes on"
         (guarded.folder / "other").chmod(0o644)
@@ -84,7 +84,7 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
         assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
     assert guarded.processes()["grpc"]["pid"] == pid
     told = guarded.logs() + guarded.supervisor("status", "--json").stdout
-    assert "took tokens and roles anew" in told
+    assert "reloaded tokens and roles" in told
     assert DASH not in told
     assert OTHER not in told
 
@@ -131,5 +131,5 @@ def test_a_unix_socket_is_cleared_after_a_death_and_removed_at_the_end(guarded: 
     assert not socket.exists()
     socket.write_text("precious")
     refused = guarded.supervisor("up", "--detach")
-    assert (refused.returncode, "no socket: move it away" in refused.stderr) == (1, True)
+    assert (refused.returncode, "not a socket: move it away" in refused.stderr) == (1, True)
     assert socket.read_text() == "precious"

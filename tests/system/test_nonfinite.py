@@ -30,7 +30,7 @@ writable = ["**"]
 [grpc]
 listen = ["{grpc}"]
 """
-REASON = "NaN and infinities are not written"
+REASON = "NaN and infinities are written only if"
 
 
 def test_they_are_refused_until_the_configuration_allows_them(make_cell: Callable[..., Cell]) -> None:
@@ -40,7 +40,10 @@ def test_they_are_refused_until_the_configuration_allows_them(make_cell: Callabl
     until(lambda: cell.processes()["sim"]["quality"] == "good", "good quality")
 
     done = cell.run("shmio", "set", "sim/a", "NaN")
-    assert (done.returncode, f"sim/a: not written, the source took nothing: a: {REASON}" in done.stderr) == (1, True)
+    assert (done.returncode, f"sim/a: not written, the source accepted nothing: a: {REASON}" in done.stderr) == (
+        1,
+        True,
+    )
     with (
         shmio.attach(cell.instance, writable=True) as local,
         connect(str(cell.grpc)) as remote,

@@ -102,7 +102,7 @@ def test_every_verb_refuses_by_the_file_of_another_plant(
     output = capsys.readouterr()
     refusal = (
         f"the running instance {shared_instance!r} was started from {running}, not from {other}: "
-        f"to act on it all the same, name it: --instance {shared_instance}"
+        f"to use that instance anyway, add --instance {shared_instance}"
     )
     assert output.err == f"{refusal}\n"
     if "--json" in words:

@@ -98,4 +98,4 @@ def test_another_host_in_plain_text_may_what_its_address_gives(
         .replace("[[grpc.token]]", "insecure = true\n[[grpc.token]]")
     )
     checked = cell.supervisor("check")
-    assert (checked.returncode, "would carry the tokens of [[grpc.token]]" in checked.stderr) == (1, True)
+    assert (checked.returncode, "could read the tokens of [[grpc.token]]" in checked.stderr) == (1, True)

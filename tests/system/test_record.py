@@ -125,7 +125,7 @@ def test_notes_and_deaths_stand_in_the_recording(make_cell: Callable[..., Cell])
     for arguments, message in (
         (["x" * 257], "a note has 1 to 256 bytes in UTF-8, this has 257"),
         ([""], "a note has 1 to 256 bytes in UTF-8, this has 0"),
-        (["Greifer \udce4b"], "a note is text in UTF-8, and character 9 of this is none"),
+        (["Greifer \udce4b"], "a note must be UTF-8 text, but character 9 is not"),
         (["x", "--source", "press"], "no source 'press'; there are: cell"),
     ):
         failed = cell.run("shmio-dump", "note", *arguments)

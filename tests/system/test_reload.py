@@ -59,11 +59,11 @@ def test_a_source_comes_and_goes_and_who_listens_to_another_hears_on(cell: Cell,
     next(stream)
     pids = {name: process["pid"] for name, process in cell.processes().items()}
     assert cell.run("shmio", "get", PATH).returncode == 0
-    assert "; looked for in source cell, as the path begins with no source" in cell.run("shmio", "get", "x/y").stderr
+    assert "; searched in source cell," in cell.run("shmio", "get", "x/y").stderr
     add_second(cell)
     done = cell.supervisor("reload")
     assert (done.returncode, done.stderr) == (0, "")
-    error = f"{PATH}: there are 2 sources, and 'Robot_800' is none of them: write cell/… or second/…\n"
+    error = f"{PATH}: 'Robot_800' is not one of the 2 sources: write cell/… or second/…\n"
     assert cell.run("shmio", "get", PATH).stderr == error
     assert done.stdout.splitlines() == ["second: started", f"{cell.instance}: 3 processes kept as they were"]
     until(lambda: cell.processes()["second"]["quality"] == "good", "the new source is good")

@@ -215,15 +215,15 @@ def test_whoever_is_killed_within_a_step_fails_it_and_the_next_one_works(make_dr
 
     with served(cell) as model:
         step(cell)
-        assert "drive: model 'serve.py' was gone before it had answered" in failing(model.kill)
+        assert "drive: model 'serve.py' disconnected before it answered" in failing(model.kill)
     with served(cell) as model:
         step(cell)
         pid = cell.processes()["drive"]["pid"]
-        assert "drive: its process was started anew within this step" in failing(lambda: kill(pid))
+        assert "drive: its process was restarted during this step" in failing(lambda: kill(pid))
     with served(cell) as model:  # the one before hangs in its step
         step(cell)
         pid = cell.processes()["grpc"]["pid"]
-        assert "drive: model 'serve.py' was gone before it had answered" in failing(lambda: kill(pid))
+        assert "drive: model 'serve.py' disconnected before it answered" in failing(lambda: kill(pid))
         model.kill()
         until(lambda: cell.processes()["grpc"]["pid"] not in (pid, None), "the endpoint is started anew")
     with served(cell):

@@ -195,7 +195,7 @@ def test_it_plays_until_it_is_interrupted(line: Cell) -> None:
             until(lambda: line.status()["clock"]["time_s"] > begun_s + 1, "time runs")
             refused = line.run("shmio", "step")
             assert refused.returncode == 1
-            assert f"another program (pid {player.pid}), which plays it" in refused.stderr
+            assert f"another program (pid {player.pid}), which is playing it" in refused.stderr
             player.send_signal(signal.SIGINT)
             assert player.wait(PATIENCE_S) == 0
         finally:
@@ -275,11 +275,11 @@ def test_what_a_model_computes_is_not_set_and_the_remedy_works(line: Cell, remot
     way = ("--host", str(line.grpc)) if remote else ()
     unlisted = line.run("shmio", "set", *way, "belt/position", "7").stderr
     assert unlisted.startswith("belt/position is not writable; ")
-    assert unlisted.endswith("unless its model computes it: nobody writes that, and shmio inject shows another value\n")
+    assert unlisted.endswith("unless its model computes it: then only shmio inject can show another value\n")
     listed = line.run("shmio", "set", *way, "gate/closed", "true").stderr
     assert listed == (
-        "gate/closed: the source refused it: the model computes closed: it is an output, which nobody writes; "
-        "shmio inject shows others\n"
+        "gate/closed: the source refused it: the model computes closed: it is an output and cannot be written; "
+        "shmio inject can show others\n"
     )
     laid = line.run("shmio", "inject", *way, "--keep", "belt/position", "-7")
     assert laid.returncode == 0, laid.stderr
@@ -299,7 +299,7 @@ def test_a_model_that_is_killed_within_a_step_fails_it_and_goes_on_with_the_next
             _, error = command.communicate(timeout=PATIENCE_S)
         assert command.returncode == 1
         assert error == (
-            f"step {number}: belt: its process was started anew within this step; it goes on with the next one\n"
+            f"step {number}: belt: its process was restarted during this step; it continues with the next one\n"
         )
         cell.write({"belt/speed": 1.0})
         assert cell.step().step == number + 1

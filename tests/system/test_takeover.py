@@ -98,7 +98,7 @@ def test_what_a_take_over_finds_is_told_as_it_is_by_now(cell: Cell) -> None:
     up = cell.supervisor("up", "--detach")
     assert up.returncode == 0, up.stderr
     assert f"segment shmio-{cell.instance} ({grown / 1e6:.1f} MB), logs in " in up.stdout
-    assert f"grpc, pid {grpc_pid}, was stopped at once: the configuration has it no more\n" in up.stdout
+    assert f"grpc, pid {grpc_pid}, was stopped at once: it is no longer in the configuration\n" in up.stdout
     assert list(pids(cell)) == ["plc", "cell"]
 
 

@@ -112,7 +112,7 @@ def test_an_order_reaches_the_plant(cell: Cell) -> None:
 
 def test_what_cannot_be_written_is_one_clear_line(cell: Cell) -> None:
     for path, value, message in [
-        ("cell/Inputs/0", "1", "cell/Inputs/0 is not writable; the configuration has to name it in the source's"),
+        ("cell/Inputs/0", "1", "cell/Inputs/0 is not writable; name it in the source's"),
         ("cell/Outputs/100.%X8", "1", "Outputs/100.%X8: BYTE has bits 0 to 7"),
         ("cell/Robot_800/Axs7_Pos", "1", "near: Robot_800/Axs6_Pos"),
         ("cell/Outputs/100", "256", "cell/Outputs/100: BYTE: 256 is out of range"),
@@ -131,7 +131,7 @@ def test_without_its_controller_nothing_is_written_and_the_reason_is_told(make_c
     until(lambda: "refused" in (cell.processes()["cell"]["note"] or ""), "no controller")
     done = cell.run("shmio", "set", PLACE, "5")
     assert (done.returncode, done.stdout) == (1, f"{PLACE}  rejected\n")
-    assert done.stderr.startswith(f"{PLACE}: not written, the source took nothing: the source is not connected")
+    assert done.stderr.startswith(f"{PLACE}: not written, the source accepted nothing: the source is not connected")
     assert "shmio-supervisor status" in done.stderr
     assert done.stderr.count("\n") == 1
     with client(cell) as stub:

@@ -47,7 +47,7 @@ def test_no_value_is_given() -> None:
         ({"operation": "drop", "name": 5}, "injection: "),
         ({"operation": "drop", "target": 5}, "injection: "),
         ({"operation": "flip", "bits": [-1]}, "injection: "),
-        ({"operation": "noise", "distribution": "even"}, "injection.distribution: 'even' is none"),
+        ({"operation": "noise", "distribution": "even"}, "injection.distribution: 'even' is unknown"),
         ({"operation": "random", "values": [None]}, "injection.values: a NoneType"),
     ],
 )

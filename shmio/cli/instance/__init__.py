@@ -1,1 +1,1 @@
-"""The verbs of ``shmio-supervisor``: a module each, with ``execute(arguments) -> exit status``."""
+"""Verbs of ``shmio-supervisor``, one module each, with ``execute(arguments) -> exit status``."""

@@ -1,4 +1,4 @@
-"""``shmio-supervisor check``: validate a configuration and what it names; start nothing."""
+"""``shmio-supervisor check``: validate a configuration and the files it names; start nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.segment import PREFIX, BlockSpec, Segment
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Print what the instance would take; errors go the usual way."""
+    """Print what the instance would need: processes, registers and memory."""
     file = config_file(arguments)
     prepared = prepare(file)
     plan = prepared.plan
@@ -45,7 +45,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _taken(file: Path, plan: Plan) -> list[str]:
-    """Addresses for which ``up`` would wait in vain, unless it is this instance that has them."""
+    """Return a note for each address that another program uses; none if the instance runs."""
     with suppress(ShmioError), Segment.open(plan.instance, config=file) as segment:
         if segment.supervised:
             return []

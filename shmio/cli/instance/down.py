@@ -1,4 +1,4 @@
-"""``shmio-supervisor down``: stop an instance and wait until it is gone."""
+"""``shmio-supervisor down``: stop an instance and wait for its end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EXIT_S = 5.0
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Ask the supervisor to stop; clear what is there if it is dead."""
+    """Ask the supervisor to stop; if it is dead, remove what it left."""
     wanted = target(arguments)
     name = wanted.name
     if name not in instances():
@@ -28,7 +28,7 @@ def execute(arguments: argparse.Namespace) -> int:
             if segment.supervised:
                 _stop(segment)
                 return 0
-    except FormatError as error:  # nobody can tell from which file it was started
+    except FormatError as error:  # the file that it was started from is unknown
         if wanted.file is not None:
             raise FormatError(f"{error}; down --instance {name} clears it if its supervisor is dead") from None
     print(f"{name}: its supervisor is dead; clearing what it left")
@@ -38,7 +38,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _forget(path: str, name: str) -> None:
-    if path == socket_path(name):  # never what somebody else's segment names
+    if path == socket_path(name):  # never a path from another user's segment
         remove_socket(path)
 
 
@@ -57,7 +57,7 @@ def _stop(segment: Segment) -> None:
 
 
 def _pidfd(pid: int) -> int | None:
-    """A handle to wait for the supervisor's end; none when it runs in another process name space."""
+    """Return a descriptor that signals the supervisor's end; None in another PID namespace."""
     with suppress(OSError):
         return os.pidfd_open(pid)
     return None

@@ -1,4 +1,4 @@
-"""``shmio-supervisor init``: write a configuration to start from."""
+"""``shmio-supervisor init``: write a first configuration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EXAMPLE_NAME = "a50"
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Write the files, or none of them when one is there already."""
+    """Write the files, or none of them if one exists already."""
     file = config_file(arguments)
     _refuse_present(file)
     text, missing = None, list[str]()
@@ -29,7 +29,7 @@ def execute(arguments: argparse.Namespace) -> int:
     elif arguments.block:
         raise ConfigError("--block chooses a data block of the files that are given, and there are none")
     written = _example(file) if text is None else {file: text}
-    other = vacant_name(EXAMPLE_NAME, file) if text is None else EXAMPLE_NAME  # before it is taken by this one
+    other = vacant_name(EXAMPLE_NAME, file) if text is None else EXAMPLE_NAME  # before this instance takes the name
     _write(written)
     for path in written:
         print(printable(f"wrote {path}"))
@@ -44,7 +44,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _example(file: Path) -> dict[Path, str]:
-    """The A50 cell with its controller emulated, beside each other."""
+    """Return the files of the A50 cell with its emulated controller, by path."""
     folder = resources.files("shmio.cli.a50")
     config, layout = ((folder / name).read_text(encoding="utf-8") for name in EXAMPLE)
     return {file: config, file.parent / EXAMPLE[1]: layout}
@@ -56,7 +56,7 @@ def _refuse_present(path: Path) -> None:
 
 
 def _write(files: dict[Path, str]) -> None:
-    """Write all or none; a file that is there is never touched, a layout with the same content serves as it is."""
+    """Write all files or none; never change an existing file, but use a layout that is the same."""
     for path, content in files.items():
         if not (path.is_file() and path.suffix == ".db" and path.read_bytes() == content.encode()):
             _refuse_present(path)

@@ -18,9 +18,10 @@ _HEADINGS = ("NAME", "STATE", "FILE", "LISTENS ON")
 
 
 class Listed(msgspec.Struct):
-    """An instance. ``file``: the configuration that it was started from; ``listen``: addresses by process.
+    """An instance in the list.
 
-    Both are empty where it does not tell. ``note``: what there is to say about it.
+    ``file`` is the configuration that it was started from, and ``listen`` has addresses by process;
+    both are empty if unknown. ``note`` is a remark for the user.
     """
 
     name: str
@@ -31,7 +32,7 @@ class Listed(msgspec.Struct):
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Print a line for each."""
+    """Print a line for each instance."""
     found = [one for name in instances() if (one := _look(name))]
     if arguments.json:
         print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
@@ -43,7 +44,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _look(name: str) -> Listed | None:
-    """What is told of it to this user; None: it has ended meanwhile."""
+    """Return what this user may know of an instance, or None if it has just ended."""
     try:
         with Segment.open(name) as segment:
             status = status_of(segment, f"shmio-supervisor down --instance {name} stops them")
@@ -53,12 +54,12 @@ def _look(name: str) -> Listed | None:
             return listed
     except NotRunningError as error:
         return Listed(name, "unknown", note=str(error)) if name in instances() else None
-    except SegmentError as error:  # another user's, or of another version
+    except SegmentError as error:  # of another user or version
         return Listed(name, "unknown", note=str(error))
 
 
 def _listening(segment: Segment, note: str) -> tuple[dict[str, list[str]], str]:
-    """By process, as the supervisor tells it; and the note, with the reason where it does not."""
+    """Return the supervisor's addresses by process, and the note, or why there are none."""
     try:
         answer = control.request(segment.header.control, control.Where(), WHERE_S, lambda: supervisor_silence(segment))
         return answer.get("listen", {}), note

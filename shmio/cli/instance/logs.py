@@ -1,4 +1,4 @@
-"""``shmio-supervisor logs [NAME]``: the end of the log files."""
+"""``shmio-supervisor logs [NAME]``: print the end of the log files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from shmio.supervisor import control
 MAX_LINE_BYTES: Final = 65536
 _STAMP = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z ")
 
-# inotify(7): what can happen to a log file as seen from its folder.
+# inotify(7): events of a log file, as seen from its folder.
 _IN_MODIFY: Final = 0x0002
 _IN_MOVED_TO: Final = 0x0080
 _IN_CREATE: Final = 0x0100
@@ -34,16 +34,16 @@ _EVENT_ROOM: Final = 65536
 
 
 def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
-    """The last ``count`` lines of the files together, in order of their time stamps.
+    """Return the last ``count`` lines of the files together, in the order of their time stamps.
 
-    A line without a stamp, as those of a traceback, stays behind the one before it.
+    A line without a time stamp, such as one of a traceback, stays after the line before it.
     """
     merged = heapq.merge(*(_stamped(file, count) for file in files), key=lambda entry: entry[0])
     return list(deque((line for _, line in merged), maxlen=count))
 
 
 def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
-    """The last ``count`` lines of one file, each with its time stamp or that of the line it follows."""
+    """Return the last ``count`` lines of a file with time stamps, own or of an earlier line."""
     try:
         with file.open("rb") as stream:
             return deque(_lines(stream), maxlen=count)
@@ -60,13 +60,13 @@ def _lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 class Follower:
-    """What is added to log files from now on; a file that is rotated is read to its end, then anew.
+    """Follows log files from now on; reads a rotated file to its end, then the new one.
 
-    Waits on inotify, so it costs nothing while nothing is written. Use ``with``.
+    It waits on inotify, so that idle files cost nothing. Use it as a context manager.
     """
 
     def __init__(self, files: Iterable[Path]) -> None:
-        """OSError: the folder cannot be watched."""
+        """Begin to follow; OSError if a folder cannot be watched."""
         self._files: dict[Path, BinaryIO | None] = {}
         self._partial: dict[Path, bytes] = {}
         files = list(files)
@@ -88,7 +88,7 @@ class Follower:
                 stream.close()
 
     def wait(self) -> list[bytes]:
-        """Wait until something happens in the folder; the whole lines that are new."""
+        """Wait for an event in the folders; return the new complete lines."""
         os.read(self._fd, _EVENT_ROOM)
         return [line for file in self._files for line in self._new(file)]
 
@@ -119,7 +119,7 @@ def _open(file: Path) -> BinaryIO | None:
 
 
 def _replaced(file: Path, stream: BinaryIO | None) -> bool:
-    """Whether the name leads to another file by now."""
+    """Return whether the path now leads to another file."""
     try:
         found = file.stat()
     except FileNotFoundError:
@@ -128,7 +128,7 @@ def _replaced(file: Path, stream: BinaryIO | None) -> bool:
 
 
 def _watch(folders: Iterable[Path]) -> int:
-    """An inotify descriptor for the folders; the standard library has no binding."""
+    """Return an inotify descriptor for the folders; Python's library has no binding."""
     libc = ctypes.CDLL(None, use_errno=True)
     fd: int = libc.inotify_init1(os.O_CLOEXEC)
     if fd < 0:
@@ -152,7 +152,7 @@ _LINE = re.compile(
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Print the last lines, and with ``-f`` what follows until Ctrl-C."""
+    """Print the last lines, and with ``-f`` new lines until Ctrl-C."""
     folder, processes = _where(arguments)
     names = [SUPERVISOR, *processes]
     if arguments.name is not None:
@@ -172,9 +172,10 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
-    """Folder and processes: as the file says, else as the running instance does, whose file may be gone.
+    """Return the log folder and the process names.
 
-    What runs and is in no file, as a replay's sources may be, is known too.
+    They come from the configuration, or else from the running instance, whose file may be gone.
+    Running processes that are not in the file, such as a replay's sources, are included.
     """
     wanted = target(arguments)
     if wanted.file is not None:
@@ -199,7 +200,7 @@ def _print(lines: Iterable[bytes], *, as_json: bool) -> None:
 
 
 def _parsed(line: str) -> dict[str, Any]:
-    """A line's parts; all but its text are None where it goes on with the one before, as those of a traceback."""
+    """Split a line; a continuation, such as a line of a traceback, has only text."""
     found = _LINE.fullmatch(line)
     if found is None:
         return {"time": None, "level": None, "process": None, "pid": None, "text": line}

@@ -1,4 +1,4 @@
-"""``shmio-supervisor reload``: have the running instance take what has changed in its configuration."""
+"""``shmio-supervisor reload``: apply changes of the configuration to the running instance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RELOAD_S = 90.0
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Print what the supervisor did; 1 when something new does not run."""
+    """Print what the supervisor did; return 1 if a changed process does not run."""
     with target(arguments).open_supervised() as segment:
         answer = ask(segment, control.Reload(), RELOAD_S)
         if arguments.json:

@@ -14,7 +14,7 @@ WHERE_S = 5.0
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Return when the process runs again."""
+    """Restart a process; return when it runs again."""
     with target(arguments).open_supervised() as segment:
         ask(segment, control.Restart(arguments.name), RESTART_S)
         print(f"{arguments.name} runs again")

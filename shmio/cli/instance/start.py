@@ -1,4 +1,4 @@
-"""The start of an instance, by the process that is its supervisor from then on."""
+"""Start an instance in this process, which becomes its supervisor."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from shmio.supervisor.start import check_startable, hold_log_folder
 
 
 def foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
-    """Run it; return when it has stopped. ``keys``: of ``[replay]``, from the command line."""
+    """Run an instance until it has stopped; ``keys`` are those of ``[replay]`` from the command line."""
     prepared = prepare(file, mode, keys)
     plan = prepared.plan
     for warning in plan.warnings:
@@ -47,7 +47,7 @@ def foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
 
 
 def detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int:
-    """Run it, and tell who waits for it how the start went, through this descriptor."""
+    """Run an instance detached, and send the result of the start through the descriptor ``report``."""
     told = False
 
     def tell(message: StartMessage) -> None:
@@ -55,7 +55,7 @@ def detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int
         if told:
             return
         told = not isinstance(message, Configured)
-        with suppress(OSError):  # who waited gave up
+        with suppress(OSError):  # the waiting process gave up
             os.write(report, msgspec.json.encode(message) + b"\n")
         if told:
             os.close(report)
@@ -94,12 +94,12 @@ def _log_file(plan: Plan) -> Path:
 
 
 def _replan(plan: Plan, keys: Mapping[str, Any]) -> Callable[[], Plan]:
-    """What a reload makes of the same file by then."""
+    """Return a function that plans the same file again, for a reload."""
     return lambda: prepare(plan.config_file, plan.mode, keys).plan
 
 
 def _processes(prepared: Prepared) -> Iterator[str]:
-    """What there will be, a line each, and what to know of it."""
+    """Yield a line about each process of the plan."""
     jobs = prepared.plan.jobs
     width = max((len(job.name) for job in jobs), default=0)
     for job in sorted(jobs, key=lambda job: job.rank):
@@ -124,7 +124,7 @@ def _describe(job: Job, prepared: Prepared) -> str:
 
 
 class _Console(logging.Formatter):
-    """A record's message alone."""
+    """Formats a log record as its message alone."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(record.getMessage())

@@ -1,4 +1,4 @@
-"""What a supervisor that starts detached tells the process that waits for it."""
+"""Messages from a detached supervisor to the process that waits for its start."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Configured(msgspec.Struct, tag=True):
 
 
 class Started(msgspec.Struct, tag=True):
-    """Everything runs.
+    """The instance runs.
 
-    ``history``: what was found of an earlier supervisor; ``processes``: the processes, a line each.
+    ``history`` says what an earlier supervisor left; ``processes`` has a line for each process.
     """
 
     instance: str

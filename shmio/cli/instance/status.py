@@ -1,4 +1,4 @@
-"""``shmio-supervisor status``: how an instance and its processes are."""
+"""``shmio-supervisor status``: print the state of an instance and its processes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Print the status; 1 when nothing runs."""
+    """Print the status; return 1 if the instance does not run."""
     try:
         wanted = target(arguments)
         status = read_status(wanted.name, config_option(arguments), wanted.file)
@@ -51,7 +51,10 @@ def _table(status: InstanceStatus) -> list[str]:
 
 
 def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
-    """Time in one line. ``dt_ms``: by how much its steps were told to move it; None: by the step size."""
+    """Return the state of the clock as text.
+
+    ``dt_ms`` is the size of the steps that were made; None if that is the clock's step size.
+    """
     if clock.mode == str(ClockMode.WALL):
         return f"real time {clock.time_s:.3f} s"
     size = f"{clock.step_size_ms:g} ms"
@@ -79,7 +82,7 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
 
 
 def _said(process: ProcessStatus) -> bool:
-    """Whether the note only repeats why the source is bad, in full or cut to fit."""
+    """Return whether the note only repeats the source's reason, in full or shortened."""
     return isinstance(process, SourceStatus) and (
         process.reason.startswith(process.note) or bool(process.reason and process.note.startswith(process.reason))
     )

@@ -1,6 +1,7 @@
 """``shmio-supervisor up``: start an instance, in the foreground or detached.
 
-What starts it is in ``start``; who only waits for a detached one imports none of that.
+The module ``start`` starts it; a process that only waits for a detached supervisor does not import
+that module.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def _detach(file: Path, mode: str, words: Sequence[str]) -> int:
         child = subprocess.Popen(
             [*command, "-c", str(file), "--mode", mode, "--report", str(writer), *words],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # its standard error is ours, until it has its log file
+            stdout=subprocess.DEVNULL,  # it shares our standard error until it has its log file
             pass_fds=(writer,),
             env=child_environment(),
             start_new_session=True,
@@ -61,7 +62,7 @@ def _detach(file: Path, mode: str, words: Sequence[str]) -> int:
             child.terminate()
             child.wait()
             raise
-    child.returncode = 0  # it lives on, which Popen would complain about
+    child.returncode = 0  # keeps Popen from warning that the child still runs
     for line in started.history:
         say(line)
     status = read_status(started.instance)
@@ -73,7 +74,7 @@ def _detach(file: Path, mode: str, words: Sequence[str]) -> int:
 
 
 def _await(fd: int) -> tuple[str, Started]:
-    """Its log file, and what it tells when it runs; ControlError with what it says otherwise."""
+    """Wait for the start; return the log file and the message, or raise ControlError."""
     log_file = ""
     for line in _lines(fd):
         told = msgspec.json.decode(line, type=StartMessage)
@@ -88,7 +89,7 @@ def _await(fd: int) -> tuple[str, Started]:
 
 
 def _lines(fd: int) -> Iterator[bytes]:
-    """What comes through the pipe, to its end, if there ever is one."""
+    """Yield the lines that come through the pipe, until its end or the time-out."""
     deadline = time.monotonic() + DETACH_S
     received = b""
     while True:

@@ -1,1 +1,1 @@
-"""The verbs of ``shmio-dump``; each module has ``execute``."""
+"""Verbs of ``shmio-dump``, one module each, with ``execute(arguments) -> exit status``."""

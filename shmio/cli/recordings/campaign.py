@@ -1,4 +1,4 @@
-"""``shmio-dump campaign``: what was injected in recordings as a file for ``shmio inject --file``."""
+"""``shmio-dump campaign``: write the injections of recordings as a campaign file."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from shmio.recording.rewriting import new_file
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Write the injections of some files of one run; what cannot be declared is told."""
+    """Write the injections of files of one run; report those that cannot be declared."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         found = derive(dump)
     for text in found.left_out:
-        print(printable(f"not as it was: {text}"), file=sys.stderr)
+        print(printable(f"not exactly reproduced: {text}"), file=sys.stderr)
     if not found.declarations:
-        raise RecordingError(f"{dump.files[0]}: no injection was laid in it that can be declared")
+        raise RecordingError(f"{dump.files[0]}: it has no injection that can be declared")
     declarations = found.shifted(found.begin_s) if arguments.from_zero else found.declarations
     try:
         check_declarations(declarations)
     except ConfigError as error:
-        raise RecordingError(f"{dump.files[0]}: its injections make no campaign: {error}") from None
+        raise RecordingError(f"{dump.files[0]}: its injections cannot form a campaign: {error}") from None
     tables = [_table(msgspec.to_builtins(one)) for one in declarations]
     with new_file(arguments.output) as stream:
         stream.write("\n".join(tables).encode())
@@ -44,5 +44,5 @@ def _table(keys: dict[str, Any]) -> str:
 
 
 def _text(value: Any) -> str:
-    """As TOML has it, whose texts without control characters, numbers and lists are JSON's."""
+    """Return a value as TOML; texts without control characters, numbers and lists are as in JSON."""
     return json.dumps(value, ensure_ascii=False)

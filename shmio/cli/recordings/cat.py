@@ -1,4 +1,4 @@
-"""``shmio-dump cat``: what happened, line by line."""
+"""``shmio-dump cat``: print a recording line by line."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ from shmio.segment import Event, Frame
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Print a line for each frame in which a chosen value or the quality changed, and for events, gaps and steps.
+    """Print a line for each frame in which a chosen value or the quality changed.
 
-    1 if something was damaged: all the rest is printed, and where something is lost is told.
+    Events, gaps and steps have lines, too. Damage is reported where it occurs; then the exit status
+    is 1, and everything else is printed.
     """
     report = DamageReport()
     with (
@@ -80,7 +81,7 @@ def _printer(arguments: argparse.Namespace, views: Sequence[View]) -> Printer:
 
 
 def _nothing(found: Survey) -> str:
-    """Why nothing was printed."""
+    """Return why nothing was printed."""
     if not found.begin_ns:
         return "nothing is recorded in it"
     return f"nothing of what was asked for is in it then; it goes {span(found.begin_ns, found.end_ns)}"
@@ -89,9 +90,10 @@ def _nothing(found: Survey) -> str:
 def _views(
     reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], report: DamageReport
 ) -> dict[int, View]:
-    """By their frames' channels the blocks of which something is to be shown. PathError: a pattern names nothing.
+    """Return the blocks to show by the channel of their frames, without those with damaged layouts.
 
-    Of a block whose layout is damaged nothing can be.
+    Raises:
+        PathError: A pattern names nothing.
     """
     blocks = {}
     for channel in channels:
@@ -113,7 +115,7 @@ def _views(
                 continue
             try:
                 registers = {register.path: register for register in named(layout, topic)}
-            except PathError as error:  # it may be in the layout that came after a change
+            except PathError as error:  # the pattern may fit a later layout of the source
                 problem = error
             else:
                 some = some or bool(registers)
@@ -124,14 +126,14 @@ def _views(
 
 
 def _one_file(patterns: Sequence[str]) -> None:
-    """PathError for a pattern that is a file, as the shell's ``*.mem`` makes them, with what to do."""
+    """Raise PathError with a remedy if a pattern is a file, as when the shell expands ``*.mem``."""
     for pattern in patterns:
         if Path(pattern).is_file():
-            raise PathError(f"{pattern} is a file, and cat prints one: shmio-dump merge FILE… -o NEW makes one of them")
+            raise PathError(f"{pattern} is a file, but cat prints only one: shmio-dump merge FILE… -o NEW joins them")
 
 
 def _layout(reader: Reader, channel: Channel) -> Layout | None:
-    """None: it is damaged, which is told where frames are to be printed."""
+    """Return the layout of a channel; None if it is damaged, which is reported with the frames."""
     try:
         return reader.layout(channel)
     except RecordingError:

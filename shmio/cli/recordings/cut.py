@@ -1,4 +1,4 @@
-"""``shmio-dump cut``: a part of a recording as a new one."""
+"""``shmio-dump cut``: write a part of a recording to a new file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shmio.recording.rewriting import part
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Write what lies between two times, of some sources or registers, to a new file."""
+    """Write the entries between two times, of some sources or registers, to a new file."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         from_ns, to_ns = time_range(arguments, dump.begin_ns)

@@ -1,4 +1,4 @@
-"""What of a recording cannot be read, told where the rest of the output has come to."""
+"""Report damaged parts of a recording between the lines of the output."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from shmio.recording.times import lost
 
 
 class DamageReport:
-    """Tells on standard error."""
+    """Reports damage on standard error."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
 
     @property
     def any(self) -> bool:
-        """Whether there was anything to tell."""
+        """Whether anything was reported."""
         return bool(self.texts)
 
     def open(self, files: Sequence[Path]) -> Dump:
-        """Open a recording of which what cannot be read is told. OSError, RecordingError as ``open_dump``."""
+        """Open a recording and report its damage; OSError, RecordingError as ``open_dump``."""
         dump = open_dump(files, self.damage)
         for text in dump.damage:
             self.say(text)
         return dump
 
     def damage(self, file: Path, damage: Damage) -> None:
-        """A part of a file is lost."""
+        """Report that a part of a file is lost."""
         self.say(f"{file}: {lost(damage)}")
 
     def say(self, text: str) -> None:
-        """One line; the exit status will be 1."""
+        """Print a line; the exit status will be 1."""
         self.texts.append(text)
         sys.stdout.flush()
         print(printable(text), file=sys.stderr, flush=True)

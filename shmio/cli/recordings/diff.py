@@ -1,4 +1,4 @@
-"""``shmio-dump diff``: where two recordings differ."""
+"""``shmio-dump diff``: compare two recordings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_SHOWN = 50
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Compare source by source; 1 if something differs."""
+    """Compare source by source; return 1 if anything differs."""
     first, second = arguments.files
     ignore = [word for words in arguments.ignore for word in words.split(",")]
     how = Comparison(ignore, arguments.only or (), arguments.tolerance, arguments.relative)
@@ -60,7 +60,7 @@ def _lines(found: SourceDifference) -> Iterator[str]:
     if len(found.registers) > MAX_SHOWN:
         yield f"  and {len(found.registers) - MAX_SHOWN} more"
     if found.missing:
-        yield f"  only one has, or in another type: {', '.join(found.missing[:MAX_SHOWN])}"
+        yield f"  only in one recording, or of different types: {', '.join(found.missing[:MAX_SHOWN])}"
 
 
 def _side(side: Side, name: str) -> str:
@@ -121,7 +121,7 @@ def _side_object(side: Side) -> dict[str, Any]:
 
 
 def _plain(value: Value) -> Any:
-    """As JSON has it: what is no finite number as text."""
+    """Return a value for JSON; NaN and infinities become text."""
     if isinstance(value, list):
         return [_plain(item) for item in value]
     return str(value) if isinstance(value, float) and value - value != 0 else value

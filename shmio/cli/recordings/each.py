@@ -1,4 +1,4 @@
-"""What ``info`` and ``verify`` have in common: they look at files one by one."""
+"""Examine files one by one, for ``info`` and ``verify``."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ def each(
     look: Callable[[Path], dict[str, Any]],
     lines: Callable[[dict[str, Any]], Iterable[str]],
 ) -> int:
-    """Print what ``look`` finds in each file, as ``lines`` or JSON; 1 if one of them is damaged, or no recording.
+    """Print what ``look`` finds in each file, as ``lines`` or JSON.
 
-    In JSON, what is no recording has its error in its place.
-
-    ``look``: OSError, RecordingError: it is none.
+    ``look`` raises OSError or RecordingError for a file that is not a recording; in JSON the error
+    takes the place of the result. Returns 1 if a file is damaged or not a recording.
     """
     found: list[dict[str, Any]] = []
     failed = False
@@ -45,10 +44,10 @@ def each(
 
 
 def ended(found: dict[str, Any]) -> str:
-    """How a file ends, for people: by its ``closed`` and ``end``."""
+    """Return how a file ends, as text: by its ``closed`` and ``end``."""
     return "closed" if found["closed"] else not_closed(found["end"])
 
 
 def not_closed(end: str) -> str:
-    """What is said of a file that has no end, whoever says it."""
+    """Return the text about a file that was not closed; all commands use it."""
     return f"not closed ({end}): still being written, or its recorder was killed"

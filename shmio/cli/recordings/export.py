@@ -1,4 +1,4 @@
-"""``shmio-dump export``: recordings for other programs."""
+"""``shmio-dump export``: convert recordings for other programs."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def execute(arguments: argparse.Namespace) -> int:
 def _print_result(
     arguments: argparse.Namespace, report: DamageReport, files: Sequence[tuple[Path, int]], what: str
 ) -> int:
-    """Print what was made, as lines or an object; 1 if something was damaged."""
+    """Print the new files as lines or JSON; return 1 if the recording was damaged."""
     if arguments.json:
         made = [{"file": str(path), what: count} for path, count in files]
         print(dumps({"files": made, "damage": report.texts}, indent=2))
@@ -87,7 +87,11 @@ def _print_result(
 
 
 def _form(output: Path, asked: str | None) -> tuple[bool, str]:
-    """(whether the name is that of a file of some format, the format); RecordingError: it is of another."""
+    """Return whether the name is that of a file (else of a folder), and the format.
+
+    Raises:
+        RecordingError: The name and the requested format contradict each other.
+    """
     suffix = output.suffix.lower().removeprefix(".")
     if suffix in SHEETS | OTHERS and not output.is_dir():
         raise RecordingError(f"{output}: export does not write .{suffix}; {_remedy(output, suffix)}")
@@ -112,7 +116,7 @@ def _within(block: DumpBlock, from_ns: int, to_ns: int) -> bool:
 
 
 def _require_one(output: Path, blocks: Sequence[DumpBlock]) -> None:
-    """RecordingError: these blocks do not go into one table."""
+    """Raise RecordingError if these blocks do not fit into one table."""
     if len(blocks) > 1:
         names = ", ".join(block.source for block in blocks)
         raise RecordingError(f"{output} holds one block, and there are {len(blocks)} ({names}): name a folder")

@@ -1,4 +1,4 @@
-"""``shmio-dump info``: what is in recordings."""
+"""``shmio-dump info``: describe recordings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shmio.recording.times import iso, local
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Describe each file; 1 if one of them is none, or damaged."""
+    """Describe each file; return 1 if one is damaged or not a recording."""
     return each(arguments, _look, lambda found: _folded(_lines(found)))
 
 
@@ -117,7 +117,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
     recorder = "the instance's own recorder" if found["recorder"] == SUPERVISED else found["recorder"]
     by = f"recorded by {recorder}, shmio {found['version']}, on {found['host']}"
     if found["made_by"]:
-        by += f"; made of it by {found['made_by']}"
+        by += f"; converted by {found['made_by']}"
     lines = [
         f"{found['file']}: {size}, {ended(found)}",
         f"  instance {found['instance']}, mode {found['mode']}, started {found['started']}; {by}",
@@ -128,7 +128,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
     if found["trigger"]:
         lines.append(f"  triggered {found['triggered']} by {found['trigger']}")
     if found["doubtful"]:
-        where = f"behind byte {found['doubtful_from']} of {found['doubtful']}"
+        where = f"after byte {found['doubtful_from']} of {found['doubtful']}"
         lines.append(f"  what is {where} may be lost: the disk failed at its fsync")
     for block in found["blocks"]:
         hertz = f" at {block['rate_hz']:.1f} Hz" if block["rate_hz"] else ""
@@ -143,7 +143,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
 
 
 def _folded(lines: list[str]) -> Iterator[str]:
-    """The lines, those that follow one like them counted."""
+    """Yield the lines; equal lines in a row become one line with their number."""
     for line, alike in groupby(lines):
         count = sum(1 for _ in alike)
         yield line if count == 1 else f"{line} ({count} of these)"

@@ -1,4 +1,4 @@
-"""``shmio-dump merge``: several recordings of one run as one."""
+"""``shmio-dump merge``: join recordings of one run into one file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shmio.cli.run import say
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Write what is in any of the files, once and in the order of time, to a new one."""
+    """Write the contents of all files to a new one, in the order of time and without duplicates."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         work = rewrite(dump, arguments.output, "shmio-dump merge", dump.items())

@@ -1,4 +1,4 @@
-"""``shmio-dump note``: what somebody has to say, between the frames of a running instance."""
+"""``shmio-dump note``: put a note into the events of a running instance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WHERE_S = 2.0
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Send the note, and wait until it is there."""
+    """Send the note, and wait until the source has published it."""
     with Attachment(target(arguments).open(writable=True)) as cell:
         source = arguments.source if arguments.source is not None else _default_source(cell.instance)
         cell.note(arguments.text, source if source in cell.sources or arguments.source is not None else None)
@@ -25,7 +25,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _default_source(name: str) -> str | None:
-    """The source that clients mean who name none, if the configuration can be asked."""
+    """Return the default source of clients, or None if the configuration cannot be read."""
     with suppress(ControlError, ConfigError, KeyError), Segment.open(name) as segment:
         config = load(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
         return config.grpc.default_source if config.grpc else None

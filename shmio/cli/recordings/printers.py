@@ -1,4 +1,4 @@
-"""How ``shmio-dump cat`` puts things into lines."""
+"""Format the output lines of ``shmio-dump cat``: text, JSON or CSV."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from shmio.segment.changed_registers import ChangeScan
 
 
 class View:
-    """The chosen registers of one block, and what was shown of them last."""
+    """The chosen registers of one block, and their last printed values."""
 
     def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
         self.source = channel.source
@@ -36,7 +36,10 @@ class View:
         self._shown: Frame | None = None
 
     def news(self, frame: Frame) -> bool:
-        """Whether a value or the quality differs from the frame shown before; if so, this one is shown."""
+        """Return whether a value or the quality differs from the last printed frame.
+
+        If so, this frame becomes the last printed one.
+        """
         shown = self._shown
         same = shown is not None and (shown.quality, shown.reason) == (frame.quality, frame.reason)
         if shown is not None and same and not self._scan.changed(shown.image, frame.image):
@@ -46,22 +49,22 @@ class View:
 
 
 class Printer(Protocol):
-    """How things are put into lines."""
+    """Formats entries of a recording as lines."""
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """A frame's chosen values."""
+        """Format the chosen values of a frame."""
 
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
-        """An event, and what it is about."""
+        """Format an event with its registers and values."""
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """What was missed."""
+        """Format a gap."""
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """The end of a step."""
+        """Format the end of a step."""
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
-        """What has happened to a process."""
+        """Format a change of a process."""
 
 
 MAX_PLACES: Final = 4
@@ -69,7 +72,7 @@ MAX_PLACES: Final = 4
 
 
 def _where(event: Event, explained: Explained, room: int | None) -> str:
-    """The registers with their direction and values, for people; of what has no name the bytes."""
+    """Return an event's registers with direction and values as text; bytes without a name as bytes."""
     if not explained.places:
         return f"{event.size} bytes at {event.offset}" if event.size and not event.data.startswith(b"{") else ""
     way = f"/{explained.direction}" if explained.direction else ""
@@ -82,15 +85,15 @@ def _where(event: Event, explained: Explained, room: int | None) -> str:
 
 
 def _laid(laid: dict[str, Any]) -> str:
-    """How an injection is laid, as a campaign file has it; what its event says already is left out."""
+    """Return an injection's definition as text, without what the event already says."""
     return ", ".join(f"{key} = {dumps(value)}" for key, value in laid.items() if key not in ("name", "direction"))
 
 
 class JsonLines:
-    """An object a line, times in UTC."""
+    """Formats entries as one JSON object per line, with times in UTC."""
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """``values`` by path, null for all of them where the source never had any."""
+        """Format a frame with ``values`` by path; all are null if the source never had any."""
         known = frame.source_ns != 0
         values = {
             register.path: json_value(decode.decode(frame.image), register.element) if known else None
@@ -108,7 +111,7 @@ class JsonLines:
         )
 
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
-        """``event`` is its number."""
+        """Format an event; ``event`` is its number."""
         fields = {name: getattr(event, name) for name in ("cycle", "incarnation", "writer")}
         return self._line(
             time_ns,
@@ -122,17 +125,17 @@ class JsonLines:
         )
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """``missed`` is how many."""
+        """Format a gap; ``missed`` is the number of missing frames or events."""
         return self._line(
             time_ns, gap.source, missed=gap.count, what=gap.what, first=gap.first, last=gap.last, why=str(gap.reason)
         )
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """``step`` is its number, ``clock_ns`` the instance's clock after it; it is of no source."""
+        """Format a step: ``step`` is its number, ``clock_ns`` the time after it; no source."""
         return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
-        """As it is in the file."""
+        """Format a change of a process with the fields of the recording."""
         return dumps({"time": iso(time_ns), "process": msgspec.to_builtins(change)})
 
     def _line(self, time_ns: int, source: str, **fields: Any) -> str:
@@ -140,16 +143,16 @@ class JsonLines:
 
 
 class Table:
-    """A line with columns, under headings when the block is another than before."""
+    """Formats entries as lines with columns; prints headings when the block changes."""
 
     def __init__(self, room: int | None) -> None:
-        """``room``: for so many characters of a value; None: for all."""
+        """Take the maximum number of characters of a value; None for no limit."""
         self._room = room
         self._view: View | None = None
         self._widths: list[int] = []
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """The values; quality is said unless it is good."""
+        """Format a frame's values, with the quality unless it is good."""
         known = frame.source_ns != 0
         cells = [
             shown(decode.decode(frame.image) if known else None, register, self._room)
@@ -164,7 +167,7 @@ class Table:
         yield f"{local(time_ns)}  {view.source}  {frame.number:<5}  {self._row(cells)}{quality}".rstrip()
 
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
-        """Kind and reason; of a command what it is about, and whose it is; of an injection how it is laid."""
+        """Format an event: kind, reason, and the details of a command or an injection."""
         what = f"{kind_of(event)} {event.quality}" if event.kind == EventKind.QUALITY else kind_of(event)
         if where := _where(event, explained, self._room):
             what += f" {where}"
@@ -177,16 +180,16 @@ class Table:
         return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}{laid}"
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """How many, which, why."""
+        """Format a gap: how many are missing, which, and why."""
         source = printable(gap.source)
         return f"{local(time_ns)}  {source}  {gap.count} {gap.what} missed, {gap.first} to {gap.last}: {gap.reason}"
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """Number, and the time after it."""
+        """Format a step: its number, and the time after it."""
         return f"{local(time_ns)}  step {mark.step} of {mark.dt_ns / 1e6:g} ms is done: {mark.time_ns / 1e9:g} s"
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
-        """Name, what, why."""
+        """Format a change of a process: name, change and reason."""
         pid = f", pid {change.pid}" if change.pid else ""
         why = f": {printable(change.why)}" if change.why else ""
         return f"{local(time_ns)}  process {printable(change.name)} {change.what}{pid}{why}"
@@ -196,10 +199,11 @@ class Table:
 
 
 class Csv:
-    """A row for each (RFC 4180) under one heading, times in UTC.
+    """Formats entries as CSV rows (RFC 4180) under one heading, with times in UTC.
 
-    A column for each register of any block, with its source if there are several, or if another column has its name.
-    Arrays are JSON; a value is empty where the source never had any, or it is of another block.
+    Each register of any block has a column, named with its source if there are several sources or
+    another column has the same name. Arrays are JSON. A cell is empty if the source never had a
+    value, or the register belongs to another block.
     """
 
     OWN = ("time", "source", "what", "number", "quality", "text", *ABOUT)
@@ -218,7 +222,7 @@ class Csv:
         self._begun = False
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """``what`` is frame, ``text`` the reason."""
+        """Format a frame: ``what`` is frame, ``text`` the reason."""
         values = [""] * len(self._columns)
         if frame.source_ns != 0:
             names = self._names[self._views.index(view)]
@@ -227,20 +231,20 @@ class Csv:
         yield self._row(time_ns, view.source, "frame", frame.number, str(frame.quality), frame.reason, values)
 
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
-        """``what`` is its kind."""
+        """Format an event: ``what`` is its kind."""
         row = time_ns, source, kind_of(event), event.number, str(event.quality), event.text
         return self._row(*row, about=cells_of(explained, dumps))
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """``number`` is the first that is missing."""
+        """Format a gap: ``number`` is the first missing one."""
         return self._row(time_ns, gap.source, f"missed {gap.count} {gap.what}", gap.first, "", str(gap.reason))
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """Of no source."""
+        """Format a step, which has no source."""
         return self._row(time_ns, "", "step", mark.step, "", "")
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
-        """``number`` is its pid, ``text`` its name and why."""
+        """Format a change of a process: ``number`` is its pid, ``text`` its name and the reason."""
         text = f"{change.name}: {change.why}" if change.why else change.name
         return self._row(time_ns, "", f"process {change.what}", change.pid, "", text)
 

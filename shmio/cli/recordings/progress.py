@@ -1,4 +1,4 @@
-"""How far long work is, on a terminal."""
+"""Show the progress of long work on a terminal."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ EACH_S = 0.2
 
 
 class Progress:
-    """A line on standard error, if that is a terminal; gone when the work is done. A context manager."""
+    """Progress line on standard error, if that is a terminal; removed at the end.
+
+    Use it as a context manager.
+    """
 
     def __init__(self, what: str, *, silent: bool = False) -> None:
-        """``silent``: something else is shown there."""
+        """Begin; ``silent`` shows nothing, because the terminal has other output."""
         self.total = 0
         """How much there is to do: bytes, or ns of a recording."""
         self._what = what
@@ -25,7 +28,7 @@ class Progress:
         self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() and not silent else float("inf")
 
     def at(self, done: int) -> None:
-        """So much is done."""
+        """Show how much is done."""
         if time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + EACH_S
             share = f"{min(done / self.total, 1):4.0%}" if self.total else ""

@@ -31,7 +31,7 @@ LOOK_S = 0.5
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Record until Ctrl-C, the time is over, or the instance ends."""
+    """Record until Ctrl-C, the end of the time, or the end of the instance."""
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     with target(arguments).open() as segment, stop_on_signals() as stopping:
         sources = arguments.sources
@@ -79,7 +79,7 @@ def _record(
     duration_s: float | None,
     news: Reporter,
 ) -> bool:
-    """Whether it went on as long as was asked."""
+    """Record; return False if the instance ended before the requested time."""
     until_s = None if duration_s is None else time.monotonic() + duration_s
     look_s, more, problem, file = 0.0, False, "", work.file
     while True:
@@ -103,7 +103,7 @@ def _record(
 
 
 def _attachments(segment: Segment, news: Reporter) -> AttachedFiles:
-    """The files of the configuration, if the supervisor says where that is."""
+    """Return the files of the configuration, if the supervisor knows its place."""
     try:
         return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
     except (ControlError, KeyError) as error:
@@ -127,13 +127,13 @@ def _name(file: Path | None) -> str | None:
 
 
 class Reporter:
-    """Tells what goes on: on standard error in lines, or on standard output as an object a line."""
+    """Reports what happens: lines on standard error, or JSON lines on standard output."""
 
     def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json
 
     def tell(self, what: str, line: str, **fields: Any) -> None:
-        """Something has happened. A terminal that has gone away does not end the recording."""
+        """Report an event; a closed terminal does not end the recording."""
         if self._as_json:
             say_json({"what": what, **fields})
         else:

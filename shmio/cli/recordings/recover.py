@@ -1,4 +1,4 @@
-"""``shmio-dump recover``: what is whole of a damaged recording, as a new one."""
+"""``shmio-dump recover``: write the intact parts of a damaged recording to a new file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_TOLD = 1000
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Write a new, closed file with every message of every whole chunk, and tell what was lost."""
+    """Write a closed file with all messages of all intact chunks, and report what was lost."""
     file: Path = arguments.file
     path = arguments.output or file.parent / f"{file.stem}-recovered{file.suffix}"
     places: list[str] = []

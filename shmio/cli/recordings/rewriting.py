@@ -1,4 +1,4 @@
-"""What ``cut``, ``merge`` and ``recover`` have in common: they write a new recording, and verify it."""
+"""Write a new recording and verify it, for ``cut``, ``merge`` and ``recover``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def rewrite(dump: Dump, path: Path, made: str, entries: Iterable[Entry[Item]], *
 
 
 def verified(path: Path) -> list[str]:
-    """Lines about a new file that was read once more; RecordingError: it is damaged."""
+    """Read a new file completely and return lines about it; RecordingError if it is damaged."""
     found = verify(path)
     if found["damage"]:
         raise RecordingError(f"{path}: {found['damage'][0]}")

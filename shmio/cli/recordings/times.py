@@ -1,4 +1,4 @@
-"""The options ``--from`` and ``--to``."""
+"""Read the options ``--from`` and ``--to``."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from shmio.recording.reading.part import MAX_NS
 
 
 def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
-    """Log times in ns of ``--from`` and ``--to``: seconds from the recording's start, or ISO 8601, local unless told.
+    """Return the log times of ``--from`` and ``--to`` in ns; without them, everything.
 
-    Without them all there is. RecordingError for what is neither, and for an end before its beginning.
+    They are seconds from the recording's start, or ISO 8601, in local time without an offset.
+
+    Raises:
+        RecordingError: A time is invalid, or the end is before the beginning.
     """
     begin, end = arguments.begin, arguments.end
     from_ns = 0 if begin is None else _parse("--from", begin, start_ns)

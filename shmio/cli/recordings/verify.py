@@ -1,4 +1,4 @@
-"""``shmio-dump verify``: whether recordings are whole."""
+"""``shmio-dump verify``: check whether recordings are intact."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from shmio.recording.times import lost
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Read all of each file; 1 if one of them is damaged, or no recording."""
+    """Read each file completely; return 1 if one is damaged or not a recording."""
     return each(arguments, verify, lines)
 
 
 def verify(file: Path) -> dict[str, Any]:
-    """What a look at all of a file tells. OSError, RecordingError: it is no recording."""
+    """Return the result of reading a file completely; OSError, RecordingError: not a recording."""
     with Progress(f"verifying {file}") as progress, Reader(file) as reader:
         progress.total = reader.records.size
         found = check(reader, progress.at)
@@ -38,7 +38,7 @@ def verify(file: Path) -> dict[str, Any]:
 
 
 def lines(found: dict[str, Any]) -> list[str]:
-    """For people."""
+    """Return the result as lines of text."""
     whole = f"{found['chunks']} chunks and {found['messages']} messages are whole"
     if not found["chunks"]:
         whole = "nothing is recorded in it"

@@ -1,5 +1,5 @@
 """The asyncio client of ``shmio.v1``.
 
-``scripts/generate-sync-client`` makes :mod:`shmio.client.sync` of these modules, but for
-:mod:`~shmio.client.aio.transport`, which each of the two has of its own.
+``scripts/generate-sync-client`` generates :mod:`shmio.client.sync` from these modules, except for
+:mod:`~shmio.client.aio.transport`, of which each client has its own.
 """

@@ -1,4 +1,4 @@
-"""Declared injections as a program holds them."""
+"""Declared injections of a program."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ class Lift(Protocol):
     """Lifts an injection of a source by its number."""
 
     async def __call__(self, source: str, number: int) -> None:
-        """Lift it. PathError, CommandError: it cannot be."""
+        """Lift an injection; PathError, CommandError if that fails."""
 
 
 class Campaign(AsyncIterator[Happening]):
-    """What was declared. Iterate over it for what is done: it ends when nothing of it stands. For one task.
+    """Injections that were declared together.
 
-    ``declared``: in the order of the declarations, with their seeds.
+    Iterate over it for their events, in one task; the iteration ends when all injections have
+    ended. ``declared`` has the injections in the order of the declarations, with their seeds.
     """
 
     def __init__(self, stream: Stream, first: Any, lift: Lift, *, keep: bool) -> None:
@@ -35,7 +36,7 @@ class Campaign(AsyncIterator[Happening]):
 
     @classmethod
     async def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
-        """What the answers to Declare begin with."""
+        """Read the first answers to Declare, and return the campaign."""
         try:
             return cls(stream, await stream.first(), lift, keep=keep)
         except BaseException:
@@ -43,7 +44,11 @@ class Campaign(AsyncIterator[Happening]):
             raise
 
     async def __anext__(self) -> Happening:
-        """The next one, waited for. RemoteError: the record is not read fast enough, or the instance has ended."""
+        """Wait for the next event.
+
+        Raises:
+            RemoteError: The events were not read fast enough, or the instance has ended.
+        """
         while not self._happened:
             self._happened = injections.happenings(await anext(self._stream))
         happened = self._happened.pop(0)
@@ -52,14 +57,14 @@ class Campaign(AsyncIterator[Happening]):
         return happened
 
     async def close(self) -> None:
-        """Lift what stands of it, unless it is to be kept."""
+        """Lift the remaining injections, unless ``keep`` was given."""
         left, self._left = self._left, {}
         try:
             for source, number in () if self._keep else left:
-                with suppress(PathError, CommandError):  # it was over, or a reload has taken its source away
+                with suppress(PathError, CommandError):  # it has ended, or a reload removed its source
                     await self._lift(source, number)
         finally:
-            self._stream.close()  # what still stands goes with it
+            self._stream.close()  # this ends what still remains
 
     async def __aenter__(self) -> Self:
         return self

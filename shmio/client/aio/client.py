@@ -33,7 +33,7 @@ from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 
 
 class Client:
-    """An instance at the other end of a connection. Several tasks may use it. Close it, or use ``async with``.
+    """Client of an instance; several tasks may use it. Close it, or use ``async with``.
 
     It has the methods of :class:`shmio.Cell`, and more.
 
@@ -42,7 +42,7 @@ class Client:
     """
 
     def __init__(self, target: Target, timeout_s: float = 10.0) -> None:
-        """``timeout_s``: of calls that are answered at once."""
+        """Take the target, and the time limit of calls that are answered at once."""
         self.target = target
         self._channel = Channel(target, timeout_s)
         self._layouts: Mapping[str, Layout] | None = None
@@ -58,7 +58,7 @@ class Client:
         self._simulate: Any = connection.stream_stream(f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString)
 
     async def layouts(self, *sources: str) -> dict[str, BlockLayout]:
-        """The blocks of these sources, or of all, by source. PathError: no such source."""
+        """Return the layouts of these sources, or of all, by source; PathError: no such source."""
         request = wire.GetLayoutsRequest(sources=sources)
         parts = await Stream(self._channel, self._stub.GetLayouts, request, timeout_s=self._channel.timeout_s).to_list()
         return {block.source: block for block in layouts(parts)}
@@ -94,21 +94,26 @@ class Client:
         ]
 
     async def status(self) -> dict[str, Any]:
-        """How the instance and its processes are, as ``shmio-supervisor status --json`` has it."""
+        """Return the state of the instance, as ``shmio-supervisor status --json`` prints it."""
         return calls.status(await self._call(self._stub.GetStatus, wire.GetStatusRequest()))
 
     async def read(self, *patterns: str, originals: bool = False) -> Snapshot:
-        """Registers as of now: paths, elements, slices, structures, globs, or a source; of each source one frame.
+        """Read registers; those of one source come from one frame.
 
-        ``originals``: what the source delivered, too, where an injection shows something else. PathError,
-        ValueRangeError: too much for one call.
+        Args:
+            patterns: Paths, elements, slices, structures, globs, or the names of sources.
+            originals: Whether to read also the source's values beneath injections.
+
+        Raises:
+            PathError: A pattern names nothing.
+            ValueRangeError: The registers are too many for one call.
         """
         tables = Tables()
         request = calls.read_request(patterns, originals=originals, tables=())
         return Snapshot(tables.updates(await self._call(self._read, request)))
 
     async def __getitem__(self, path: str) -> Any:
-        """A register's good value; PathError, and QualityError with the reason when there is none."""
+        """Return a register's value; PathError, or QualityError with the reason if it is bad."""
         return (await self.read(path))[path]
 
     def subscribe(
@@ -119,11 +124,18 @@ class Client:
         max_rate_hz: float = 0.0,
         deadband: float = 0.0,
     ) -> Subscription:
-        """The present values of all, then what changes: see :class:`Update`. PathError comes with the first one.
+        """Subscribe to registers: the present values come first, then changes (:class:`Update`).
 
-        ``every_frame``: all frames in order, losses counted; else the newest, at most ``max_rate_hz`` a second of
-        each source, and of numbers only what differs from what came before by more than ``deadband``. ``frames``: raw
-        frames of the sources instead of values.
+        Args:
+            patterns: As for :meth:`read`.
+            every_frame: Whether to receive all frames in order, with losses counted. Otherwise
+                each update has the newest frame.
+            frames: Whether to receive raw frames of the sources instead of values.
+            max_rate_hz: Maximum number of updates per second of each source; 0 for no limit.
+            deadband: Changes of numbers up to this size are not reported.
+
+        Returns:
+            An iterator of updates. PathError comes with the first one.
         """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
@@ -137,11 +149,21 @@ class Client:
     async def write(
         self, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
     ) -> list[Outcome]:
-        """Write registers, arrays or elements of one source, all or none; what became of each, by the source.
+        """Write registers, arrays or elements of one source, all or none.
 
-        ``timeout_s``: how long the source may take until it begins; default: 2 s, or three of its cycles.
-        ``until_accepted``: do not wait for what the device says. PathError, ValueRangeError, CommandError: nothing has
-        been sent.
+        Args:
+            values: Values by path.
+            timeout_s: Time limit until the source begins to write; by default 2 s, or three of its
+                cycles.
+            until_accepted: Whether to return without waiting for the device.
+
+        Returns:
+            The outcome of each value.
+
+        Raises:
+            PathError: There is no such register; nothing was sent.
+            ValueRangeError: A value does not fit; nothing was sent.
+            CommandError: A register is not writable; nothing was sent.
         """
         request = calls.write_request(values, timeout_s, until_accepted=until_accepted)
         answer = await self._call(self._stub.Write, request, (timeout_s or 0) + calls.WRITE_PATIENCE_S)
@@ -158,12 +180,25 @@ class Client:
         for_s: float | None = None,
         originals: bool = False,
     ) -> Shadow:
-        """Lay a shadow over registers, elements, slices, structures or patterns of one source, all /out or all /in.
+        """Lay an injection over registers of one source, all of /out or all of /in.
 
-        It is lifted when it is closed, at the end of its ``async with`` block, when this program ends, or ``for_s``
-        later; with ``keep`` only when somebody lifts it. ``originals``: iterate over it for what it stands over.
-        ``ranges``: bytes and bits of a frame besides, or alone: then ``source`` says whose, as ``cell`` or
-        ``cell/in``. PathError, ValueRangeError; CommandError: the source refuses it.
+        It is lifted when it is closed, at the end of its ``async with`` block, when this program
+        ends, or after ``for_s``.
+
+        Args:
+            patterns: Registers, elements, slices, structures or globs.
+            ranges: Bytes and bits of a frame, in addition to the patterns or alone.
+            source: Source of the ranges if there is no pattern, as ``cell`` or ``cell/in``.
+            priority: Injections with a higher priority cover those with a lower one.
+            keep: Whether the injection stays until somebody lifts it.
+            name: Name in the list of injections.
+            for_s: Time in s after which it is lifted.
+            originals: Whether to receive the covered values by iteration.
+
+        Raises:
+            PathError: A pattern names nothing.
+            ValueRangeError: An argument is out of range.
+            CommandError: The source refuses the injection.
         """
         first = injection.lay(
             patterns, ranges=ranges, source=source, priority=priority, keep=keep, name=name, for_s=for_s,
@@ -176,34 +211,58 @@ class Client:
     ) -> Campaign:
         """Lay injections that their sources run by themselves, all or none: tables as ``[[injection]]`` has them.
 
-        They are lifted when it is closed, at the end of its ``async with`` block, or when this program ends; with
-        ``keep`` when they are over, or somebody lifts them. Iterate over it for what is done with them.
-        ValueRangeError: one that cannot be; CommandError: a source refuses it.
+        They are lifted when the campaign is closed, at the end of its ``async with`` block, or when
+        this program ends. Iterate over the campaign for its events.
+
+        Args:
+            declarations: Keys of ``[[injection]]`` tables.
+            keep: Whether they stay until they have ended, or somebody lifts them.
+
+        Raises:
+            ValueRangeError: A declaration is invalid.
+            CommandError: A source refuses an injection.
         """
         request = injections.declare_request(declarations, keep=keep)
         return await Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     async def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """What stands at present, on these sources or all; of each the innermost first."""
+        """Return the present injections of these sources, or of all; the innermost come first."""
         request = wire.ListInjectionsRequest(sources=sources)
         return injections.injections(await self._call(self._stub.ListInjections, request))
 
     async def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whoever laid it. PathError: there is none; CommandError: the source does not answer."""
+        """Lift an injection, whoever laid it.
+
+        Raises:
+            PathError: There is no such injection.
+            CommandError: The source does not answer.
+        """
         await self._call(self._stub.Lift, wire.LiftRequest(source=source, number=number))
 
     async def lift_all(self, *sources: str) -> list[Lifted]:
-        """The emergency: lift all of these sources, or of all, whoever laid them. CommandError: some still stand."""
+        """Lift all injections of these sources, or of all sources, whoever laid them.
+
+        Raises:
+            CommandError: Some could not be lifted.
+        """
         found = injections.lifted(await self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
         if left := [one for one in found if one.failure]:
-            raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
+            raise CommandError(f"{len(left)} of {len(found)} injections were not lifted: {left[0].failure}")
         return found
 
     async def simulation(self, source: str, name: str = "") -> Simulation:
-        """Join a source of the connector ``remote`` as its model, to be told its steps and to answer them.
+        """Join a source with the connector ``remote`` as its model, which answers its steps.
 
-        ``name``: for messages. PathError: no such source; CommandError: it has no model elsewhere; ConflictError: it
-        has another one already; LostError, RemoteError.
+        Args:
+            source: Name of the source.
+            name: Name of the model in messages.
+
+        Raises:
+            PathError: There is no such source.
+            CommandError: The source has another connector.
+            ConflictError: The source already has a model.
+            LostError: The endpoint has ended.
+            RemoteError: The endpoint cannot be reached.
         """
         return await Simulation.join(self._channel, self._simulate, source, name)
 
@@ -216,12 +275,20 @@ class Client:
         start: Callable[[Simulation], object] | None = None,
         patience_s: float = PATIENCE_S,
     ) -> None:
-        """Be the model of a source until this client is closed, or its task is interrupted.
+        """Run as the model of a source until this client is closed, or the task is interrupted.
 
-        ``step(time_s, dt_s, inputs)`` gives outputs by their paths, all or some; what it raises is the reason why the
-        step failed, which the log of ``shmio.client`` tells, too. ``start`` is called with the :class:`Simulation`
-        whenever it has joined. An instance that is not there, or goes, is waited for ``patience_s``. Errors as of
-        :meth:`simulation`.
+        Args:
+            source: Name of the source.
+            step: Called as ``step(time_s, dt_s, inputs)``; returns outputs by path, all or some. If
+                it raises an error, the step fails with this reason, which is also logged by
+                ``shmio.client``.
+            name: Name of the model in messages.
+            start: Called with the :class:`Simulation` each time the model has joined.
+            patience_s: Time in s to wait for an instance that does not run.
+
+        Raises:
+            PathError, CommandError, ConflictError, LostError, RemoteError: As for
+                :meth:`simulation`.
         """
         rejoining = Rejoining(patience_s)
         while True:
@@ -244,7 +311,7 @@ class Client:
             await sleep(RETRY_S)
 
     async def clock(self) -> Clock:
-        """How time stands."""
+        """Return the state of the clock."""
         return calls.clock((await self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
 
     async def real_sources(self) -> list[str]:
@@ -268,7 +335,11 @@ class Client:
         return await self.clock()
 
     def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
-        """Take time over, and move it by so many steps, by one call: see :class:`Steps`. ValueRangeError."""
+        """Take control of time, and do ``count`` steps by one call; see :class:`Steps`.
+
+        Raises:
+            ValueRangeError: The count or the step size is out of range.
+        """
         requests = calls.steps_requests(count, dt_s)
         return Steps(Duplex(self._channel, self._stub.Steps, *requests), count)
 
@@ -289,10 +360,17 @@ class Client:
         return await self._move(self._stub.Release, wire.ReleaseRequest())
 
     async def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
-        """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.
+        """Control the sources that play recordings, and return their state.
 
-        One that is over begins anew. ValueRangeError: a speed or a time; PathError: a source or a register;
-        CommandError: nothing is played, what is looked for is not there, or a source does not answer.
+        Args:
+            wish: Requested changes (:class:`Wish`); without any, only the state is returned. Play
+                at the end of a recording begins again.
+
+        Raises:
+            ValueRangeError: A speed or a time is out of range.
+            PathError: There is no such source or register.
+            CommandError: No recording is played, the search found nothing, or a source does not
+                answer.
         """
         found = await self._call(self._stub.Replay, replay.request(wish), replay.patience_s(wish))
         return replay.told(found)
@@ -322,7 +400,10 @@ class Client:
 
 
 class Subscription(AsyncIterator[Update]):
-    """Updates as they come; ends when it, or its client, is closed. For one task, :meth:`close` for any."""
+    """Iterator of updates, for one task; it ends when it or its client is closed.
+
+    Any task may call :meth:`close`.
+    """
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
@@ -330,9 +411,11 @@ class Subscription(AsyncIterator[Update]):
         self._waiting: Iterator[Update] = iter(())
 
     async def __anext__(self) -> Update:
-        """The next one, waited for. The arrays of its table change with the one after it.
+        """Wait for the next update; the one after it changes the arrays of its table in place.
 
-        RemoteError: the instance has ended; PathError, ValueRangeError, EndpointError: it refuses.
+        Raises:
+            RemoteError: The instance has ended.
+            PathError, ValueRangeError, EndpointError: The endpoint refuses the subscription.
         """
         while True:
             for update in self._waiting:
@@ -340,7 +423,7 @@ class Subscription(AsyncIterator[Update]):
             self._waiting = self._tables.all_of(await anext(self._stream))
 
     def close(self) -> None:
-        """End it."""
+        """End the subscription."""
         self._stream.close()
 
     async def __aenter__(self) -> Self:

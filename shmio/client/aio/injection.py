@@ -1,4 +1,4 @@
-"""An injection as a program holds it."""
+"""An injection of a program."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from shmio.model.outcome import Outcome
 
 
 class Shadow(AsyncIterator[Update]):
-    """An injection that stands. Several tasks may give values; one may iterate over the originals.
+    """A present injection; several tasks may give values, and one may iterate over the originals.
 
-    ``table``: the registers that it stands over, and the originals by now.
+    ``table`` has the registers that it covers, with the latest originals.
     """
 
     def __init__(self, channel: Channel, stream: Duplex, held: injection.Held) -> None:
@@ -34,7 +34,7 @@ class Shadow(AsyncIterator[Update]):
 
     @classmethod
     async def lay(cls, channel: Channel, method: Any, first: bytes) -> Self:
-        """Lay it; what :meth:`Client.inject` says."""
+        """Lay an injection; see :meth:`Client.inject`."""
         stream = Duplex(channel, method, first)
         try:
             return cls(channel, stream, injection.Held(await stream.first()))
@@ -48,9 +48,18 @@ class Shadow(AsyncIterator[Update]):
         arrays: injection.Arrays | None = None,
         raw: injection.Raw = (),
     ) -> list[Outcome]:
-        """Give values by path, by the columns of ``table``, or as raw bytes; wait for what became of them.
+        """Give values, and wait for their outcomes.
 
-        PathError, ValueRangeError; CommandError: it was lifted; RemoteError.
+        Args:
+            values: Values by path.
+            arrays: Values by the columns of ``table``.
+            raw: Values as raw bytes.
+
+        Raises:
+            PathError: The injection does not cover a path.
+            ValueRangeError: A value does not fit its register.
+            CommandError: The injection was lifted.
+            RemoteError: The instance has ended.
         """
         values, raw = values or {}, list(raw)
         async with self._turn:
@@ -76,14 +85,17 @@ class Shadow(AsyncIterator[Update]):
         arrays: injection.Arrays | None = None,
         raw: injection.Raw = (),
     ) -> None:
-        """The same without waiting. A value that is wrong ends the injection, which the next call tells."""
+        """Give values as in :meth:`set`, without waiting for their outcomes.
+
+        A wrong value ends the injection; the next call raises the error.
+        """
         async with self._turn:
             self._check()
             _, data = self._held.request(values or {}, arrays, raw, answered=False)
         await self._stream.write(data)
 
     async def __anext__(self) -> Update:
-        """The next original, waited for; ends when it is over. Asked for with ``originals``."""
+        """Wait for the next original, if ``originals`` was given; ends with the injection."""
         async with self._turn:
             if not self._updates:
                 await self._turn.wait_until(lambda: self._held.waits or self._over)
@@ -118,7 +130,7 @@ class Shadow(AsyncIterator[Update]):
                 self._turn.notify_all()
 
     async def close(self) -> None:
-        """Lift it, unless it is to be kept."""
+        """Lift the injection, unless ``keep`` was given."""
         await self._stream.finish()
         await self._reading.join(self._channel.timeout_s)
         self._stream.close()

@@ -1,4 +1,4 @@
-"""A model as its program serves it."""
+"""The model of a source, computed by a program."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from shmio.client.model import Member, Part, Rejoining, Work
 
 
 class Simulation(Member, AsyncIterator[Work]):
-    """A source that this program computes: iterate over the steps, and answer each. Close it, or use ``async with``.
+    """A source that this program computes: iterate over the steps, and answer each.
 
-    For one task, :meth:`close` for any.
+    Close it, or use ``async with``. Only :meth:`close` may be called from other tasks.
     """
 
     def __init__(self, stream: Duplex, part: Part) -> None:
@@ -22,7 +22,7 @@ class Simulation(Member, AsyncIterator[Work]):
 
     @classmethod
     async def join(cls, channel: Channel, method: Any, source: str, name: str) -> Self:
-        """Join a source; what :meth:`Client.simulation` says."""
+        """Join a source; see :meth:`Client.simulation`."""
         stream = Duplex(channel, method, model.join(source, name))
         try:
             return cls(stream, Part(await anext(stream, None)))
@@ -31,26 +31,30 @@ class Simulation(Member, AsyncIterator[Work]):
             raise
 
     async def __anext__(self) -> Work:
-        """The next step, waited for; ends when it, or its client, is closed.
+        """Wait for the next step; the iteration ends when this object or its client is closed.
 
-        LostError: the endpoint has ended, or a reload has changed the source; RemoteError.
+        Raises:
+            LostError: The endpoint has ended, or a reload has changed the source.
+            RemoteError: The connection failed otherwise.
         """
         self._work = self._part.take(await anext(self._stream))
         return self._work
 
     async def done(self, outputs: Mapping[str, object]) -> None:
-        """Answer the present step with outputs by their paths; those that are left out keep what they have.
+        """Answer the present step with outputs by path; outputs that are left out keep their values.
 
-        PathError, ValueRangeError: nothing has been sent.
+        Raises:
+            PathError: There is no such output; nothing was sent.
+            ValueRangeError: A value does not fit; nothing was sent.
         """
         await self._answer(self._part.done(self._present(), outputs))
 
     async def fail(self, reason: str) -> None:
-        """Answer the present step: it has failed, and why. Nothing of it is shown."""
+        """Answer that the present step has failed; the outputs stay as they are."""
         await self._answer(self._part.failed(self._present(), reason))
 
     async def compute(self, work: Work, step: Step, rejoining: Rejoining) -> None:
-        """Answer a step with what a program's code says to it, and with what that raises."""
+        """Call a program's function for a step, and answer with its outputs or its error."""
         rejoining.heed(self._part, work)
         try:
             outputs = await outputs_of(step(work.time_s, work.dt_s, work.inputs))
@@ -64,7 +68,7 @@ class Simulation(Member, AsyncIterator[Work]):
         await self._stream.write(data)
 
     def close(self) -> None:
-        """Leave: steps fail until another joins."""
+        """Leave the source; steps fail until another model joins."""
         self._stream.close()
 
     async def __aenter__(self) -> Self:

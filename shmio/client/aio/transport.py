@@ -27,7 +27,7 @@ sleep: Final = asyncio.sleep
 
 
 async def outputs_of(found: Outputs | Awaitable[Outputs]) -> Outputs:
-    """What a step has computed."""
+    """Return the outputs of a step, awaiting them if necessary."""
     return await found if inspect.isawaitable(found) else found
 
 
@@ -53,7 +53,11 @@ class Channel:
 
 
 class Stream(AsyncIterator[Any]):
-    """The answers to one request; ends when it, or its channel, is closed. ShmioError: why the endpoint ended it."""
+    """Answers to one request; the iteration ends when the stream or its channel is closed.
+
+    Raises:
+        ShmioError: The endpoint ended the stream.
+    """
 
     def __init__(self, channel: Channel, method: Any, *request: Any, timeout_s: float | None = None) -> None:
         self._channel = channel
@@ -73,7 +77,7 @@ class Stream(AsyncIterator[Any]):
         return found
 
     async def first(self) -> Any:
-        """The first answer, None if it was closed. RemoteError: there is none in time; when more come nobody knows."""
+        """Return the first answer, or None if the stream was closed; RemoteError after a time-out."""
         try:
             async with asyncio.timeout(calls.WRITE_PATIENCE_S):
                 return await anext(self, None)
@@ -81,25 +85,25 @@ class Stream(AsyncIterator[Any]):
             raise calls.unanswered(self._channel.target) from None
 
     async def to_list(self) -> list[Any]:
-        """All of them. RemoteError: the channel was closed meanwhile."""
+        """Return all answers; RemoteError if the channel is closed meanwhile."""
         found = [one async for one in self]
         if self._channel.closed:
             raise RemoteError(f"{self._channel.target.address}: the client was closed")
         return found
 
     def close(self) -> None:
-        """End it."""
+        """End the stream."""
         self._closed = True
         self._call.cancel()
 
 
 class Duplex(Stream):
-    """A stream that takes further requests; the first ones go with the first use."""
+    """A stream that sends further requests; the first ones are sent at its first use."""
 
     def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
         super().__init__(channel, method)
         self._first = first
-        self._turn = asyncio.Lock()  # gRPC takes one message after the other
+        self._turn = asyncio.Lock()  # gRPC accepts one message at a time
 
     async def __anext__(self) -> Any:
         if self._first:
@@ -107,7 +111,7 @@ class Duplex(Stream):
         return await super().__anext__()
 
     async def write(self, *requests: Any) -> None:
-        """Send requests. If the stream is over they are dropped: reading says why."""
+        """Send requests; they are dropped if the stream has ended, and reading raises the reason."""
         async with self._turn:
             requests, self._first = (*self._first, *requests), ()
             with suppress(grpc.RpcError, asyncio.InvalidStateError), _closing():
@@ -115,14 +119,14 @@ class Duplex(Stream):
                     await self._call.write(request)
 
     async def finish(self) -> None:
-        """Say that no more requests follow."""
+        """Tell the endpoint that no more requests follow."""
         with suppress(grpc.RpcError, asyncio.InvalidStateError), _closing():
             await self._call.done_writing()
 
 
 @contextmanager
 def _closing() -> Iterator[None]:
-    """Suppress the cancellation of a call by close; that of the task goes on."""
+    """Suppress the cancellation of a call by close, but not that of the task."""
     try:
         yield
     except asyncio.CancelledError:
@@ -131,10 +135,10 @@ def _closing() -> Iterator[None]:
 
 
 class Condition(asyncio.Condition):
-    """Has several wait for each other."""
+    """Condition with a time-out, on which several tasks wait for each other."""
 
     async def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait for it; whether it has come true in time."""
+        """Wait until the predicate is true; return whether it became so in time."""
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await self.wait_for(predicate)
@@ -148,5 +152,5 @@ class Background:
         self._task = asyncio.get_running_loop().create_task(run(), name=name)
 
     async def join(self, timeout_s: float | None = None) -> None:
-        """Wait for its end, at most so long."""
+        """Wait for its end, at most ``timeout_s``."""
         await asyncio.wait((self._task,), timeout=timeout_s)

@@ -13,24 +13,26 @@ from shmio.errors import CommandError, ShmioError
 
 
 class Steps(Iterator[Stepped]):
-    """Steps of time on one stream, which costs less than a call for each. Close it, or use ``with``.
+    """Steps of time on one stream, which costs less than one call for each step.
 
-    For one thread. Iterate over it for those that :meth:`Client.steps` has asked for, in their order: each when all
-    streams have what has changed in it, while the next ones go on; and, for a program that does something between
-    them, :meth:`step`.
+    Close it, or use ``with``; use it in one thread. Iterate over the steps that
+    :meth:`Client.steps` requested. Each comes when all streams have its changes, while the next
+    steps are already being computed. To do something between steps, call :meth:`step` instead.
     """
 
     def __init__(self, stream: Duplex, count: int) -> None:
-        """``count``: how many steps the stream has asked for."""
+        """Take the stream, and the number of steps that it has requested."""
         self._stream = stream
         self._left = count
         self._waiting: Iterator[Any] = iter(())
 
     def __next__(self) -> Stepped:
-        """The next one that is done, waited for; ends when all that were asked for are.
+        """Wait for the next finished step; the iteration ends after all requested steps.
 
-        CommandError: it failed, or another program owns time, and none of those behind it is done; ValueRangeError,
-        RemoteError.
+        Raises:
+            CommandError: The step failed, or another program owns time; no later step is done.
+            ValueRangeError: The step size is out of range.
+            RemoteError: The connection failed.
         """
         if not self._left:
             raise StopIteration
@@ -45,18 +47,18 @@ class Steps(Iterator[Stepped]):
                 raise
 
     def step(self, dt_s: float | None = None) -> Stepped:
-        """Do one more, and wait for it, and for those that were asked for before. Errors as of iterating."""
+        """Do one more step, and wait for it and all earlier ones; errors as for iteration."""
         self._stream.write(*calls.steps_requests(1, dt_s))
         self._left += 1
         last = None
         for done in self:
             last = done
         if last is None:
-            raise CommandError("the steps were closed: none is done any more")
+            raise CommandError("the steps were closed")
         return last
 
     def close(self) -> None:
-        """Ask for no more: a step that was begun is done, those behind it are not."""
+        """Cancel the requested steps, except one that has begun."""
         self._left = 0
         self._stream.close()
 

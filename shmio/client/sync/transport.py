@@ -24,7 +24,7 @@ sleep: Final = time.sleep
 
 
 def outputs_of(found: Outputs) -> Outputs:
-    """What a step has computed."""
+    """Return the outputs of a step."""
     return found
 
 
@@ -50,7 +50,11 @@ class Channel:
 
 
 class Stream(Iterator[Any]):
-    """The answers to one request; ends when it, or its channel, is closed. ShmioError: why the endpoint ended it."""
+    """Answers to one request; the iteration ends when the stream or its channel is closed.
+
+    Raises:
+        ShmioError: The endpoint ended the stream.
+    """
 
     def __init__(self, channel: Channel, method: Any, request: Any, *, timeout_s: float | None = None) -> None:
         self._channel = channel
@@ -66,7 +70,7 @@ class Stream(Iterator[Any]):
             self._channel.target.fail(error)
 
     def first(self) -> Any:
-        """The first answer, None if it was closed. RemoteError: there is none in time; when more come nobody knows."""
+        """Return the first answer, or None if the stream was closed; RemoteError after a time-out."""
         late = threading.Event()
 
         def give_up() -> None:
@@ -87,20 +91,20 @@ class Stream(Iterator[Any]):
             timer.join()
 
     def to_list(self) -> list[Any]:
-        """All of them. RemoteError: the channel was closed meanwhile."""
+        """Return all answers; RemoteError if the channel is closed meanwhile."""
         found = list(self)
         if self._channel.closed:
             raise RemoteError(f"{self._channel.target.address}: the client was closed")
         return found
 
     def close(self) -> None:
-        """End it."""
+        """End the stream."""
         self._closed = True
         self._call.cancel()
 
 
 class Duplex(Stream):
-    """A stream that takes further requests; the first ones go at once."""
+    """A stream that sends further requests; the first ones are sent at once."""
 
     def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -115,30 +119,30 @@ class Duplex(Stream):
             raise
 
     def write(self, *requests: Any) -> None:
-        """Send requests. If the stream is over they are dropped: reading says why."""
+        """Send requests; they are dropped if the stream has ended, and reading raises the reason."""
         for request in requests:
             self._requests.put(request)
 
     def finish(self) -> None:
-        """Say that no more requests follow."""
+        """Tell the endpoint that no more requests follow."""
         self._requests.put(None)
 
     def close(self) -> None:
-        """End it."""
+        """End the stream."""
         self.finish()
         super().close()
 
 
 class Condition(threading.Condition):
-    """Has several wait for each other."""
+    """Condition with a time-out, on which several threads wait for each other."""
 
     def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait for it; whether it has come true in time."""
+        """Wait until the predicate is true; return whether it became so in time."""
         return self.wait_for(predicate, timeout_s)
 
 
 class Background(threading.Thread):
-    """A function that runs beside the program, and does not keep it from ending."""
+    """Daemon thread that runs a function, and does not keep the program from ending."""
 
     def __init__(self, run: Callable[[], None], name: str) -> None:
         super().__init__(target=run, name=name, daemon=True)

@@ -54,18 +54,20 @@ def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str
         if not colon or not user.strip() or not secret:
             raise ConfigError(f"{KEY}: {name}: line {number}: expected name:password")
         if user in accounts:
-            raise ConfigError(f"{KEY}: {name}: line {number}: this name has a line already")
+            raise ConfigError(f"{KEY}: {name}: line {number}: this name is given twice")
         if user != user.strip() or secret != secret.strip():
-            raise ConfigError(f"{KEY}: {name}: line {number}: a blank beside the colon, or at an end, would count")
+            raise ConfigError(
+                f"{KEY}: {name}: line {number}: a blank next to the colon, or at an end, would be a part of it"
+            )
         known = _is_hash(secret)
         if not known and _HASH.match(secret):
             raise ConfigError(
-                f"{KEY}: {name}: line {number}: a hash of a kind that is not known here, or a damaged one: use "
+                f"{KEY}: {name}: line {number}: an unknown or damaged hash: use "
                 "mosquitto_passwd -H sha512-pbkdf2, or write the password itself"
             )
         accounts[user] = secret if known else hashed(secret)
     if not accounts:
-        raise ConfigError(f"{KEY}: {name}: it has no account: a line each, name:password")
+        raise ConfigError(f"{KEY}: {name}: it has no accounts; expected lines name:password")
     for index, account in enumerate(roles):
         if account.name is not None and account.name not in accounts:
             raise ConfigError(f"mqtt.account[{index}].name: {account.name!r} has no line in {name}")

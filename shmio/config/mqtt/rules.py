@@ -118,7 +118,7 @@ def _check_external(mqtt: Mqtt) -> None:
         )
     for address in brokers(mqtt):
         if not (address.loopback or mqtt.tls or mqtt.insecure):
-            _refuse_plain_text("mqtt.host", f"{address} would be spoken to in plain text over the network")
+            _refuse_plain_text("mqtt.host", f"{address} would get plain text over the network")
     if mqtt.password_file is not None and mqtt.username is None:
         raise ConfigError("mqtt.username: a password_file needs it: the password is this user's")
     if mqtt.tls and (mqtt.tls.certificate is None) != (mqtt.tls.key is None):
@@ -154,7 +154,11 @@ def _check_accounts(mqtt: Mqtt, instance: str) -> None:
     for index, account in enumerate(mqtt.account):
         key = f"mqtt.account[{index}]"
         if account.name in names:
-            whose = "one without a name, for who shows no account," if account.name is None else repr(account.name)
+            whose = (
+                "the account without a name, for clients that do not log in,"
+                if account.name is None
+                else repr(account.name)
+            )
             raise ConfigError(f"{key}.name: {whose} is already {names[account.name]}")
         names[account.name] = key
         if account.name is not None and mqtt.password_file is None:
@@ -173,12 +177,12 @@ def _check_filter(key: str, topics: str, own: Sequence[str]) -> None:
     wild = any(set("+#").intersection(level) and level not in ("+", "#") for level in levels)
     if wild or "#" in levels[:-1] or topics.startswith("$") or len(topics) > MAX_PREFIX or _is_no_text(topics):
         raise ConfigError(
-            f"{key}: {topics!r} is no filter of topics: at most {MAX_PREFIX} characters, no $ at its beginning, + and "
+            f"{key}: {topics!r} is not a topic filter: at most {MAX_PREFIX} characters, no $ at its beginning, + and "
             "# as a whole level each, and # as the last; such as homeassistant/#"
         )
     for one in own:
         if _overlap(levels, one.split("/")):
-            raise ConfigError(f"{key}: {topics!r} would have others publish on the instance's own topics, {one}")
+            raise ConfigError(f"{key}: {topics!r} would let others publish on the instance's own topics, {one}")
 
 
 def _overlap(one: Sequence[str], other: Sequence[str]) -> bool:

@@ -60,4 +60,6 @@ def _show(context: ssl.SSLContext, tls: MqttTls) -> None:
     try:
         load_pair(context, certificate, key, "mqtt.tls")
     except ssl.SSLError as error:
-        raise ConfigError(f"mqtt.tls: {certificate} and {key} are no certificate and its key{detail(error)}") from None
+        raise ConfigError(
+            f"mqtt.tls: {certificate} and {key} are not a certificate and its key{detail(error)}"
+        ) from None

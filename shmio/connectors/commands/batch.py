@@ -161,7 +161,7 @@ def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[
 
     """
     if len(outcomes) != len(writes):
-        raise ConnectorError(f"the connector tells {len(outcomes)} outcomes of {len(writes)} writes")
+        raise ConnectorError(f"the connector returned {len(outcomes)} outcomes for {len(writes)} writes")
     return outcomes
 
 

@@ -57,7 +57,6 @@ class FiniteCheck:
             if len(wrong):
                 path = path_at(self._layout, int(wrong[0]))
                 return (
-                    f"{path}: NaN and infinities are not written, unless the source's `allow_nonfinite` names the "
-                    "register"
+                    f"{path}: NaN and infinities are written only if the source's `allow_nonfinite` names the register"
                 )
         return ""

@@ -183,7 +183,7 @@ class CommandProcessor:
         return [item for item, wanted in kinds if wanted]
 
     def _expire(self, items: Sequence[Item]) -> None:
-        self._end(items, [(EventKind.EXPIRED, "no cycle came before its deadline")] * len(items))
+        self._end(items, [(EventKind.EXPIRED, "no cycle began before its deadline")] * len(items))
 
     def _patience_ns(self) -> int:
         """Return the time until the next deadline or regular check, in ns.
@@ -221,8 +221,8 @@ class CommandProcessor:
         now_ns = time.monotonic_ns()
         if now_ns - self._garbage_ns.get(writer, -TELL_NS) >= TELL_NS:
             self._garbage_ns[writer] = now_ns
-            log.warning("writer %d sends what is no command: %s", writer, error)
-            self._writer.event(Record(EventKind.REJECTED, f"not a command: {error}", writer))
+            log.warning("writer %d sent an invalid command: %s", writer, error)
+            self._writer.event(Record(EventKind.REJECTED, f"invalid command: {error}", writer))
 
     def _judge(self, command: Command) -> bool:
         """Accept or reject a command; return False if it must wait for room."""
@@ -290,7 +290,7 @@ class CommandProcessor:
     def _refusal(self, command: Command) -> str:
         """Return why a command is not accepted; empty if it is."""
         if command.incarnation != self._writer.incarnation:
-            return "it was meant for the source's process before this one, which ended: try again"
+            return "it was for an earlier process of the source, which has ended: try again"
         late_ns = self._now_ns() - command.deadline_ns
         if late_ns > 0:
             return f"it came {late_ns / 1e6:.0f} ms after its deadline"

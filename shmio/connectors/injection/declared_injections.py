@@ -141,7 +141,7 @@ class DeclaredInjections:
             program = self._program(running.declaration)
             layer = resumed(declared(standing.number, program, owner, running.seed, keep=standing.keep), running, seen)
         except (ConfigError, ValueError) as error:
-            log.warning("injection %s is not gone on with: %s", standing.name, error)
+            log.warning("injection %s is not continued: %s", standing.name, error)
             return
         self._publisher.restore(layer)
         self._settle()
@@ -178,7 +178,9 @@ class DeclaredInjections:
         wanted = {declaration.name: declaration for declaration in self._own.declared.read()}
         stale = {x.id for x in self._layers if x.configured and wanted.get(x.name) != x.program.declaration}
         if stale:
-            self._publisher.lift(lambda layer: layer.id in stale, "the configuration has it no more, or otherwise")
+            self._publisher.lift(
+                lambda layer: layer.id in stale, "the configuration no longer has it, or has changed it"
+            )
             self.settle()
         there = {layer.name for layer in self._layers if layer.configured}
         for declaration in wanted.values():
@@ -246,7 +248,7 @@ class DeclaredInjections:
             try:
                 condition = compile_condition(layer.program.declaration.when or "", layouts)
             except ConfigError as error:
-                log.warning("injection %s waits for ever, until the configuration is changed: %s", layer.name, error)
+                log.warning("injection %s cannot start until the configuration is changed: %s", layer.name, error)
                 condition = NEVER
             with self._output.turn:
                 layer.program = replace(layer.program, condition=condition)

@@ -107,7 +107,7 @@ class LayerStack:
         if any(layer.id == injection.id for layer in self.layers):
             return f"there is an injection {injection.id} already"
         if len(self.layers) >= MAX_INJECTIONS:
-            return f"{MAX_INJECTIONS} injections stand on this source already: lift one"
+            return f"{MAX_INJECTIONS} injections cover this source already, the maximum: lift one"
         place = sum(layer.priority <= injection.priority for layer in self.layers)
         self.layers.insert(place, injection)
         return ""

@@ -83,7 +83,7 @@ class Output:
 
     @property
     def base(self) -> bytes:
-        """The image to which injections are applied: :attr:`raw`, in a replay the recorded one."""
+        """Image beneath injections: :attr:`raw`, or the recorded image in a replay."""
         return self.raw if self._last is None else self._last.base
 
     @property

@@ -72,7 +72,7 @@ class InjectionProcessor:
         if command.kind in (CommandKind.INJECT, CommandKind.DECLARE):
             owner = self._owner_of(command.writer)
             if owner is None:
-                return "nobody has the command queue that it came by"
+                return "the command queue that it came by has no owner"
             if command.kind is CommandKind.DECLARE:
                 return self.declared.declare(command, owner)
             return self._lay(command, owner)
@@ -126,7 +126,7 @@ class InjectionProcessor:
 
     def _shadow(self, layer: Layer, command: Command) -> str:
         if isinstance(layer, DeclaredLayer):
-            return f"the injection {layer.name} is declared: it takes no values from others"
+            return f"the injection {layer.name} is declared: clients cannot give it values"
         with self._output.turn:
             if reason := shadow(layer, command.writes):
                 return reason

@@ -50,7 +50,7 @@ class LayerPublisher:
             if self._refuse_in:
                 return self._refuse_in
             if (layer.cover & ~self._writable).any():
-                return "it covers what is not writable; name that in the source's `writable`"
+                return "it covers registers that are not writable; name them in the source's `writable`"
         if reason := self.injections.lay(layer):
             return reason
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())

@@ -54,7 +54,9 @@ class Inputs:
             frame, reason = frames[block.source]
             value = None if frame is None else decoder.decode(frame.image)
             if holds_none(value):
-                missing.append(f"input {path} keeps its value: {block.source}: {reason or 'the bytes are no value'}")
+                missing.append(
+                    f"input {path} keeps its value: {block.source}: {reason or 'the bytes are not a valid value'}"
+                )
             else:
                 values[path] = value
         return values, "; ".join(missing)

@@ -167,7 +167,7 @@ class Remote(Computed):
                 raise ConnectorError(STOPPED)
             if gone:
                 raise ConnectorError(
-                    f"model {model.name!r} was gone before it had answered; the next step works when one is connected"
+                    f"model {model.name!r} disconnected before it answered; the next step works once one is connected"
                 )
             rest_ns = until_ns - time.monotonic_ns()
             if rest_ns <= 0:

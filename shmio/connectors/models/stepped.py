@@ -20,7 +20,7 @@ from shmio.model.clock import Clock
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 from shmio.segment.clock import ClockPage
 
-RESTARTED: Final = "its process was started anew within this step; it goes on with the next one"
+RESTARTED: Final = "its process was restarted during this step; it continues with the next one"
 
 
 class StepClock(Protocol):

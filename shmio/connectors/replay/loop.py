@@ -57,20 +57,20 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
 
     """
     if ask.speed is not None and not (math.isfinite(ask.speed) and MIN_SPEED <= ask.speed <= MAX_SPEED):
-        raise ValueRangeError(f"a speed is from {MIN_SPEED:g} to {MAX_SPEED:g}, not {ask.speed:g}")
+        raise ValueRangeError(f"the speed must be from {MIN_SPEED:g} to {MAX_SPEED:g}, not {ask.speed:g}")
     if not -MAX_NS < ask.clock_ns <= clock_ns + AHEAD_NS:
-        raise ValueRangeError("the request makes no sense")
+        raise ValueRangeError("invalid request")
     play = play.anchored(ask.clock_ns)
     position_ns, paused = ask.position_ns, play.paused if ask.paused is None else ask.paused
     if position_ns is None and not paused and play.position_ns >= play.end_ns:
         position_ns = play.begin_ns  # from the end it goes on at the beginning
     if position_ns is not None and not play.begin_ns <= position_ns <= play.end_ns:
         length_s = (play.end_ns - play.begin_ns) / 1e9
-        raise ValueRangeError(f"that is not within what is played, which is {length_s:.3f} s long")
+        raise ValueRangeError(f"that time is outside the played part, which is {length_s:.3f} s long")
     at_ns = play.position_ns if position_ns is None else position_ns
     if ask.until_ns is not None and ask.until_ns < at_ns:
         at_s = (at_ns - play.begin_ns) / 1e9
-        raise ValueRangeError(f"that is past: it is at {at_s:.3f} s; seek to before that first")
+        raise ValueRangeError(f"that time has passed: the replay is at {at_s:.3f} s; seek to before that first")
     until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
     if ask.until_ns is None and position_ns is None and (ask.paused is None or play.until_ns > at_ns):
         until_ns = play.until_ns  # `pause` and `play` keep one that lies ahead
@@ -119,7 +119,7 @@ class Search:
         for _ in range(SEARCH_PIECE):
             entry = next(self._entries, None)
             if entry is None or entry.position_ns >= self._end_ns:
-                return PlayheadAnswer(f"there is no {self._what} from here to the end of what is played")
+                return PlayheadAnswer(f"there is no {self._what} between here and the end of the played part")
             if self._matches(entry):
                 return PlayheadAnswer(position_ns=entry.position_ns)
         return None
@@ -130,7 +130,7 @@ def _event_matcher(name: str, *, keep: bool) -> Callable[[Entry], bool]:
     if name == ANY:
         return lambda entry: isinstance(entry.item, Event) and is_replayed(entry.item, keep=keep)
     if name not in kinds:
-        raise PathError(f"event {shorten(name, 16)!r} is none of {', '.join(kinds)}, {ANY}")
+        raise PathError(f"event {shorten(name, 16)!r} is unknown; valid: {', '.join(kinds)}, {ANY}")
     return lambda entry: isinstance(entry.item, Event) and entry.item.kind == kinds[name]
 
 
@@ -340,7 +340,7 @@ class ReplayLoop:
         left_out = behind_ns // self._source.recorded.block.period_ns
         self.counters.overruns += left_out
         if too_late:  # else the speed is too high, and the line would repeat
-            log.warning("%d frames were left out: this process was held up for %.1f s", left_out, late_ns / 1e9)
+            log.warning("%d frames were skipped: this process was delayed by %.1f s", left_out, late_ns / 1e9)
         if play.wraps:
             self._keep(play.settled(clock_ns))
         self._player.show(min(self._play.at_ns(clock_ns), play.end_ns - 1), self._stamp)
@@ -358,7 +358,7 @@ class ReplayLoop:
         self._head.write(play)
 
     def _refuse(self, writes: Sequence[Write]) -> list[str]:
-        return [f"source {self._writer.block.source} is a replay: nothing is written"] * len(writes)
+        return [f"source {self._writer.block.source} replays a recording: it cannot be written"] * len(writes)
 
     # ---- what others ask for -------------------------------------------------------------------------------------
 
@@ -390,7 +390,7 @@ class ReplayLoop:
         if isinstance(ask, FindRequest):
             return self._find(number, ask)
         if not isinstance(ask, MoveRequest):
-            found = PlayheadAnswer("the request makes no sense")
+            found = PlayheadAnswer("invalid request")
         elif missed and ask.clock_ns <= self._play.anchor_ns:
             found = PlayheadAnswer()  # the others' play includes it
         else:

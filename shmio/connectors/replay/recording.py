@@ -86,7 +86,7 @@ class Recording:
             for block in self._dump.blocks
         )
         if not even or max(self.utc_ns, *map(abs, self.whole)) > MAX_NS:
-            raise RecordingError(f"{self._file} has times that make no sense: it cannot be played")
+            raise RecordingError(f"{self._file} has invalid times: it cannot be played")
 
     def _measured(self, name: str) -> Span | None:
         """Return the span of a source's frames in UTC, one period added at the end.
@@ -159,7 +159,7 @@ class Recording:
         if any(block.layout_hash != last.layout_hash for block in played):
             at_s = (last.begin_ns - self.utc_ns - self.whole.begin_ns) / 1e9
             raise RecordingError(
-                f"source {source}: its layout was changed within what is to be played, at {at_s:.3f} s: end before "
+                f"source {source}: its layout changes within the part to play, at {at_s:.3f} s: end before "
                 "that, or start there"
             )
         return RecordedSource(self._dump, self._damage, last, self.utc_ns)

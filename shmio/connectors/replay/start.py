@@ -75,9 +75,9 @@ def _is_of(source: Replay, play: PlayState) -> bool:
 
 
 def as_others(source: Replay, heads: Iterable[Playhead]) -> PlayState | None:
-    """Return the play of the sources of the same recording, as it was moved last.
+    """Return the replay state of the other sources of the same recording, as last requested.
 
-    None if there are none.
+    None if there are no other sources.
     """
     plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
     return max(plays, key=lambda play: play.anchor_ns, default=None)

@@ -24,7 +24,9 @@ class S7Connector(Connector):
     def __init__(self, options: S7Options, layout: Layout) -> None:
         number = options.dbNumber if options.dbNumber is not None else layout.number
         if number is None:
-            raise ConfigError(f"dbNumber: this key is needed, for the layout {layout.name!r} has no number in its name")
+            raise ConfigError(
+                f"dbNumber: this key is needed, because the layout {layout.name!r} has no number in its name"
+            )
         if layout.byte_order != "big":
             raise ConfigError(f"layout: {layout.name!r} is in little-endian byte order, a controller's block is not")
         self._client = S7Client(options, number, layout.size)

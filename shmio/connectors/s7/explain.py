@@ -20,10 +20,7 @@ _ACCESS_DENIED = (
     "access denied {where}: enable 'Permit access with PUT/GET communication' and 'Full access' in the CPU's "
     f"protection settings; if they are, {_NO_OPTIMIZED}"
 )
-_PROTECTED = (
-    "the CPU's protection level forbids it {where}: choose 'Full access' in its protection settings, for it asks for a "
-    "password"
-)
+_PROTECTED = "the CPU's protection level forbids it {where}: choose 'Full access' in its protection settings"
 
 # Errors of a whole job for which the table of python-snap7 has less to say.
 _ERRORS = {

@@ -43,12 +43,10 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
 
     def __post_init__(self) -> None:
         if not _is_host(self.host):
-            raise ValueError(
-                f"host: {self.host!r} is no host name or address; write it without port: that is a key of its own"
-            )
+            raise ValueError(f"host: {self.host!r} is not a host name or address; give the port in the key port")
         if self.model is not None and _family(self.model) not in _CPU_SLOT:
             raise ValueError(
-                f"model: {self.model!r} is none; there are: {', '.join(_CPU_SLOT)}{meant(self.model, _CPU_SLOT)}"
+                f"model: {self.model!r} is unknown; valid: {', '.join(_CPU_SLOT)}{meant(self.model, _CPU_SLOT)}"
             )
 
     @property

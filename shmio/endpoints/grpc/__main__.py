@@ -101,7 +101,7 @@ async def _serve(worker: Worker) -> None:
         if not server.alive:
             _end_now(worker)
         if not (feeds.alive and services.stepper.alive):
-            raise RuntimeError("something ended that should not have; the endpoint starts anew")
+            raise RuntimeError("a task ended unexpectedly; the endpoint restarts")
         trimmer.look(server.unknown)
         services.stepper.timeline.look()
         streams, dropped, published, refused = services.counters
@@ -150,7 +150,7 @@ def _settings(worker: Worker) -> tuple[Grpc, _Place]:
 
 
 async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: Server, turn: asyncio.Lock) -> None:
-    """Read tokens and roles anew, and end the calls that they no longer allow."""
+    """Reload tokens and roles, and end the calls that they no longer allow."""
     async with turn:  # of two reloads, the one that reads later must win
         try:
             config = await asyncio.to_thread(load, file)
@@ -163,7 +163,7 @@ async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: S
         ended = server.calls.review()
     if not (ended or config.grpc.guarded):
         return  # there are none, and it is likely that there were none
-    worker.log.info("took tokens and roles anew", extra=fields(tokens=len(config.grpc.token), calls_ended=ended))
+    worker.log.info("reloaded tokens and roles", extra=fields(tokens=len(config.grpc.token), calls_ended=ended))
 
 
 if __name__ == "__main__":

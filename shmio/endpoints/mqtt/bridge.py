@@ -220,8 +220,8 @@ class Bridge:
     def correct(self, topic: str) -> None:
         """Publish our value on a topic again, or delete what another client has left there."""
         log.warning(
-            "another client publishes on %s, which is ours: it is told again; let no other account publish there, and "
-            "no other bridge have this prefix",
+            "another client publishes on %s, a topic of this instance, which now publishes its own value again: let no "
+            "other account publish there, and no other bridge use this prefix",
             shorten(topic),
         )
         if (channel := self._channels.get(topic)) is not None:

@@ -75,8 +75,8 @@ class StepDelivery:
         if marker.sent is not None and not self._connection.is_unacknowledged(marker.sent):
             return True  # a broker acknowledges in the order in which it was sent (MQTT 5.0, section 4.6)
         if time.monotonic() >= self._until_s:
-            log.warning("step %d: the broker does not take it", marker.number)
-            self._connection.drop(f"it did not take step {marker.number} within {PATIENCE_S:g} s")
+            log.warning("step %d: the broker does not accept it", marker.number)
+            self._connection.drop(f"it did not accept step {marker.number} within {PATIENCE_S:g} s")
             return True
         return False
 

@@ -84,7 +84,7 @@ class TopicGuard:
             rest_s = REST.wait_s(self._rests)
             self._rests += 1
             self._resting, self._everything, self._until_s = True, True, now_s + rest_s
-            log.warning("others publish too much on our topics: none of it is corrected for %g s", rest_s)
+            log.warning("other clients publish too much on our topics: no corrections for %g s", rest_s)
         elif topic not in self._waiting and len(self._waiting) >= MOST_WAITING:
             self._everything = True
         else:

@@ -222,7 +222,7 @@ class _Expansion:
                 position = field.member.position
                 if position not in self._told:
                     self._told.add(position)
-                    what = f"the initial value of the structure {field.member.name!r} is not read: {error}"
+                    what = f"the initial value of the structure {field.member.name!r} is ignored: {error}"
                     self._report.add(position.warning(what))
         return self._split[key]
 
@@ -265,7 +265,7 @@ def assign(
     for assignment in assignments:
         target = _target(group, assignment)
         if target is None:
-            what = "the value is not read: the members of its type are not known"
+            what = "the value is ignored: the members of its type are unknown"
             report.add(assignment.position.warning(what))
             continue
         if isinstance(target, str):

@@ -30,7 +30,7 @@ MAX_TEXT = 32 << 20  # characters of all expanded paths, comments and initial va
 
 
 _OPAQUE = (
-    "the system type '{name}' is kept as {size} bytes without meaning, for the places of its members are not public; "
+    "the system type '{name}' is kept as {size} bytes without meaning, because its members are not public; "
     'if you know them, give it as a PLC data type: TYPE "{name}" STRUCT … END_STRUCT; END_TYPE'
 )
 _SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, --type-bytes "{name}=…" of shmio-layout'
@@ -211,13 +211,12 @@ class Placer:
         if reason := system_types.refusal(name.name):
             return (
                 f"the system type {name.name} is not supported: {reason}; if you know its members, give it as a PLC "
-                f'data type: TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE; if you know its size alone, declare '
+                f'data type: TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE; if you know only its size, give '
                 f"that: {_SIZE.format(name=name.name)}"
             )
         return (
             f"expected a known type, found {name.name!r}; if it is a PLC data type or a function block, name its "
-            "source (.udt, .scl, .awl) as well; if you know its size alone, declare that: "
-            + _SIZE.format(name=name.name)
+            "source (.udt, .scl, .awl) as well; if you know only its size, give that: " + _SIZE.format(name=name.name)
         )
 
     def _refuse(self, position: Position, message: str) -> None:

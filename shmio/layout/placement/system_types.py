@@ -81,8 +81,8 @@ _REFUSED = {
         "ASSOCVALUES",
     ), _NO_SOURCE),
     "TCON_IP_V4": "Siemens' help gives it 14 bytes in one place and 16 in another",
-    "VARIANT": "it is a reference, and takes no room in a data block",
-    "VOID": "it is the type of no value",
+    "VARIANT": "it is a reference, which a data block does not store",
+    "VOID": "no value has this type",
 }
 # fmt: on
 

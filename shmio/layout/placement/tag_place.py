@@ -116,12 +116,12 @@ class _Placer:
         for path in self._registers:
             first = in_lower_case.setdefault(path.lower(), path)
             if first != path:
-                problem = f"only the case of letters tells it from {shorten(first)}"
+                problem = f"differs only in case from {shorten(first)}"
                 self._complain(self._keys[path], problem, "warning")
             head = path.rpartition("/")[0]
             while head:
                 if head in self._registers:
-                    self._complain(self._keys[path], f"{shorten(head)} is a value itself")
+                    self._complain(self._keys[path], f"{shorten(head)} is already a register")
                 head = head.rpartition("/")[0]
         if self._end > MAX_BLOCK_BYTES or self._elements > MAX_ELEMENTS:
             most = f"{MAX_BLOCK_BYTES} bytes and {MAX_ELEMENTS} elements"
@@ -139,13 +139,13 @@ class _Placer:
     def _place_all(self, key: str, tag: _Tag) -> None:
         """Place a register, or the members of a structure."""
         if key.rpartition("/")[2] in ("in", "out"):
-            raise PathError("it ends in a direction; leave it out, each register has both")
+            raise PathError("the path ends in a direction; leave that out: each register has both")
         inside = members(tag.type)
         if inside is None:
             self._place(key, key, tag)
             return
         if tag.initial is not None:
-            raise ValueError("initial: a structure has none; name its members one by one to give them values")
+            raise ValueError("initial: a structure has no initial value; list its members to give them values")
         for name, kind in inside.items():
             self._place(key, f"{key}/{name}", _Tag(kind, None, tag.comment))
 
@@ -154,7 +154,7 @@ class _Placer:
         if len(path) > MAX_TOPIC:
             raise PathError(f"a path is at most {MAX_TOPIC} characters long")
         if path in self._registers:
-            raise PathError("it is there twice")
+            raise PathError("given twice")
         if len(self._registers) >= MAX_REGISTERS:
             self._complain(key, f"expected at most {MAX_REGISTERS} registers, structures' members included")
             raise TooManyErrors
@@ -182,7 +182,7 @@ def _tag(key: str, given: object) -> _Tag:
         other = min(others)
         known = ", ".join(_Tag.__struct_fields__)
         raise ValueError(
-            f"there is no {shorten(printable(other))!r} here, only {known}; a path with a dot is written in quotes, "
+            f"there is no {shorten(printable(other))!r} here, only {known}; write a path with a dot in quotes, "
             f'"{shorten(printable(f"{key}.{other}"))}"'
         )
     try:
@@ -190,7 +190,7 @@ def _tag(key: str, given: object) -> _Tag:
     except msgspec.ValidationError as error:
         if isinstance(given, dict) and _is_nested(given.get("initial")):
             raise ValueError(
-                "initial: expected one list, in which the last index runs fastest, found lists in it"
+                "initial: expected one flat list, in which the last index runs fastest, found nested lists"
             ) from None
         raise ValueError(explain(error)) from None
 
@@ -224,7 +224,7 @@ def _type(text: str) -> tuple[ElementType, Dims]:
     element = element_type(text.strip())
     if element is None:
         raise ValueError(
-            f"there is no type {text!r}; there are BOOL, INT, DINT, REAL, LREAL, STRING[20] and the like, and the "
+            f"there is no type {text!r}; valid: BOOL, INT, DINT, REAL, LREAL, STRING[20] and similar, and the "
             f"structures {', '.join(CONTENTS)}"
         )
     return element, tuple(dims)

@@ -66,13 +66,13 @@ def _read(file: str, data: bytes, report: Report) -> Table:
         report.add(Diagnostic(file, data.count(b"\n", 0, error.start) + 1, 1, "it is not in UTF-8"))
         return Table({})
     if line := too_long(text, MAX_SOURCE_BYTES):
-        what = f"a key has more than {MAX_PARTS} parts; a path with dots is written in quotes"
+        what = f"a key has more than {MAX_PARTS} parts; write a path with dots in quotes"
         report.add(Diagnostic(file, line, 1, what))
         return Table({})
     try:
         return msgspec.convert(tomllib.loads(text), Table)
     except msgspec.ValidationError as error:
-        report.add(Diagnostic(file, 1, 1, f"it is no tag table: {explain(error)}"))
+        report.add(Diagnostic(file, 1, 1, f"not a tag table: {explain(error)}"))
     except (ValueError, RecursionError) as error:
         report.add(_syntax_error(file, text, error))
     return Table({})
@@ -87,12 +87,12 @@ def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
     lines = text.split("\n")
     line, column = (int(where[1]), int(where[2])) if where[1] else (len(lines), len(lines[-1]) + 1)
     if not str(error).startswith("Cannot overwrite a value"):
-        hint = "; a path is written in quotes" if str(error).startswith("Expected '='") else ""
+        hint = "; write a path in quotes" if str(error).startswith("Expected '='") else ""
         return Diagnostic(file, line, column, f"{_PLACE.sub('', explain_toml(error, text))}{hint}")
     while line > 1 and not _KEY.match(lines[line - 1]):
         line -= 1  # tomllib gives the end of the value
     key = shorten(lines[line - 1].partition("=")[0].strip())
-    return Diagnostic(file, line, 1, f"{key}: it is there twice; a path with a dot is written in quotes")
+    return Diagnostic(file, line, 1, f"{key}: given twice; write a path with a dot in quotes")
 
 
 class _Lines:

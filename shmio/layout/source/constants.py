@@ -71,15 +71,15 @@ class Constants:
         name, at = constant.name, constant.position
         scope = self._scope(name.lower())
         if scope is None:
-            what = f"the constant {name!r} is not in the sources; write its value here, or give one more source with: "
+            what = f"the constant {name!r} is not in the sources; write its value here, or add a source with: "
             raise BoundFault(at.error(f'{what}VAR CONSTANT "{name}" : Int := …; END_VAR'))
         if (known := scope._numbers.get(name.lower())) is not None:
             return known
         number = scope._declared[name.lower()].number
         if number is None:
-            raise BoundFault(at.error(f"expected a whole number, found the constant {name!r} of another kind"))
+            raise BoundFault(at.error(f"expected a whole number, but the constant {name!r} is not one"))
         if depth >= MAX_DEFINITIONS:
-            raise BoundFault(at.error(f"the constant {name!r} is defined by itself"))
+            raise BoundFault(at.error(f"the constant {name!r} is defined by way of itself"))
         value = number if isinstance(number, int) else scope._sum(number, depth + 1)
         scope._numbers[name.lower()] = value
         return value

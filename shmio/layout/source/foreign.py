@@ -25,16 +25,16 @@ def foreign(file: str, data: bytes) -> str:
     name = file.lower()
     head = data[:HEAD_BYTES]
     if head.startswith((_ZIP, _OLD_OFFICE)) or name.endswith((".xlsx", ".xls", ".ods")):
-        return f"this is a spreadsheet or an archive, which is not read: {_INSTEAD}"
+        return f"this is a spreadsheet or an archive, which shmio cannot read: {_INSTEAD}"
     wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = decode(head[: len(head) & ~1] if wide else head).text
     if _MARKUP.match(text) or name.endswith(".xml"):
-        return f"this is XML, as TIA Portal Openness exports blocks, which is not read: {_INSTEAD}"
+        return f"this is XML, as TIA Portal Openness exports blocks, which shmio cannot read: {_INSTEAD}"
     if name.endswith((".csv", ".sdf", ".tsv")) or _is_table(text, data):
-        return f"this is a table of tags, which says nothing of where a data block keeps them: {_INSTEAD}"
+        return f"this is a table of tags without their places in a data block: {_INSTEAD}"
     controls = len(head) - len(head.translate(None, _CONTROLS))
     if not wide and controls > max(len(head) // 20, 8):
-        return f"this is no text: {_INSTEAD}"
+        return f"this is not a text file: {_INSTEAD}"
     return ""
 
 

@@ -151,7 +151,7 @@ def _problem(kind: Kind, content: str) -> str:
     if kind is Kind.QUOTED and not content:
         return "a quoted name must not be empty"
     if kind is Kind.QUOTED and any(ord(c) < 32 or ord(c) == 127 for c in content):
-        return "a name must not hold control characters"
+        return "a name must not contain control characters"
     if len(content) > MAX_TOKEN_LENGTH:
         return f"longer than {MAX_TOKEN_LENGTH} characters"
     return ""

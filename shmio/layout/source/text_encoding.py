@@ -46,7 +46,7 @@ def decode(data: bytes) -> Decoded:
     except UnicodeDecodeError as error:
         line, column = _place(data[: error.start].decode(encoding))
     if encoding != "utf-8":
-        problem = f"expected {encoding.upper()}, as the byte order mark says, found bytes that are not; "
+        problem = f"expected {encoding.upper()}, as the byte order mark says, found other bytes; "
         return Decoded("", f"{problem}export the source again", line, column, fatal=True)
     try:
         text = data.decode("cp1252")

@@ -53,7 +53,7 @@ class Moment:
         if not self._bounds[0] <= ns <= self._bounds[1]:
             raise out_of_range(value, self._name, *map(self._text, self._bounds))
         if ns % self._step:
-            raise ValueRangeError(f"{self._name}: {brief(value)} is finer than the type, such as {self._text(ns)}")
+            raise ValueRangeError(f"{self._name}: {brief(value)} is too precise; {self._text(ns)} fits")
         return self._from_ns(ns)
 
 

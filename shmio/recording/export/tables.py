@@ -141,7 +141,7 @@ def new_folder(path: Path) -> Iterator[None]:
         path.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
-        with suppress(OSError):  # others have put something into it
+        with suppress(OSError):  # the folder is not empty: others have put something into it
             for folder in made:
                 folder.rmdir()
         raise
@@ -167,7 +167,7 @@ class BlockTables:
             path = self._path(block)
             stream = self._stack.enter_context(new_file(path))
             table = TABLES[self._form](stream, self._chosen[block])
-            self._stack.callback(table.close)  # before its file is, also where that is then removed
+            self._stack.callback(table.close)  # before its file is closed, even if that is removed then
             self._tables[block] = path, table
         self._tables[block][1].write(columns)
 

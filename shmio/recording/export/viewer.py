@@ -124,9 +124,9 @@ def _channel(writer: Writer, topic: str, name: str, properties: dict[str, Any]) 
 
 
 def _tree(registers: Sequence[Register], source: str) -> dict[str, Any]:
-    """Registers by the segments of their paths: their places among the registers, or what is below.
+    """Return a tree of the registers by path segments; its leaves are indices of registers.
 
-    One that would be taken for what the frame tells of itself has its source before it.
+    A register with the name of a field of the frame has its source before it.
     """
     tree: dict[str, Any] = {}
     for place, register in enumerate(registers):
@@ -162,7 +162,7 @@ def _schema(tree: dict[str, Any], columns: Columns) -> dict[str, Any]:
 
 
 def _plain(values: npt.NDArray[Any]) -> list[Any]:
-    """As JSON has them: durations as numbers, moments as text, null for what is no value or no finite number."""
+    """Convert values for JSON: durations to numbers, dates to text, invalid or infinite ones to null."""
     kind = values.dtype.kind
     found: Any = values
     if kind == "f" and not np.isfinite(values).all():

@@ -85,7 +85,7 @@ def unpack(content: bytes) -> bytes:
     elif not compression:
         data = bytes(packed)
     else:
-        raise ValueError(f"its compression {compression[:20]!r} is none that is known here")
+        raise ValueError(f"its compression {compression[:20]!r} is unknown")
     if len(data) != size:
         raise ValueError("its sizes contradict each other")
     if crc and zlib.crc32(data) != crc:

@@ -32,7 +32,7 @@ MAX_RECORD_BYTES: Final = 1 << 20
 
 BROKEN: Final = 0
 """The opcode, which no record of MCAP has, of bytes that make no sense."""
-ONLY_BEGUN: Final = "ends where it begins: its recorder was killed before it wrote anything, or has just begun"
+ONLY_BEGUN: Final = "has no content: its recorder was killed before it wrote anything, or has just started"
 LOOK_BYTES: Final = 4096
 """So much at a record's beginning tells how long it is: names of attachments and metadata fit in."""
 BEAT_BYTES: Final = 1 << 20
@@ -87,11 +87,11 @@ class Records:
         try:
             found = os.fstat(self._fd)
             if own and not stat.S_ISREG(found.st_mode):
-                raise RecordingError(f"{file} is no regular file")
+                raise RecordingError(f"{file} is not a regular file")
             if own and found.st_uid != os.geteuid():
-                raise RecordingError(f"{file} is another user's, of id {found.st_uid}")
+                raise RecordingError(f"{file} belongs to another user (uid {found.st_uid})")
             if stat.S_ISDIR(found.st_mode):
-                raise RecordingError(f"{file} is a folder; name the recordings in it: {file}/*.mem")
+                raise RecordingError(f"{file} is a directory; name the recordings in it: {file}/*.mem")
             self.size = found.st_size
             start = self._pread(len(MAGIC), 0)
         except (OSError, RecordingError):
@@ -103,7 +103,7 @@ class Records:
                 raise RecordingError(f"{file} is empty: its recorder wrote nothing")
             if MAGIC.startswith(start):
                 raise RecordingError(f"{file} {ONLY_BEGUN}")
-            raise RecordingError(f"{file} is no recording: it does not begin as MCAP")
+            raise RecordingError(f"{file} is not a recording: it does not begin like an MCAP file")
 
     def walk(self, to: int | None = None) -> Iterator[Record]:
         """Yield all records up to the footer, or to the end of the file.

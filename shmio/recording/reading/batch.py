@@ -156,7 +156,7 @@ def _frame(piece: bytes, size: int) -> Frame:
     except ValueError as error:
         raise RecordingError(str(error)) from None
     if len(frame.raw) != size:
-        raise RecordingError("a frame is not of its layout's size")
+        raise RecordingError("a frame does not have the size of its layout")
     return frame
 
 

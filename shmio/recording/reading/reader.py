@@ -195,7 +195,7 @@ class Reader:
                 if channel.encoding:
                     yield channel, log_ns, data
         if unknown is not None:
-            raise RecordingError(f"{self.file}: messages of channel {unknown}, which is not described")
+            raise RecordingError(f"{self.file}: messages of channel {unknown}, which has no description")
 
     def channel(self, number: int) -> Channel | None:
         """Return a channel by its number; None if it is unknown.
@@ -219,7 +219,7 @@ class Reader:
             if channel.encoding == FRAME:
                 frame = decode_frame(bytes(data))
                 if len(frame.raw) != self.layout(channel).size:
-                    raise ValueError("a frame is not of its layout's size")
+                    raise ValueError("a frame does not have the size of its layout")
                 return frame
             return _DECODERS[channel.encoding](bytes(data))
         except ValueError as error:
@@ -251,9 +251,7 @@ class Reader:
     def note(self, record: Record) -> None:
         """Process a record outside chunks: metadata, header or attachment. RecordingError: it is damaged."""
         if record.opcode == BROKEN:
-            raise RecordingError(
-                f"{self.file}: bytes {record.at} to {record.at + record.size - 1} make no sense: they were changed"
-            )
+            raise RecordingError(f"{self.file}: bytes {record.at} to {record.at + record.size - 1} are damaged")
         try:
             if record.opcode == Opcode.METADATA:
                 metadata = Metadata.read(stream(self.records.read(record.at, record.size)))
@@ -292,21 +290,21 @@ class Reader:
     def _channel(self, content: memoryview) -> None:
         if len(content) > MAX_CHANNEL_BYTES or len(self.channels) >= MAX_CHANNELS:
             raise RecordingError(
-                f"{self.file}: it describes more channels, or one at more length, than a recorder does"
+                f"{self.file}: it has more, or longer, descriptions of channels than a recorder writes"
             )
         try:
             channel = describe(content)
         except (ValueError, KeyError, struct.error, McapError):
             raise RecordingError(f"{self.file}: the description of a channel is damaged") from None
         if self.channels.setdefault(channel.number, channel) != channel:  # messages would be ambiguous
-            raise RecordingError(f"{self.file}: channel {channel.number} is described twice, and differently")
+            raise RecordingError(f"{self.file}: channel {channel.number} has two different descriptions")
 
     def require_ours(self) -> None:
         """Raise RecordingError if nothing that was read was written by a recorder of shmio."""
         if not self.about and not any(channel.encoding for channel in self.channels.values()):
             if not self.records.closed and (self._ours or self._is_cut_short()):
                 raise RecordingError(f"{self.file} {ONLY_BEGUN}")
-            raise RecordingError(f"{self.file} is an MCAP file, but no recording of shmio")
+            raise RecordingError(f"{self.file} is an MCAP file, but not a recording of shmio")
 
     def close(self) -> None:
         """Close the file."""

@@ -164,7 +164,7 @@ class Track:
             if not found:  # otherwise only messages of other channels are lost
                 raise
         if not found:
-            raise RecordingError(f"{reader.file}: {self.channel.topic}: an index names messages that are not there")
+            raise RecordingError(f"{reader.file}: {self.channel.topic}: an index refers to messages that do not exist")
         return found
 
 

@@ -80,7 +80,7 @@ def test_where_time_stands_a_campaign_by_time_says_who_moves_it(
     cell.clock = clock
     options = Namespace(seed=1, file=file, from_now=from_now, keep=False, for_s=None, json=False)
     assert run_campaign(cast("Cell", cell), options) == 0
-    stands = "time stands at 3.000 s: start_s and end_s wait for shmio step to move it\n"
+    stands = "time is paused at 3.000 s: start_s and end_s wait until shmio step moves it\n"
     assert capsys.readouterr().err == (stands if clock is Still.clock and from_now else "")
 
 

@@ -210,14 +210,14 @@ def test_a_path_that_names_nothing_is_refused(file: str, said: Output) -> None:
     assert said()[1] == ["cell/x*: no register of this recording has such a path"]
     assert main(["cat", file, "cell/speed"]) == 0, "it is in the second layout only"
     assert main(["cat", file, "count"]) == 1
-    assert said()[1] == ["count: there are 2 sources, and 'count' is none of them: write cell/… or press/…"]
+    assert said()[1] == ["count: 'count' is not one of the 2 sources: write cell/… or press/…"]
 
 
 def test_cat_of_several_files_says_how(file: str, said: Output) -> None:
     assert main(["cat", file, file]) == 1
     assert said() == (
         [],
-        [f"{file} is a file, and cat prints one: shmio-dump merge FILE… -o NEW makes one of them"],
+        [f"{file} is a file, but cat prints only one: shmio-dump merge FILE… -o NEW joins them"],
     )
 
 
@@ -229,14 +229,14 @@ def test_what_is_no_recording_is_told(verb: list[str], file: str, tmp_path: Path
     contents = {"short": data[:5], "magic": data[:8], "header": data[:40], "text": b"some text", "empty": b""}
     for name, content in contents.items():
         Path(name).write_bytes(content)
-    begun = "ends where it begins: its recorder was killed before it wrote anything, or has just begun"
+    begun = "has no content: its recorder was killed before it wrote anything, or has just started"
     for path, why in (
-        (str(tmp_path), f"is a folder; name the recordings in it: {tmp_path}/*.mem"),
-        (".", "is a folder; name the recordings in it: ./*.mem"),
+        (str(tmp_path), f"is a directory; name the recordings in it: {tmp_path}/*.mem"),
+        (".", "is a directory; name the recordings in it: ./*.mem"),
         ("short", begun),
         ("magic", begun),
         ("header", begun),
-        ("text", "is no recording: it does not begin as MCAP"),
+        ("text", "is not a recording: it does not begin like an MCAP file"),
         ("empty", "is empty: its recorder wrote nothing"),
     ):
         assert main([*verb, path]) == 1
@@ -302,7 +302,7 @@ def test_verify_tells_what_is_damaged_and_where(damaged: tuple[str, str], said: 
     [place, events, frames] = [line for line in out if line.startswith("  damage: ")]
     assert re.fullmatch(f"  damage: {WHERE}", place)
     first = 3 * RING + 11
-    assert frames == f"  damage: press, block 1: frames {first} to {first + 9} are neither there nor in a gap"
+    assert frames == f"  damage: press, block 1: frames {first} to {first + 9} are missing, and in no gap"
     assert events.startswith("  damage: press, block 1: events ")
     assert out[-1].endswith("no damage"), "the other is told too"
     assert err == []
@@ -387,7 +387,7 @@ def test_a_channel_whose_two_descriptions_are_damaged_costs_no_other(
     assert kept == [line for line in whole if line["source"] == "press"][-len(kept) :]
     assert [line["frame"] for line in kept if "frame" in line][-20:] == list(range(11, 31))
     assert not any(line["source"] == "cell" and kind in line for line in objects(out))
-    assert any("which is not described" in line for line in err)
+    assert any("which has no description" in line for line in err)
 
 
 def test_a_block_without_its_layout_is_told_and_the_others_are_printed(file: str, said: Output) -> None:
@@ -404,7 +404,7 @@ def test_a_block_without_its_layout_is_told_and_the_others_are_printed(file: str
 def test_what_is_no_recording_is_told_in_one_line(verb: str, said: Output) -> None:
     Path("empty.mem").touch()
     Path("text.mem").write_text("hello\n")
-    for name, message in (("empty.mem", "is empty"), ("text.mem", "is no recording"), ("none.mem", "No such file")):
+    for name, message in (("empty.mem", "is empty"), ("text.mem", "is not a recording"), ("none.mem", "No such file")):
         assert main([verb, name]) == 1
         out, [line] = said()
         assert out == []
@@ -486,7 +486,7 @@ def test_nothing_runs(said: Output) -> None:
 def test_seconds_around_a_condition_need_one(option: str, said: Output) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["record", option, "3"])
-    assert "--before and --after are for --when" in said()[1][-1]
+    assert "--before and --after need --when" in said()[1][-1]
 
 
 @pytest.mark.parametrize("seconds", ["0", "-1", "nan", "x", "inf"])

@@ -113,18 +113,18 @@ def test_what_a_client_gave_consumers_is_set_from_value_to_value(derive: Derive)
 
 def test_what_cannot_be_declared_is_told(derive: Derive, capsys: pytest.CaptureFixture[str]) -> None:
     blind = declared(7, DRIFT | {"name": "blind"})._replace(writer=NO_WRITER)
-    again = "no command has laid it: the configuration, or a replayed recording, does"
+    again = "no client laid it, but the configuration or a replayed recording"
     limit = laid(5, "in", (0, 2, 255), name="limit")
-    why = "a client gave it values over /in, which depended on what was written"
+    why = "a client gave it values over /in that depended on other writes"
     earlier = "it was laid before the recording began"
     derive(
         (1, blind), (5, given(4, 1)), (5, given(4, 2)), (10, limit), (20, declared(6, DRIFT)),
-        said=f"not as it was: blind: {again}\nnot as it was: 4: {earlier}\nnot as it was: limit: {why}\n",
+        said="".join(f"not exactly reproduced: {x}\n" for x in (f"blind: {again}", f"4: {earlier}", f"limit: {why}")),
     )  # fmt: skip
     Path("campaign.toml").unlink()
     with build(Path("b.mem")) as work:
         work.block("cell")
         work.frame(1, image(1))
     assert main(["campaign", "b.mem", "-o", "campaign.toml"]) == 1
-    assert capsys.readouterr().err == "b.mem: no injection was laid in it that can be declared\n"
+    assert capsys.readouterr().err == "b.mem: it has no injection that can be declared\n"
     assert not Path("campaign.toml").exists()

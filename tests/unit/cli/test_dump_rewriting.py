@@ -150,7 +150,7 @@ def test_merge_of_what_does_not_belong_together(tmp_path: Path, capsys: pytest.C
         work.block("cell")
         work.frame(1, image(1))
     assert main(["merge", str(plain(tmp_path / "a.mem")), "b.mem", "-o", "all.mem"]) == 1
-    assert "are of different runs" in capsys.readouterr().err
+    assert "come from different runs" in capsys.readouterr().err
 
 
 def test_recover_gives_back_every_whole_chunk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -208,7 +208,7 @@ def test_recover_of_what_is_no_recording(tmp_path: Path, capsys: pytest.CaptureF
         pass
     assert main(["recover", "x.mem"]) == 1
     assert capsys.readouterr().err == "x.mem: nothing is recorded in it\n"
-    for content, message in ((b"", "is empty"), (b"nothing", "is no recording"), (MAGIC, "ends where it begins")):
+    for content, message in ((b"", "is empty"), (b"nothing", "is not a recording"), (MAGIC, "has no content")):
         Path("x.mem").write_bytes(content)
         assert main(["recover", "x.mem"]) == 1
         assert message in capsys.readouterr().err

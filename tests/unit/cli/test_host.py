@@ -281,7 +281,7 @@ def test_step_asks_where_a_source_has_a_device(segment: Segment, capsys: pytest.
     def test(remote: Output, local: Output, _: Plant) -> None:
         refused = remote("step")
         assert refused == local("step")
-        assert (refused[0], "cell goes on in real time; to step all the same: --yes" in refused[2]) == (1, True)
+        assert (refused[0], "cell goes on in real time; --yes steps anyway" in refused[2]) == (1, True)
         assert remote("step", "--pause", "--yes")[0] == 0
         assert remote("step", "--pause")[0] == 0, "it is not asked for again"
 

@@ -50,7 +50,7 @@ def test_it_tells_how_they_play(playing: Playing, instance: str, capsys: pytest.
         (["seek"], "seek needs a VALUE"),
         (["pause", "1"], "pause takes no VALUE"),
         (["loop", "maybe"], "loop is on or off"),
-        (["speed", "fast"], "'fast' is no number"),
+        (["speed", "fast"], "'fast' is not a number"),
         (["seek", "1", "--jump"], "--jump goes with"),
         (["pause", "--speed", "1"], "--speed goes with play"),
         (["rewind"], "invalid choice"),
@@ -67,14 +67,16 @@ def test_wrong_usage_is_told(
 
 def test_what_cannot_be_is_one_line(playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert replay(instance, "seek", "900") == 1
-    assert capsys.readouterr().err == "900 is not within what is played, which is 0.400 s long\n"
+    assert capsys.readouterr().err == "900 is outside the played part, which is 0.400 s long\n"
     assert replay(instance, "status", "--source", "none") == 1
     assert capsys.readouterr().err == "source 'none' plays no recording; these do: cell\n"
     assert replay(instance, "seek", "0.2") == 0
     assert replay(instance, "until", "0.1") == 1
-    assert capsys.readouterr().err == "cell: that is past: it is at 0.200 s; seek to before that first\n"
+    assert (
+        capsys.readouterr().err == "cell: that time has passed: the replay is at 0.200 s; seek to before that first\n"
+    )
     assert replay(instance, "to-event", "accepted") == 1
-    assert capsys.readouterr().err == "there is no event accepted from here to the end of what is played\n"
+    assert capsys.readouterr().err == "there is no event accepted between here and the end of the played part\n"
 
 
 def test_a_step_tells_of_a_replay_that_stands(

@@ -70,7 +70,7 @@ def test_its_sources_take_the_places_of_the_configurations(file: Path) -> None:
     assert (options["own_clock"], options["loop"], options["file"]) == (True, True, [str(file)])
     notices = "\n".join(plan.warnings)
     assert "source panel is left out: the recording has none of it; it has cell, arm" in notices
-    assert "emulator plc is left out: a recording is played, not a device read" in notices
+    assert "emulator plc is left out: a replay reads no device" in notices
     assert "the configuration's injections are left out" in notices
     assert "grpc.default_source is left out" in notices
 
@@ -92,7 +92,7 @@ payload = "frames"
     told = "mqtt.topic[1].match: panel is left out: the recording has no such source"
     assert [told in warning for warning in prepared.plan.warnings].count(True) == 1
     config.write_text(f'{CONFIG}{mqtt}[[mqtt.topic]]\nmatch = "pannel"\npayload = "frames"\n')
-    with pytest.raises(ConfigError, match="'pannel': frames are those of a whole source"):
+    with pytest.raises(ConfigError, match="'pannel': frames need the name of a whole source"):
         prepare(config, "replay", {"file": [str(file)]})
 
 
@@ -132,7 +132,7 @@ def test_a_replay_beside_others_has_the_recordings_registers(
     assert main(["check"]) == 0
     assert "source cell: DB1, 2 registers, 4 bytes" in capsys.readouterr().out
     for more, error in (
-        ('layout = "db1.db"', "source[0].layout: a replay has none"),
+        ('layout = "db1.db"', "source[0].layout: a replay does not take this key"),
         ("speed = 0", "source[0].speed: "),
         ("start = 99", "source[0].start, end: there is nothing to play"),
         ('source = "none"', "source[0].source: "),
@@ -143,7 +143,7 @@ def test_a_replay_beside_others_has_the_recordings_registers(
         assert main(["check"]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert re.match(rf"supervisor\.toml(:[0-9]+)?: {re.escape(error)}", line), line
-    for name, error in (("none.mem", ": No such file"), ("panel.toml", " is no recording")):
+    for name, error in (("none.mem", ": No such file"), ("panel.toml", " is not a recording")):
         config.write_text(text.replace(file.name, name))
         assert main(["check"]) == 1
         (line,) = capsys.readouterr().err.splitlines()

@@ -208,11 +208,11 @@ def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture
     ("arguments", "message"),
     [
         (["cell/nothing", "1"], "cell/nothing: no such register in DB1"),
-        (["nothing/count", "1"], "there are 2 sources, and 'nothing' is none of them: write cell/… or other/…"),
+        (["nothing/count", "1"], "'nothing' is not one of the 2 sources: write cell/… or other/…"),
         (["cell/COUNT", "1"], "near: count"),
         (["nope://count", "1"], "no source of this name; there are: cell, other"),
         (["cell/count/out", "1"], "leave out /out"),
-        (["model/clock", "1"], "nothing is served under model"),
+        (["model/clock", "1"], "unknown source model"),
         (["cell/count", "70000"], "cell/count: INT: 70000 is out of range -32768..32767\n"),
         (["cell/*n*", "1"], "cell/*n*: set takes one register, not a pattern; this one matches cell/count, cell/run, "),
         (["cell/**", "1"], "this one matches cell/count, cell/run, cell/speed, …\n"),
@@ -221,7 +221,7 @@ def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture
         (["cell/row", "[1]"], "cell/row: expected all"),
         (
             ["cell/secret", "1"],
-            "cell/secret is not writable; the configuration has to name it in the source",
+            "cell/secret is not writable; name it in the source",
         ),
         (["cell/count", "1", "CELL://count", "2"], "cell/count: given twice"),
         (["cell", "1"], "names a source, not a register"),
@@ -244,7 +244,7 @@ def test_a_source_without_its_device_says_so(device: Device, capsys: pytest.Capt
     out, err = capsys.readouterr()
     assert out.splitlines() == ["cell/count  rejected", "cell/run    rejected"]
     assert err == (
-        "cell/count: not written, the source took nothing: the source is not connected: no answer from 10.0.0.1; "
+        "cell/count: not written, the source accepted nothing: the source is not connected: no answer from 10.0.0.1; "
         "see shmio-supervisor status (and 1 more)\n"
     )
 
@@ -265,8 +265,8 @@ def test_a_source_that_is_replaced_before_it_took_it_is_to_be_asked_again(
         assert main(["set", "other/count", "1"]) == 1
         replacing.join()
         assert capsys.readouterr().err == (
-            "other/count: not written, the source took nothing: it was meant for the source's process before this one, "
-            "which ended: try again; see shmio-supervisor status\n"
+            "other/count: not written, the source accepted nothing: it was for an earlier process of the source, "
+            "which has ended: try again; see shmio-supervisor status\n"
         )
         assert main(["set", "other/count", "1"]) == 0, "the remedy works"
 
@@ -292,7 +292,7 @@ def test_what_nobody_knows_is_said_with_what_to_do(device: Device, capsys: pytes
 def test_it_waits_no_longer_than_told(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.idle = True
     assert main(["set", "--timeout", "0.2", "cell/count", "1"]) == 1
-    assert "no cycle came before its deadline" in capsys.readouterr().err
+    assert "no cycle began before its deadline" in capsys.readouterr().err
 
 
 def test_sources_have_a_command_each_and_what_was_written_is_told(

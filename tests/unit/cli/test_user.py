@@ -111,7 +111,7 @@ class Keyboard(io.StringIO):
         return True
 
 
-REAL = "the instance's time is real: a step makes it stand until it is released, while cell goes on in real time"
+REAL = "the instance's time is real: a step pauses it until it is released, while cell goes on in real time"
 
 
 def mode(instance: str) -> str:
@@ -124,7 +124,7 @@ def test_real_time_is_taken_from_a_device_by_no_script_that_does_not_say_so(
     running: str, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
     assert main(["step", "--instance", running, *words]) == 1
-    assert capsys.readouterr().err == f"{REAL}; to step all the same: --yes\n"
+    assert capsys.readouterr().err == f"{REAL}; --yes steps anyway\n"
     assert mode(running) == "wall"
 
 
@@ -307,6 +307,6 @@ def test_on_a_terminal_watch_is_a_table_that_is_brought_up_to_date_in_place(time
         terminal.process.send_signal(signal.SIGINT)
         assert terminal.process.wait(60) == 130
     with terminal_of("watch", "--instance", times.instance, "cell/many/0..8") as terminal:
-        terminal.until(r"cell/many/3.*… and 5 more lines: a higher window, or --lines, shows them")
+        terminal.until(r"cell/many/3.*… and 5 more lines: enlarge the window, or use --lines")
     with terminal_of("watch", "--lines", "--full", "--instance", times.instance, "cell/many") as terminal:
         assert "\x1b" not in terminal.until(r"(0,){199}0\]\s")

@@ -197,9 +197,9 @@ def test_nobody_there(connects: Connect) -> None:
     ("serves", "ca", "told"),
     [
         ("tls", None, "or it speaks TLS: then name the CA"),
-        ("mutual", "ca.pem", "or it wants a certificate of ours"),
+        ("mutual", "ca.pem", "or it needs a client certificate"),
         ("plain", "ca.pem", "it speaks plain text: leave the CA out"),
-        ("tls", "other.pem", "its certificate is not of the CA that was named"),
+        ("tls", "other.pem", "its certificate is not from the CA"),
         ("of another", "ca.pem", "its certificate does not name this host"),
     ],
 )

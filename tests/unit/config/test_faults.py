@@ -63,12 +63,12 @@ def refused(folder: Path, text: str) -> list[str]:
 def test_all_faults_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
     assert refused(tmp_path, MANY) == [
         "F:4: instance.ring: unknown key; did you mean ring_mb?",
-        "F:3: instance.clock: 'Wall' is none; there are: wall, stepped; did you mean wall?",
+        "F:3: instance.clock: 'Wall' is unknown; valid: wall, stepped; did you mean wall?",
         'F:6: source[0].connector: this key is needed (source "cell")',
         'F:8: source[0].layout: expected text or a list in [ ], got a whole number (source "cell")',
         'F:9: source[0].period_ms: expected a number, got text (source "cell")',
         (
-            "F:38: injection[1].operation: 'ofset' is none; there are: set, offset, scale, clamp, noise, random, "
+            "F:38: injection[1].operation: 'ofset' is unknown; valid: set, offset, scale, clamp, noise, random, "
             'freeze, delay, drop, flip; did you mean offset? (injection "drift")'
         ),
         "F:12: source[1].name: 'Model' is reserved",
@@ -93,8 +93,8 @@ def test_all_faults_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('log_dir = "a"\n\nname = "y"\n', "instance.name is there twice, in lines 2 and 5; keep one of them"),
-        ("[grpc]\n[instance]\n", "instance is there twice, in lines 1 and 4; keep one of them"),
+        ('log_dir = "a"\n\nname = "y"\n', "instance.name is given twice, in lines 2 and 5; keep one of them"),
+        ("[grpc]\n[instance]\n", "instance is given twice, in lines 1 and 4; keep one of them"),
         ('log_dir = "C:\\Users\\me"\n', "write a path in single quotes"),
         ('log_dir = "C:\\plc"\n', "write a path in single quotes"),
         ('log_dir = "C:\\temp\\new"\n', "a path with backslashes is written in single quotes"),

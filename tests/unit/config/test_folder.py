@@ -63,4 +63,4 @@ def test_a_file_system_that_takes_no_files_is_found_out_as_root_too(tmp_path: Pa
     for folder in ("/proc", "/proc/logs"):
         assert "its file system takes no files: choose another folder" in str(unwritable(Path(folder)))
     (tmp_path / "file").touch()
-    assert unwritable(tmp_path / "file/logs") == Obstacle(f"{tmp_path}/file is no folder")
+    assert unwritable(tmp_path / "file/logs") == Obstacle(f"{tmp_path}/file is not a directory")

@@ -116,7 +116,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
     [
         ("[instance]", "[instanse]", r"instanse: unknown key; did you mean instance\?"),
         ("ring_mb", "ring_megabytes", r"instance\.ring_megabytes: unknown key"),
-        ("ring_mb = 8", 'clock = "walls"', r"instance\.clock: 'walls' is none; there are: wall, stepped"),
+        ("ring_mb = 8", 'clock = "walls"', r"instance\.clock: 'walls' is unknown; valid: wall, stepped"),
         ("ring_mb = 8", 'ring_mb = "8"', r"instance\.ring_mb: expected a number, got text"),
         ("ring_mb = 8", "ring_mb = 0", r"instance\.ring_mb: expected a number > 0"),
         ('name = "a50"\n', "", r"instance\.name: this key is needed"),
@@ -133,7 +133,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
         ("armed = false", "armed = 1", r"source\[0\]\.armed: expected true or false, got a whole number"),
         ("armed = false", "stale_ms = 30", r"source\[0\]\.stale_ms: 30 is less than two periods of 20 ms"),
         ('name = "cell"', 'name = "Model"', r"source\[0\]\.name: 'Model' is reserved"),
-        ('name = "cell"', 'name = "grpc"', r"source\[0\]\.name: 'grpc' is the name of a process of ours"),
+        ('name = "cell"', 'name = "grpc"', r"source\[0\]\.name: 'grpc' is the name of one of shmio's processes"),
         ('name = "plc"', 'name = "CELL"', r"emulator\[0\]\.name: 'CELL' is already the name of source\[0\]"),
         ("period_ms = 20", "period_ms = 0", r"source\[0\]\.period_ms: expected"),
         ("period_ms = 20", "period_ms = nan", r"source\[0\]\.period_ms: "),
@@ -177,7 +177,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
         ("[instance]", 'folder = "/"\n[instance]', r"folder: unknown key"),
         ("[instance]", "[instance", r"not TOML"),
         ("[instance]", f"digits = {'9' * 5000}\n[instance]", r"a number in it has too many digits"),
-        ('"var/log"', '"var\\u0000log"', r"instance\.log_dir: must not hold control characters"),
+        ('"var/log"', '"var\\u0000log"', r"instance\.log_dir: must not contain control characters"),
     ],
 )
 def test_what_is_wrong_is_refused_by_its_full_key(folder: Path, old: str, new: str, message: str) -> None:

@@ -39,7 +39,9 @@ def test_a_file_and_a_hash_are_the_same_token(file: Path) -> None:
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o644, 0o620])
 def test_a_file_that_others_can_reach_is_refused(file: Path, mode: int) -> None:
     file.chmod(mode)
-    with pytest.raises(ConfigError, match=rf"token_file: .*mode {mode:04o} lets others in: chmod 600, and a new token"):
+    with pytest.raises(
+        ConfigError, match=rf"token_file: .*mode {mode:04o} lets other users read it: chmod 600, and a new token"
+    ):
         read_tokens([token(file)])
 
 

@@ -57,7 +57,7 @@ def test_what_is_no_socket_is_left(tmp_path: Path) -> None:
     for name in ("file", "link"):
         path = tmp_path / name
         path.write_text("precious") if name == "file" else path.symlink_to(tmp_path / "file")
-        with pytest.raises(EndpointError, match="no socket: move it away"):
+        with pytest.raises(EndpointError, match="not a socket: move it away"):
             clear(str(path))
         assert path.read_text() == "precious"
     with pytest.raises(EndpointError, match=r"there is no folder .*nowhere: mkdir -p it"):

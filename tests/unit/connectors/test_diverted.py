@@ -186,7 +186,7 @@ def test_all_injections_are_lifted_at_once_whoever_laid_them(rig: Rig, local: At
 def test_what_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
     one = StandingInjection(5, "out", 0, keep=True, name="", writer=0, pid=0, ranges=())
     rig.block.standing.write(encode([msgspec.json.encode(one)]))  # of which the source knows nothing
-    with pytest.raises(CommandError, match="1 of 1 injections still stand: cell: there is no injection 5"):
+    with pytest.raises(CommandError, match="1 of 1 injections were not lifted: cell: there is no injection 5"):
         local.lift_all()
     rig.block.standing.write(encode([]))
 

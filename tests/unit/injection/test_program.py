@@ -200,8 +200,8 @@ def test_freeze_and_drop_hold(steps: list[int]) -> None:
     ("target", "operation", "keys", "message"),
     [
         ("t/none", "freeze", {}, "target: t/none: no such register"),
-        ("t/name", "offset", {"value": 1}, "target: t/name is STRING[6], and offset is for numbers"),
-        ("t/run", "noise", {"amplitude": 1}, "target: t/run is BOOL, and noise is for numbers"),
+        ("t/name", "offset", {"value": 1}, "target: t/name is STRING[6], but offset is for numbers"),
+        ("t/run", "noise", {"amplitude": 1}, "target: t/run is BOOL, but noise is for numbers"),
         ("t/int", "set", {"value": 40000}, "value: int: "),
         ("t/int", "set", {"value": "warm"}, "value: int: "),
         ("t/grid", "set", {"value": [1, 2]}, "value: grid: expected a list of 4 elements"),

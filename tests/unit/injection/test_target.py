@@ -78,7 +78,7 @@ def test_a_register_named_twice_counts_once() -> None:
     ("texts", "message"),
     [
         (["cell/sped"], "no such register"),
-        (["speed"], "there are 2 sources"),
+        (["speed"], "not one of the 2 sources"),
         (["cell/speed", "sim/a"], "one direction of one source"),
         (["cell/speed", "cell/speed/in"], "one direction of one source"),
         (["cell/word", "cell/word.%X0"], ""),
@@ -89,10 +89,10 @@ def test_a_register_named_twice_counts_once() -> None:
         (["cell/word.%W0"], "WORD has no such part"),
         (["cell/bytes/4..2"], "the lower index first"),
         (["cell/bytes/8..10"], "outside"),
-        (["cell/speed/1..2"], "in place of an array's last index"),
-        (["cell/grid/1..2"], "in place of an array's last index"),
+        (["cell/speed/1..2"], "the place of an array's last index"),
+        (["cell/grid/1..2"], "the place of an array's last index"),
         (["cell/z*"], "no such register"),
-        (["model/clock"], "nothing is served under model"),
+        (["model/clock"], "unknown source model"),
         (["cell//speed"], "empty segment"),
     ],
 )

@@ -272,10 +272,14 @@ def test_constants_as_initial_values() -> None:
 @pytest.mark.parametrize(
     ("constants", "member", "message"),
     [
-        ("", 'a : Array[0.."N"] of Int;', "the constant 'N' is not in the sources; write its value here, or give one"),
+        (
+            "",
+            'a : Array[0.."N"] of Int;',
+            "the constant 'N' is not in the sources; write its value here, or add a source",
+        ),
         ("N : Int := M;", "a : Array[0..N] of Int;", "the constant 'M' is not in the sources"),
-        ("N : Int := N;", "a : Array[0..N] of Int;", "the constant 'N' is defined by itself"),
-        ("N : Real := 1.5;", "a : Array[0..N] of Int;", "expected a whole number, found the constant 'N'"),
+        ("N : Int := N;", "a : Array[0..N] of Int;", "the constant 'N' is defined by way of itself"),
+        ("N : Real := 1.5;", "a : Array[0..N] of Int;", "expected a whole number, but the constant 'N'"),
         ("N : Int := 0;", "a : Array[1..N] of Int;", "expected a lower bound not above the upper, found 1..0"),
         ("N : Int := 300;", "a : String[N];", "expected a STRING length of 1 to 254, found 300"),
         ("N : DInt := 2147483647;", "a : Array[0..N+1] of Int;", "expected a whole number within 32 bits"),
@@ -299,7 +303,7 @@ def test_long_sums_and_chains_of_constants_have_an_end() -> None:
     zero = f"VAR CONSTANT {doubled} C31 : Int := 0; END_VAR"
     assert layout_of(zero, block("a : Array[0..C0] of Int;")).registers[0].count == 1
     chain = "".join(f"C{i} : Int := C{i + 1};\n" for i in range(1000))
-    assert "is defined by itself" in error(f"VAR CONSTANT {chain} END_VAR", block("a : Array[0..C0] of Int;"))
+    assert "is defined by way of itself" in error(f"VAR CONSTANT {chain} END_VAR", block("a : Array[0..C0] of Int;"))
 
 
 def test_constants_within_a_constant_do_not_grow_without_end() -> None:
@@ -379,7 +383,7 @@ def test_initial_values_that_cannot_be_read_are_reported(value: str, message: st
     compiled = compile_text(block(f"s : Struct a : Int := 4; b : Int; END_STRUCT := {value};"))
     assert [register.initial for register in compiled.layouts[0].registers] == ["4", None]
     (warning,) = compiled.warnings
-    assert f"the initial value of the structure 's' is not read: {message}" in warning.message
+    assert f"the initial value of the structure 's' is ignored: {message}" in warning.message
 
 
 def test_a_large_value_is_read_once_for_all_elements() -> None:
@@ -485,7 +489,7 @@ def test_a_system_type_of_public_length_is_bytes_without_meaning(name: str, size
 def test_a_block_that_is_a_timer_with_values_that_nobody_can_place() -> None:
     compiled = compile_text(f'DATA_BLOCK "T1" NON_RETAIN IEC_TIMER BEGIN PT := T#5s; {END}')
     assert places(compiled.layouts[0]) == {"bytes": 0}
-    assert "the value is not read" in compiled.warnings[1].message
+    assert "the value is ignored" in compiled.warnings[1].message
     declared = 'TYPE "IEC_TIMER" STRUCT PT : Time; END_STRUCT; END_TYPE '
     assert places(layout_of(declared, block("a : IEC_TIMER;"))) == {"a/PT": 0}
 

@@ -116,7 +116,7 @@ def test_a_slice_of_bits_has_changed_when_one_of_its_bits_has(first: int, count:
         ("BYTE", "a.%B0", r"BYTE has no such part; it has %X0 to %X7$"),
         ("DWORD", "a.%W2", r"DWORD has no such part; it has %X0 to %X31, %B0 to %B3, %W0 to %W1$"),
         ("DWORD", "a.%X0.%X0", "BOOL has no such part"),
-        ("DWORD", "a/0..1", "a range stands in place of an array's last index"),
+        ("DWORD", "a/0..1", "a range must take the place of an array's last index"),
         ("DWORD", "b.%X0", "b: no such register"),
     ],
 )

@@ -103,10 +103,10 @@ def test_a_table_cannot_hide_more_registers_than_a_block_may_have() -> None:
 
 @pytest.mark.parametrize("key", ["a/in", "out"])
 def test_a_structure_has_no_direction_in_its_name_either(key: str) -> None:
-    with pytest.raises(LayoutError, match=f"{key}: it ends in a direction"):
+    with pytest.raises(LayoutError, match=f"{key}: the path ends in a direction"):
         place_tags("t", {key: "Point"})
 
 
 def test_a_structure_has_no_initial_value_of_its_own() -> None:
-    with pytest.raises(LayoutError, match="p: initial: a structure has none"):
+    with pytest.raises(LayoutError, match="p: initial: a structure has no initial value"):
         place_tags("t", {"p": {"type": "Point", "initial": 1}})

@@ -90,18 +90,16 @@ def test_malformed(text: str) -> None:
 def test_a_path_may_end_in_a_part_of_a_register(part: str) -> None:
     topic = parse_topic(f"cell/a b/8.{part}/in", SOURCES, "cell")
     assert (topic.path, topic.direction) == (f"a b/8.{part}", "in")
-    with pytest.raises(PathError, match=rf"^8\.{part}: a bit or another part of a register ends the path"):
+    with pytest.raises(PathError, match=rf"^8\.{part}: a bit or another part of a register is allowed only at the end"):
         parse_topic(f"cell/a/8.{part}/b", SOURCES, "cell")
-    with pytest.raises(PathError, match="ends the path"):
+    with pytest.raises(PathError, match="only at the end"):
         canonical_path(f"a/8.{part}")  # as of a register in a layout
     assert parse_topic("cell/8.%X07", SOURCES, "cell").path == "8.%X7"
 
 
 def test_without_default_the_source_must_be_named() -> None:
     assert parse_topic("cell/a", SOURCES, None) == Topic("cell", "a", None)
-    with pytest.raises(
-        PathError, match=r"^a/b: there are 3 sources, and 'a' is none of them: write cell/… or sim/… or R"
-    ):
+    with pytest.raises(PathError, match=r"^a/b: 'a' is not one of the 3 sources: write cell/… or sim/… or R"):
         parse_topic("a/b", SOURCES, None)
     with pytest.raises(PathError, match=r"or s3/…, …$"):
         parse_topic("a/b", [f"s{number}" for number in range(200)], None)
@@ -112,7 +110,7 @@ def test_without_default_the_source_must_be_named() -> None:
 
 
 def test_a_path_without_a_source_says_where_it_was_looked_for(layout: Layout) -> None:
-    with pytest.raises(PathError, match=r"^b: no such register in DB1; looked for in source cell, as the path begins"):
+    with pytest.raises(PathError, match=r"^b: no such register in DB1; searched in source cell, because the path"):
         look_up(layout, parse_topic("b/out", SOURCES, "cell"))
     with pytest.raises(PathError, match=r"^cell/b: no such register in DB1$"):
         look_up(layout, parse_topic("cell/b", SOURCES, "cell"))
@@ -171,7 +169,7 @@ def test_find(layout: Layout, path: str, offset: int, bit: int | None, type_: st
     ("path", "message"),
     [
         ("", "names a source"),
-        ("Robot", "a structure, not a register; it holds Robot/Axs1, Robot/Axs2"),
+        ("Robot", "a structure, not a register; it contains Robot/Axs1, Robot/Axs2"),
         ("Zones/1", "a structure"),
         ("Robot/Axs3", "no such register in DB1; near: Robot/Axs2, Robot/Axs1"),
         ("inputs", "near: Inputs"),

@@ -170,7 +170,7 @@ def test_a_silent_supervisor_is_degraded(cell: Cell, instance: str, monkeypatch:
     status = read_status(instance)
     assert status.state == "degraded"
     assert status.supervisor is not None
-    assert f"supervisor pid {os.getpid()} has shown no sign of life for 0 s" in status.note
+    assert f"supervisor pid {os.getpid()} has not responded for 0 s" in status.note
 
 
 def test_a_predecessors_pid_is_not_shown(cell: Cell, instance: str) -> None:

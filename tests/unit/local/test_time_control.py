@@ -94,22 +94,22 @@ def test_a_step_that_moves_nothing_says_so(instance: str) -> None:
     with built(instance, spec("plc", stepped=False), stepped=False) as segment:
         coordinator = Coordinator(segment)
         assert coordinator.step() == Step(1, coordinator.read().time_ns, 50 * MS)
-        assert coordinator.read().note.startswith("no source lives on the instance's clock: steps move none; ")
-        assert coordinator.read().note.endswith("; shmio step --release brings real time back"), "not cut off"
+        assert coordinator.read().note.startswith("no source uses the instance clock, so stepping has no effect; ")
+        assert coordinator.read().note.endswith("; shmio step --release returns to real time"), "not cut off"
 
 
 def test_time_that_is_taken_over_says_how_real_time_comes_back(instance: str) -> None:
     with built(instance, spec("a"), stepped=False) as segment, Participant(instance, "a"):
         coordinator = Coordinator(segment)
         coordinator.take_over()
-        told = "it stands until it is stepped; shmio step --release brings real time back"
+        told = "it is paused until the next step; shmio step --release returns to real time"
         assert coordinator.read().note == told
         coordinator.step()
         assert coordinator.read().note == ""
     with built(instance, spec("plc", stepped=False), stepped=False) as segment:
         coordinator = Coordinator(segment)
         coordinator.take_over()
-        assert coordinator.read().note.startswith("no source lives on the instance's clock")
+        assert coordinator.read().note.startswith("no source uses the instance clock")
 
 
 def test_time_that_is_released_is_real_and_never_goes_back(instance: str) -> None:
@@ -149,7 +149,7 @@ def test_time_is_released_by_its_owner_or_by_anybody_if_it_is_nobodys(instance: 
     with built(instance, stepped=False) as segment, Segment.open(instance, writable=True) as other:
         first, second = Coordinator(segment), Coordinator(other)
         first.set_playing(True)
-        with pytest.raises(TimeError, match=rf"another program \(pid {os.getpid()}\), which plays it"):
+        with pytest.raises(TimeError, match=rf"another program \(pid {os.getpid()}\), which is playing it"):
             second.release()
         assert segment.clock.read().virtual
         first.close()
@@ -170,7 +170,7 @@ def test_where_real_time_never_was_no_restart_brings_it_back(instance: str) -> N
     with built(instance, spec("plc", stepped=False), stepped=True) as segment:
         coordinator = Coordinator(segment)
         coordinator.step()
-        assert coordinator.read().note.endswith("go on in real time")
+        assert coordinator.read().note.endswith("continue in real time")
 
 
 def test_frames_are_stamped_with_the_time_after_their_step(instance: str) -> None:
@@ -307,7 +307,7 @@ def test_a_step_that_is_not_waited_for_to_its_end_is_broken_off(instance: str) -
         stepping.close()
         state = segment.clock.read()
         assert (state.stepping, state.step, state.done) == (False, 1, 0)
-        assert state.note == "step 1 failed: it was broken off"
+        assert state.note == "step 1 failed: it was cancelled"
 
 
 def latest_cycle(segment: Segment, source: str) -> int:
@@ -349,7 +349,8 @@ def test_one_program_at_a_time_moves_time(instance: str) -> None:
         first.set_playing(True, 2.0)
         for call in (second.take_over, second.step, lambda: second.set_step_size(10 * MS)):
             with pytest.raises(
-                TimeError, match=rf"moved by another program \(pid {os.getpid()}\), which plays it; stop that first$"
+                TimeError,
+                match=rf"moved by another program \(pid {os.getpid()}\), which is playing it; stop that first$",
             ):
                 call()
         assert (first.read().playing, first.read().rate) == (True, 2.0)
@@ -422,7 +423,7 @@ coordinator.step()
         coordinator.take_over()
         state = coordinator.read()
         assert (state.step, state.time_ns, state.stepping, state.playing) == (1, 50 * MS, False, False)
-        assert state.note == "step 1 was not finished: who asked for it has ended"
+        assert state.note == "step 1 was not finished: the program that requested it has ended"
         with Participant(instance, "a") as part:
             assert coordinator.step() == Step(2, 100 * MS, 50 * MS)
             assert part.steps == [(2, 100 * MS, 50 * MS)], "the one that was broken off is not done later"
@@ -495,5 +496,5 @@ def test_many_threads_take_turns(instance: str) -> None:
 def test_a_rate_is_checked(instance: str) -> None:
     with built(instance) as segment:
         for wrong in (0.0, -1.0, float("nan"), float("inf")):
-            with pytest.raises(ValueRangeError, match="a rate is above 0"):
+            with pytest.raises(ValueRangeError, match="rate must be above 0"):
                 Coordinator(segment).set_playing(True, wrong)

@@ -98,7 +98,7 @@ def test_a_rejected_command_is_rejected_for_all(writer: BlockWriter, source: lis
 def test_a_copy_by_fork_cannot_write(writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
     source_writer = SourceWriter(writer.block, 5)
     monkeypatch.setattr("os.getpid", lambda: 1)
-    with pytest.raises(CommandError, match="attach anew"):
+    with pytest.raises(CommandError, match="attach again"):
         source_writer.submit({"count": 7})
     assert writer.block.commands.pop(5) is None
 

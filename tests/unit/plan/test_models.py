@@ -140,7 +140,7 @@ def test_a_source_whose_model_is_elsewhere_has_its_outputs_in_the_segment(folder
 
 def test_without_an_endpoint_nobody_can_be_its_model(folder: Path) -> None:
     (warning,) = prepare(remote(folder, 'outputs = ["axis"]')).plan.warnings
-    assert "no model can connect to drive, for there is no [grpc] section" in warning
+    assert "no model can connect to drive, because there is no [grpc] section" in warning
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_without_an_endpoint_nobody_can_be_its_model(folder: Path) -> None:
     [
         ("", "source[0].outputs: this key is needed"),
         ('outputs = ["axes"]', "source[0].outputs: 'axes' names no register of drive"),
-        ('outputs = ["axis"]\ninouts = ["axis/position"]', "source[0].inouts: axis/position is among outputs, too"),
+        ('outputs = ["axis"]\ninouts = ["axis/position"]', "source[0].inouts: axis/position is in outputs, too"),
         ('output = ["axis"]', "source[0].output: unknown key"),
         ('outputs = ["axis"]\ntimeout_ms = 20000', "source[0].timeout_ms"),
         (
@@ -175,7 +175,7 @@ def test_what_is_wrong_with_it_is_said_with_its_key(folder: Path, keys: str, mes
         ('model = "nowhere:Belt"', "source[0].model: there is no module nowhere"),
         ('model = "line:Bolt"', "source[0].model: line has no Bolt; its models are: Belt, Gate"),
         ('model = "line:print"', "source[0].model: line has no print"),
-        ('model = "os:getcwd"', "source[0].model: os:getcwd is no subclass of shmio.simulation.Model"),
+        ('model = "os:getcwd"', "source[0].model: os:getcwd is not a subclass of shmio.simulation.Model"),
         ('model = "broken:Belt"', "broken cannot be imported: ZeroDivisionError: division by zero (broken.py, line 2)"),
         ('model = "ends:Belt"', "the process that imports ends:Belt ended with status 7: no licence"),
         ('model = "line:Belt"\nspeed = 3', "source[0].speed: unknown key"),

@@ -194,7 +194,7 @@ def test_the_successor_closes_what_a_killed_recorder_has_left(segment: Segment, 
         until(lambda: second.counts("frames") == 5, "its own")
         assert second.stop() == 0
     assert [topic for topic, _, _ in messages(old)].count("cell/frames") == 20
-    assert f"{old} is closed: its recorder did not come to that" in second.log.read_text()
+    assert f"{old} is closed now: its recorder died" in second.log.read_text()
     assert numbers(old) + numbers(second.file) == list(range(1, 26))
     assert gaps(second.file) == []
 

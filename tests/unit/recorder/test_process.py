@@ -115,7 +115,7 @@ def test_what_a_recorder_with_another_folder_has_is_said_to_be_elsewhere(segment
     with Process(segment, tmp_path, directory=str(tmp_path / "other")) as second:
         until(lambda: second.counts("frames") + second.counts("missed") == 2 * RING + 10, "all, or missed")
         second.stop()
-    assert f"; {old.name} of the recorder before is not in this folder" in second.log.read_text()
+    assert f"; {old.name} is not in this folder" in second.log.read_text()
     [file] = (tmp_path / "other").iterdir()
     [gap] = gaps(file)
     assert (gap.what, gap.first, gap.reason) == ("frames", 1, Reason.ELSEWHERE)
@@ -226,7 +226,7 @@ def test_a_recording_of_another_run_or_by_another_is_no_predecessor(segment: Seg
     with Process(segment, tmp_path) as process:
         until(lambda: process.counts("frames") == 3, "all frames")
         process.stop()
-    assert "is no recording" in process.log.read_text()
+    assert "is not a recording" in process.log.read_text()
 
 
 def test_what_others_put_into_its_folder_is_no_predecessor(segment: Segment, tmp_path: Path) -> None:
@@ -251,7 +251,7 @@ def test_what_others_put_into_its_folder_is_no_predecessor(segment: Segment, tmp
         until(lambda: process.counts("frames") == 10, "the frames from the first on")
         process.stop()
         own = process.file
-        assert "passed over: no regular file of this user" in process.log.read_text()
+        assert "ignored: not a regular file of this user" in process.log.read_text()
     after = strange.stat()
     assert (strange.read_bytes(), after.st_mtime_ns, after.st_ino) == (content, before.st_mtime_ns, before.st_ino)
     with Process(segment, tmp_path) as process:
@@ -269,11 +269,11 @@ def test_a_file_that_is_another_users_by_the_time_it_is_opened(tmp_path: Path) -
     os.mkfifo(tmp_path / "pipe.mem")
     with pytest.raises(OSError, match="symbolic link"):
         Reader(tmp_path / "link.mem", own=True)
-    with pytest.raises(RecordingError, match="is no regular file"):
+    with pytest.raises(RecordingError, match="is not a regular file"):
         Reader(tmp_path / "pipe.mem", own=True)
     if os.geteuid() == 0:
         os.chown(file, 65534, 65534)
-        with pytest.raises(RecordingError, match="is another user's, of id 65534"):
+        with pytest.raises(RecordingError, match=r"belongs to another user \(uid 65534"):
             Reader(file, own=True)
 
 
@@ -341,8 +341,8 @@ def test_after_a_failed_fsync_it_goes_on_in_a_new_file_from_what_the_disk_has(
     new = process.file
     first, second = numbers(old), numbers(new)
     assert (first[0], second[-1]) == (1, 21 + more)
-    assert "fsync: Input/output error: what was written behind byte" in process.log.read_text()
-    assert f"may be lost; going on in {new}" in process.log.read_text()
+    assert "fsync: Input/output error: what was written after byte" in process.log.read_text()
+    assert f"may be lost; continuing in {new}" in process.log.read_text()
     with Reader(new) as reader:
         assert check(reader).whole
         assert reader.about["doubtful"] == old.name

@@ -202,7 +202,7 @@ def test_a_file_whose_predecessor_could_not_be_written_stays_empty(
         outputs[-1].write(b"data")
     assert not outputs[0].close(30)
     assert not outputs[1].close(30)
-    assert "one before it was not written to its end" in outputs[1].problem
+    assert "one, the file before it, was not written completely" in outputs[1].problem
     assert (tmp_path / "two").read_bytes() == b""
 
 

@@ -108,7 +108,7 @@ def test_of_each_damaged_chunk_it_is_told_where_it_is_and_the_rest_is_read(file:
         numbers = [message.item.number for message in chunks[turn] if isinstance(message.item, Frame)]
         if numbers and turn + 1 < len(chunks):
             gap = 11 if turn == 2 else numbers[0]
-            lost = f"cell, block 1: frames {gap} to {numbers[-1]} are neither there nor in a gap"
+            lost = f"cell, block 1: frames {gap} to {numbers[-1]} are missing, and in no gap"
             assert lost in found.problems
 
 
@@ -139,7 +139,7 @@ def test_times_of_a_chunk_that_are_not_its_messages_are_told(file: Path, recordi
     changed[chunk.at + field] ^= 1
     file.write_bytes(changed)
     found = found_in(file)
-    assert found.problems == [f"the chunk at byte {chunk.at}: its times are not those of its messages"]
+    assert found.problems == [f"the chunk at byte {chunk.at}: its times differ from those of its messages"]
     assert found.damage == []
 
 
@@ -225,7 +225,7 @@ def test_numbers_that_nobody_accounts_for_are_told(
         work.turn()
     publish(writer, 2)
     assert work.close()
-    assert found_in(work.output.path).problems == ["cell, block 1: frames 6 to 8 are neither there nor in a gap"]
+    assert found_in(work.output.path).problems == ["cell, block 1: frames 6 to 8 are missing, and in no gap"]
 
 
 def _dropped(side: block_follower._Stream[Frame]) -> list[block_follower.BlockEntry]:
@@ -236,5 +236,5 @@ def _dropped(side: block_follower._Stream[Frame]) -> list[block_follower.BlockEn
 
 def test_what_is_no_recording_of_ours_is_refused(tmp_path: Path) -> None:
     (tmp_path / "x.mem").write_bytes(MAGIC + struct.pack("<BQ", Opcode.HEADER, 8) + bytes(8))
-    with pytest.raises(RecordingError, match="no recording of shmio"):
+    with pytest.raises(RecordingError, match="not a recording of shmio"):
         found_in(tmp_path / "x.mem")

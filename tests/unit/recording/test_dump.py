@@ -155,7 +155,7 @@ def test_columns_have_what_frames_have(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("paths", "message"),
     [
-        (["count"], "there are 2 sources"),
+        (["count"], "not one of the 2 sources"),
         (["cell/nothing"], "no such register"),
         (["cell/count", "press/count"], "registers of cell and press"),
         (["cell/count/in"], "leave out /in"),
@@ -240,7 +240,7 @@ def test_files_of_two_runs_are_not_one_dump(tmp_path: Path) -> None:
     with build(tmp_path / "b.mem", epoch="11" * 8) as work:
         work.block("cell")
         work.frame(1, image(1))
-    with pytest.raises(RecordingError, match=r"b.mem and .*a.mem are of different runs"):
+    with pytest.raises(RecordingError, match=r"b.mem and .*a.mem come from different runs"):
         shmio.open_dump([plain(tmp_path / "a.mem"), tmp_path / "b.mem"])
     with pytest.raises(RecordingError, match="a dump is of 1 to"):
         shmio.open_dump([])
@@ -258,7 +258,7 @@ def test_a_layout_that_changed(tmp_path: Path) -> None:
     with shmio.open_dump(tmp_path / "a.mem") as dump:
         assert [(block.section, block.layout.size) for block in dump.blocks] == [(1, 16), (5, 4)]
         assert len(list(dump.frames("cell"))) == 20
-        with pytest.raises(RecordingError, match="a reload changed the registers"):
+        with pytest.raises(RecordingError, match="a reload changed these registers"):
             dump.columns("count")
         assert dump.columns("count", at(11))["count"].tolist() == list(range(11, 21))
         assert dump.columns("speed")["speed"].tolist() == [0.0] * 10

@@ -109,7 +109,7 @@ def test_a_full_queue_is_an_error_to_the_sender(segment: Segment) -> None:
         sender.submit([write], 0)
     with pytest.raises(CommandError, match="cell: its command queue is full"):
         sender.submit([write], 0)
-    with pytest.raises(CommandError, match="are the most"):
+    with pytest.raises(CommandError, match="at most"):
         sender.submit([Write(0, 0, bytes(capacity_for(2)))], 0)
     with pytest.raises(CommandError, match=f"1 to {MAX_WRITES} items"):
         sender.submit([], 0)

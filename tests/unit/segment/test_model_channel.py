@@ -149,9 +149,9 @@ def test_inputs_and_outputs_are_those_that_the_patterns_say() -> None:
     ("outputs", "inouts", "message"),
     [
         (["axis", "axes"], [], "outputs: 'axes' names no register of DRIVE"),
-        (["axis"], ["lamps/3"], "inouts: 'lamps/3' names no register of DRIVE; it takes whole registers"),
+        (["axis"], ["lamps/3"], "inouts: 'lamps/3' names no register of DRIVE; only whole registers are allowed"),
         ([""], [], "outputs: "),
-        (["axis"], ["axis/moving"], "inouts: axis/moving is among outputs, too"),
+        (["axis"], ["axis/moving"], "inouts: axis/moving is in outputs, too"),
     ],
 )
 def test_patterns_that_name_nothing_are_refused(outputs: list[str], inouts: list[str], message: str) -> None:

@@ -106,7 +106,7 @@ def test_one_that_another_supervisor_takes_for_left_over_is_given_up(
         return shared
 
     monkeypatch.setattr(SharedObject, "create", overtaken)
-    with pytest.raises(AlreadyRunningError, match=f"just starting instance {instance}"):
+    with pytest.raises(AlreadyRunningError, match=f"starting instance {instance}"):
         Segment.create(instance, [block()], PROCESSES)
     for other in others:
         assert other.size == 0, "it is the other one's by now"
@@ -122,7 +122,7 @@ def test_a_ring_without_a_readable_frame_is_told_with_the_remedy(instance: str) 
         writer.publish(b"unique", cycle=0)
         at = bytes(segment.memory).find(b"unique") - RAW_OFFSET
         segment.memory[at : at + 8] = (2 * 9 + 1).to_bytes(8, "little")  # a later frame is being written there
-        with pytest.raises(SegmentError, match=r"turns faster.*ring_mb"):
+        with pytest.raises(SegmentError, match=r"overwritten faster.*ring_mb"):
             segment.blocks["cell"].latest()
         segment.unlink()
 
@@ -177,10 +177,10 @@ def test_another_abi_is_refused_by_name(instance: str) -> None:
 def test_something_else_by_that_name_is_refused(instance: str) -> None:
     path = Path("/dev/shm") / f"shmio-{instance}"
     path.write_bytes(b"")
-    with pytest.raises(NotRunningError, match="just starting"):
+    with pytest.raises(NotRunningError, match="is starting"):
         Segment.open(instance)
     path.write_bytes(bytes(HEADER_SIZE))
-    with pytest.raises(UnfinishedError, match="not a whole shmio segment"):
+    with pytest.raises(UnfinishedError, match="not a complete shmio segment"):
         Segment.open(instance)
 
 

@@ -120,7 +120,7 @@ def test_what_does_not_end_is_named_and_keeps_the_segment(instance: str, monkeyp
                 clear(instance)
         assert str(caught.value) == (
             f"instance {instance!r} has processes that do not end: cell: pid {orphan} was killed and lives on: "
-            "free what it waits for, or restart the host; then try again"
+            "remove the cause, or restart the host; then try again"
         )
         assert instance in instances()
         assert clear(instance)[0].startswith(f"stopped cell, pid {orphan}")

@@ -62,7 +62,7 @@ def test_what_is_no_name_is_refused(text: str) -> None:
         (BELT, "plant_m:Blet", "plant_m has no Blet; its models are: Belt"),
         (BELT, "plant_n:Belt", "there is no module plant_n that is installed or in "),
         (BELT, "plant_m.deeper:Belt", "there is no module plant_m.deeper that is installed or in "),
-        (BELT, "plant_m:Output", "plant_m:Output is no subclass of shmio.simulation.Model"),
+        (BELT, "plant_m:Output", "plant_m:Output is not a subclass of shmio.simulation.Model"),
         (
             "import nowhere_at_all",
             "plant_m:Belt",

@@ -80,10 +80,10 @@ def test_a_subclass_has_the_registers_of_the_class_above() -> None:
         (lambda: Output("INT", 70_000), "speed: INT: 70000 is out of range"),
         (lambda: Output("INT", "fast"), "speed: INT: expected a literal such as 0, found 'fast'"),
         (lambda: Output("ARRAY[0..1] OF INT", [1, 2, 3]), "speed: initial: expected at most 2 values, found more"),
-        (lambda: Input("INT", path="axis/in"), "axis/in: it ends in a direction"),
+        (lambda: Input("INT", path="axis/in"), "axis/in: the path ends in a direction"),
         (lambda: Input("INT", path="a//b"), "a//b: empty segment in the path"),
-        (lambda: Input("INT", path="first"), "speed: the path 'first' is there already"),
-        (lambda: Input("INT", path="first/second"), "first/second: first is a value itself"),
+        (lambda: Input("INT", path="first"), "speed: the path 'first' is used twice"),
+        (lambda: Input("INT", path="first/second"), "first/second: first is already a register"),
         (lambda: Input({"a": "INT"}, {"b": 1}), "speed: initial: expected a dict with some of a, found {'b': 1}"),
         (lambda: InOut("JointTrajectory[6]"), "speed: expected JointTrajectory[joints, points] with at most 64 joints"),
         (lambda: Parameter("RAEL"), "speed: there is no type 'RAEL'"),
@@ -104,7 +104,7 @@ def test_several_faults_are_told_together() -> None:
 
 @pytest.mark.parametrize("name", ["step", "start", "random", "_hidden"])
 def test_names_of_the_model_itself_are_no_registers(name: str) -> None:
-    with pytest.raises(ModelError, match=f"model Wrong: {name}: call it otherwise"):
+    with pytest.raises(ModelError, match=f"model Wrong: {name}: choose another name"):
         type("Wrong", (Still,), {name: Input("INT")})
 
 

@@ -30,7 +30,7 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path: Path, monkeypatch
     assert logs.problem(SILENT_NS + 1) == f"log_dir: {tmp_path}: the disk does not answer"
     assert looks == [tmp_path], "one look at a time"
     answering.set()
-    until(lambda: logs.problem(0) == "log_dir: it is full; what is logged meanwhile is lost")
+    until(lambda: logs.problem(0) == "log_dir: it is full; log lines are lost until that is fixed")
 
 
 def test_status_tells_of_it_while_it_lasts_and_all_goes_on(launch: Launch, tmp_path: Path) -> None:
@@ -42,7 +42,7 @@ def test_status_tells_of_it_while_it_lasts_and_all_goes_on(launch: Launch, tmp_p
     tmp_path.touch()
     try:
         until(lambda: cell.status().state == "degraded")
-        assert cell.status().note == f"log_dir: {tmp_path} is no folder; what is logged meanwhile is lost"
+        assert cell.status().note == f"log_dir: {tmp_path} is not a directory; log lines are lost until that is fixed"
         cell.wait_state("degraded")
     finally:
         tmp_path.unlink()

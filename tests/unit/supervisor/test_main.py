@@ -191,8 +191,8 @@ def test_a_supervisor_that_fails_leaves_all_to_the_next_one(launch: Launch) -> N
     os.kill(cell.pid("press"), signal.SIGKILL)
     assert cell.wait_end() == 1
     assert cell.errors() == (
-        "the supervisor failed: BrokenPipeError: [Errno 32] Broken pipe; its processes go on, and shmio-supervisor up "
-        "takes them over\n"
+        "the supervisor failed: BrokenPipeError: [Errno 32] Broken pipe; its processes continue, and "
+        "shmio-supervisor up takes them over\n"
     )
     assert "Traceback" in cell.log()
     successor = launch()
@@ -270,7 +270,7 @@ def test_only_what_is_configured_otherwise_is_replaced_at_a_take_over(launch: La
         assert list(segment.blocks) == ["cell", "robot"]
     os.kill(successor.pid("plc"), signal.SIGKILL)
     until(lambda: successor.of("plc").restarts == 1 and successor.of("plc").state == "running")
-    assert "plc crashed: ended; its exit status is not known" in successor.log()
+    assert "plc crashed: ended; its exit status is unknown" in successor.log()
 
 
 def test_a_closed_terminal_stops_it_in_good_order(launch: Launch, tmp_path: Path) -> None:
@@ -280,7 +280,7 @@ def test_a_closed_terminal_stops_it_in_good_order(launch: Launch, tmp_path: Path
     cell.wait_state("stopping")
     cell.process.send_signal(signal.SIGHUP)  # the shell sends one, too
     assert cell.wait_end() == 0
-    assert "killing what has not stopped yet" not in cell.log()
+    assert "killing the processes that have not stopped yet" not in cell.log()
     assert cell.instance not in instances()
 
 
@@ -301,7 +301,7 @@ def test_a_removed_segment_stops_the_instance(launch: Launch, tmp_path: Path) ->
     cell.wait_state("running")
     Path(f"/dev/shm/shmio-{cell.instance}").unlink()
     assert cell.wait_end() == 1
-    error = f"the shared memory shmio-{cell.instance} was removed while the instance ran: all is stopped\n"
+    error = f"the shared memory shmio-{cell.instance} was removed while the instance ran: stopping all processes\n"
     assert cell.errors() == error
     assert error in cell.log()
     assert (tmp_path / "ends").read_text().split() == ["grpc", "cell", "plc"]

@@ -33,7 +33,7 @@ def test_the_log_tells_what_a_recorder_lost_while_it_was_in_trouble(
             managed.listen()
             assert managed.complaint == complaint
         segment.unlink()
-    assert caplog.messages == ["recorder is well again; 8 frames and events were lost"]
+    assert caplog.messages == ["recorder has recovered; 8 frames and events were lost"]
 
 
 class Told:

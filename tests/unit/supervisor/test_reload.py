@@ -284,7 +284,7 @@ def test_while_a_reload_is_planned_the_supervisor_looks_after_all(launch: Launch
     asking = threading.Thread(target=lambda: answers.append(cell.request(Reload())))
     asking.start()
     with (cell.folder / "slow").open("w"):  # it is being planned, and will not be done before this is closed
-        with pytest.raises(ControlError, match="another reload is just being planned: ask again when it is over"):
+        with pytest.raises(ControlError, match="another reload is being prepared: try again when it is done"):
             cell.request(Reload())
         os.kill(cell.pid("cell"), signal.SIGKILL)
         until(lambda: cell.of("cell").restarts == 1 and cell.of("cell").state == "running")
@@ -329,7 +329,7 @@ def test_a_stop_ends_a_change_under_way(launch: Launch) -> None:
     cell.wait_state("running")
     asking, outcomes = refused_later(cell)
     until(lambda: cell.of("press").note == "stopping")
-    with pytest.raises(ControlError, match="just being changed"):
+    with pytest.raises(ControlError, match="change of the instance is in progress"):
         cell.request(Restart("plc"))
     cell.process.send_signal(signal.SIGTERM)
     asking.join()

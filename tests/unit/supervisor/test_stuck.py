@@ -13,7 +13,7 @@ from shmio.segment import Segment, instances
 from shmio.supervisor.control import Reload, Restart, Stop
 from tests.unit.supervisor.harness import CELL, Launch, Launched, until
 
-STUCK = "pid {pid} was killed and lives on: free what it waits for, or restart the host"
+STUCK = "pid {pid} was killed and lives on: remove the cause, or restart the host"
 
 
 def held(launch: Launch, name: str) -> tuple[Launched, int, str]:
@@ -59,9 +59,9 @@ def test_a_reload_names_what_does_not_end_and_goes_on_when_it_has(launch: Launch
     cell, pid, stuck = held(launch, "cell")
     with pytest.raises(ControlError) as caught:
         cell.reload([*CELL[:1], *CELL[2:]])
-    assert str(caught.value) == f"{stuck}; the reload goes on as soon as it has ended"
+    assert str(caught.value) == f"{stuck}; the reload continues as soon as it has ended"
     assert cell.of("cell").note == STUCK.format(pid=pid)
-    with pytest.raises(ControlError, match=f"just being changed, which waits for what does not end: {stuck}"):
+    with pytest.raises(ControlError, match=f"in progress and waits for a process that does not end: {stuck}"):
         cell.request(Reload())
     os.kill(pid, signal.SIGKILL)
     until(lambda: list(cell.pids()) == ["plc", "grpc"])
@@ -74,7 +74,7 @@ def test_a_stop_names_what_does_not_end_and_stops_all_else(launch: Launch) -> No
     for _ in range(2):
         with pytest.raises(ControlError) as caught:
             cell.request(Stop())
-        assert str(caught.value) == f"all else is stopped, but {stuck}; the stop goes on as soon as it has ended"
+        assert str(caught.value) == f"all else is stopped, but {stuck}; the stop continues as soon as it has ended"
     for fd in others:
         with pytest.raises(ProcessLookupError):
             signal.pidfd_send_signal(fd, 0)

@@ -196,7 +196,7 @@ class CommandClient:
                 raise CommandError(RETIRED)
             if self._silent and self._in_flight:  # one command at a time probes the source
                 raise CommandError(
-                    f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
+                    f"source {self.block.source} does not answer; shmio-supervisor status shows its state"
                 )
             self._in_flight.add(submit(), cost, done, accepted, until_accepted=until_accepted)
             self._start_timer()
@@ -374,7 +374,7 @@ async def _laid(commands: CommandClient, send: Callable[[Done], int]) -> int:
 
 
 async def lift(commands: CommandClient, injection: int) -> str:
-    """Lift an injection; return why it still stands, or an empty text if it does not."""
+    """Lift an injection; return why that failed, or an empty text."""
     try:
         _check(commands)
         answer = Answer()

@@ -178,7 +178,7 @@ class Publisher:
             path = request.path
             destination = await self._resolve(request)
         except DecodeError:
-            self._refusals.add(f"{len(message)} bytes are no PubRequest", path, peer)
+            self._refusals.add(f"{len(message)} bytes are not a PubRequest", path, peer)
             value.end()
             return
         except ShmioError as error:
@@ -254,14 +254,16 @@ class Publisher:
         """Resolve a request; raises what :meth:`write` raises."""
         if shadow := self._shadows.find(request.path):
             if shadow.kind is ShadowKind.ORIGINALS:
-                raise CommandError(f"{shorten(request.path)}: originals come from here; values go to the shadow's /in")
+                raise CommandError(
+                    f"{shorten(request.path)}: this topic delivers the originals; publish values to the shadow's /in"
+                )
             injection = shadow.injection
             values = await _read(request, injection.shape)
             return _Destination(partial(injection.give, values), injection.ready(values))
         topic = self._topics.topic(request.path)
         found = shape(self._topics.layout(topic), topic)
         if topic.direction == "out":
-            raise CommandError(f"{shorten(request.path)}: what comes out of a source is not published to; use /in")
+            raise CommandError(f"{shorten(request.path)}: an output of a source cannot be published to; use /in")
         values = await _read(request, found)
         if len(values) > MAX_VALUES:
             raise ValueRangeError(

@@ -37,10 +37,10 @@ class Topics:
         topic = self._parse(path)
         if topic.source not in self._feeds:
             if self._time_topic(topic):
-                raise PathError(f"{shorten(path)}: it can be subscribed to, and nothing else")
+                raise PathError(f"{shorten(path)}: it can only be subscribed to")
             raise PathError(
-                f"{shorten(path)}: {topic.source} is reserved; SIMLOG://step, model/clock and shadows that stand are "
-                "all there is"
+                f"{shorten(path)}: {topic.source} is reserved; only SIMLOG://step, model/clock and existing shadows "
+                "are available"
             )
         return topic
 

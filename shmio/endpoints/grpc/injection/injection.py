@@ -151,7 +151,7 @@ class Injection(InjectionFollower):
         """
         await self.laid()
         if self.over:
-            raise PathError(f"the injection over {self.target} is over: {self.over}")
+            raise PathError(f"the injection over {self.target} has ended: {self.over}")
         shown = False
 
         def show() -> None:

@@ -96,7 +96,7 @@ class Shadows:
         if injection is None:
             feed = self._topics.feed(target.source)
             if sum(other.feed is feed for other in self._holders) >= MAX_INJECTIONS:
-                raise EndpointError(f"{MAX_INJECTIONS} injections stand on {target.source} already: end one")
+                raise EndpointError(f"{MAX_INJECTIONS} injections cover {target.source} already, the maximum: end one")
             injection = Injection(target, shape, feed, f"{shorten(next(iter(kinds)), 60)} of {shorten(peer, 40)}")
             self._named |= {self._topics.name(path): Shadow(injection, kind) for path, kind in kinds.items()}
             self._holders[injection] = set()

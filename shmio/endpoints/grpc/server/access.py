@@ -140,9 +140,7 @@ class ListenerAccess:
         """Check a call, and return the name of the client's token or None. DeniedError: refused."""
         needed = NEEDS.get(method)
         if needed is None:
-            raise DeniedError(
-                grpc.StatusCode.PERMISSION_DENIED, f"{method}: this call has no role that could allow it; nobody may"
-            )
+            raise DeniedError(grpc.StatusCode.PERMISSION_DENIED, f"{method}: no role allows this call")
         secret = None if shown.token is None else self._secret(shown.token)
         if needed in self.anonymous:
             return secret.name if secret else None
@@ -157,15 +155,15 @@ class ListenerAccess:
         if not self._takes_tokens:
             raise DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
-                "this address is plain text that others can read, and takes no tokens: use the one with TLS, and have "
-                "this token replaced, for it is known by now",
+                "this address is plain text, which others can read, and accepts no tokens: use the address with TLS, "
+                "and have this token replaced, because others may know it now",
             )
         secret = self.keys.secret(shown)
         if secret is None:
             raise DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
-                "the token is none of [[grpc.token]]: send authorization: Bearer TOKEN with one that is; after a "
-                "change of its file, shmio-supervisor reload takes it",
+                "the token is not in [[grpc.token]]: send authorization: Bearer TOKEN with one that is; after a "
+                "change of its file, run shmio-supervisor reload",
             )
         return secret
 
@@ -174,9 +172,9 @@ class ListenerAccess:
     ) -> DeniedError:
         call = method.rpartition("/")[2]
         if secret is not None:
-            who, roles, where = f"token {secret.name!r}", secret.roles | by_name, "roles in [[grpc.token]]"
+            who, roles, where = f"token {secret.name!r}", secret.roles | by_name, "its roles in [[grpc.token]]"
         elif by_name:
-            who, roles, where = f"the certificate of {shown.names[0]!r}", by_name, "roles in [[grpc.client]]"
+            who, roles, where = f"the certificate of {shown.names[0]!r}", by_name, "its roles in [[grpc.client]]"
         elif self._takes_tokens and self.keys.secrets:
             gives = f"gives {_listed(self.anonymous)}" if self.anonymous else "gives nothing"
             return DeniedError(
@@ -185,12 +183,12 @@ class ListenerAccess:
                 "authorization: Bearer TOKEN with one of [[grpc.token]]",
             )
         elif shown.names:
-            who, roles, where = f"the certificate of {shown.names[0]!r}", self.anonymous, "an entry in [[grpc.client]]"
+            who, roles, where = f"the certificate of {shown.names[0]!r}", self.anonymous, "[[grpc.client]]"
         else:
-            who, roles, where = "this address", self.anonymous, "its roles in [[grpc.address]]"
+            who, roles, where = "this address", self.anonymous, "the roles of the address in [[grpc.address]]"
         return DeniedError(
             grpc.StatusCode.PERMISSION_DENIED,
-            f"{call} needs the role {needed}; {who} has {_listed(roles)}: {where} would have to name it",
+            f"{call} needs the role {needed}; {who} has {_listed(roles)}: add it to {where}",
         )
 
 

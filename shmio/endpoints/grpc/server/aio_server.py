@@ -30,7 +30,7 @@ _NEEDED: Final[Mapping[str, str]] = {
     "_RequestCallError": "",
     "get_working_loop": "",
 }
-_NO_CALL: Final = "there is no such call: see the services by reflection"
+_NO_CALL: Final = "there is no such call; reflection lists the services"
 
 
 def check_version() -> None:

@@ -131,7 +131,7 @@ class OpenCalls:
         if count >= limits.calls:
             raise DeniedError(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
-                f"{limits.calls} calls are open at once, which is the most: try again when others have ended",
+                f"{limits.calls} calls are open, the maximum: try again when others have ended",
             )
         if count >= limits.calls - limits.reserve and self._by_client[client] >= limits.share:
             raise DeniedError(
@@ -216,5 +216,5 @@ async def _parsed(method: str, decode: Decode | None, data: bytes, context: Cont
         return data if decode is None else decode(data)
     except DecodeError:
         await context.abort(
-            grpc.StatusCode.INVALID_ARGUMENT, f"{method}: {len(data)} bytes are no message of this call"
+            grpc.StatusCode.INVALID_ARGUMENT, f"{method}: {len(data)} bytes are not a valid message of this call"
         )

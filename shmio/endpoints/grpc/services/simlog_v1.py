@@ -276,7 +276,7 @@ class SimlogV1:
 
         """
         if not topic.path:
-            raise ValueRangeError(f"{topic}: a source; version 1 serves what is in it")
+            raise ValueRangeError(f"{topic}: a source; version 1 serves only its registers")
         found = shape(self._topics.layout(topic), topic)
         message_type(found)
         return found

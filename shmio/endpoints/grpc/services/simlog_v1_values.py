@@ -62,7 +62,7 @@ def _known(found: Shape) -> tuple[str, Found]:
     known = recognise(found.path, found.registers)
     if known is None:
         raise ValueRangeError(
-            f"{shorten(found.path)}: a structure that version 1 has no message for; its members are topics"
+            f"{shorten(found.path)}: version 1 has no message for this structure; use its members as topics"
         )
     return known
 

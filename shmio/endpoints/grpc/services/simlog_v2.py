@@ -185,19 +185,19 @@ class Subscribers:
 
         """
         if not uuid:
-            raise ValueRangeError("uuid: it is needed, to say in Subscribe whose stream the topic is for")
+            raise ValueRangeError("uuid: this field is needed, because Subscribe names its stream by it")
         if max(len(uuid), len(name)) > MAX_NAME:
             raise ValueRangeError(f"name and uuid have at most {MAX_NAME} characters")
         before = self._open.get(uuid)
         if before is not None and before.holder != holder:
-            raise ConflictError(f"uuid {shorten(uuid)!r} is another client's: take one that is drawn by chance")
+            raise ConflictError(f"uuid {shorten(uuid)!r} belongs to another client: choose a random one")
         if before is not None:
             del self._open[uuid]
             before.replaced = True
             before.close()
             before.outbox.clear()
             before.outbox.end()
-            log.info("subscriber %s came again; its stream before ends", shorten(name), extra=fields(uuid=uuid))
+            log.info("subscriber %s connected again; its earlier stream ends", shorten(name), extra=fields(uuid=uuid))
         elif len(self._open) >= MAX_SUBSCRIBERS:
             raise EndpointError(f"there are {MAX_SUBSCRIBERS} subscribers already; one stream serves many topics")
         subscriber = self._open[uuid] = Subscriber(self._topics, self._shadows, self._time_topics, name, outbox, holder)
@@ -231,8 +231,8 @@ class Subscribers:
             )
         if len(subscriber) >= MAX_TOPICS or sum(map(len, self._open.values())) >= MAX_ALL_TOPICS:
             raise EndpointError(
-                f"{shorten(path)}: too many subscriptions: {MAX_TOPICS} a subscriber and {MAX_ALL_TOPICS} in all are "
-                "the most"
+                f"{shorten(path)}: too many subscriptions: at most {MAX_TOPICS} for each subscriber and "
+                f"{MAX_ALL_TOPICS} in total are allowed"
             )
         subscriber.add(path)
 
@@ -422,8 +422,8 @@ class SimlogV2:
             members, elements = members + len(found.registers), elements + found.elements
             if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
                 raise ValueRangeError(
-                    f"{shorten(path)}: too much for one Read: {MAX_MEMBERS} registers with {MAX_ELEMENTS} elements are "
-                    "the most"
+                    f"{shorten(path)}: too much for one Read: at most {MAX_MEMBERS} registers with "
+                    f"{MAX_ELEMENTS} elements are allowed"
                 )
             wanted.append((path, shadow or topic.source, found))
         sources = {source for _, source, _ in wanted if isinstance(source, str)}

@@ -81,8 +81,8 @@ def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessa
     members, elements = len(found.registers), found.elements
     if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
         raise ValueRangeError(
-            f"{shorten(found.path)}: {members} registers with {elements} elements are too much for one value, "
-            f"{MAX_MEMBERS} with {MAX_ELEMENTS} are the most; its members are topics, too"
+            f"{shorten(found.path)}: {members} registers with {elements} elements are too many for one value, "
+            f"at most {MAX_MEMBERS} with {MAX_ELEMENTS} are allowed; its members are topics, too"
         )
     head = wire.SimlogMessage(type=value_type(found)).SerializeToString() + b"\x1a"
     serialise = _whole(found.registers[0], layout) if found.whole else _structure(found, layout)
@@ -230,7 +230,7 @@ def _members(
 ) -> Callable[[bytes, WireValue], None]:
     """Return a function that fills in a structure; ``parts``: each register's remaining names."""
     if not levels:
-        raise ValueRangeError(f"{shorten(parts[0][1].path)}: more than {MAX_LEVELS} structures within each other")
+        raise ValueRangeError(f"{shorten(parts[0][1].path)}: more than {MAX_LEVELS} nested structures")
     groups: dict[str, list[tuple[list[str], Register]]] = {}
     for (name, *rest), register in parts:
         groups.setdefault(decode_segment(name), []).append((rest, register))

@@ -147,7 +147,7 @@ class TimeCalls:
         Status RESOURCE_EXHAUSTED: too many streams.
         """
         if len(self._watchers) >= MAX_WATCHERS:
-            await refuse(context, EndpointError(f"{MAX_WATCHERS} calls of WatchClock are open, the most there may be"))
+            await refuse(context, EndpointError(f"{MAX_WATCHERS} calls of WatchClock are open, the maximum"))
         news = asyncio.Event()
         self._watchers.add(news)
         try:

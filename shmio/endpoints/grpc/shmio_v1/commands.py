@@ -129,7 +129,7 @@ class CommandCalls:
     def _check_room(self) -> None:
         """Raise EndpointError if too many calls are open."""
         if len(self._open) >= MAX_INJECTIONS:
-            raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the most there may be")
+            raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the maximum")
 
     async def _close(self, one: InjectCall | DeclareCall, opening: asyncio.Task[bytes]) -> None:
         try:

@@ -52,7 +52,7 @@ class DeclareCall:
         """
         if len(request.declarations) > MAX_DECLARATIONS:  # first: reading them blocks the event loop
             raise ValueRangeError(
-                f"{len(request.declarations)} injections are declared, {MAX_DECLARATIONS} are the most"
+                f"{len(request.declarations)} injections are declared, at most {MAX_DECLARATIONS} are allowed"
             )
         tables = [declaration_from_wire(one, f"injection[{index}]") for index, one in enumerate(request.declarations)]
         if not tables:

@@ -42,25 +42,25 @@ class InjectTarget(NamedTuple):
 def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
     """Read what an injection is to be over. Raises PathError or ValueRangeError."""
     if not (lay.patterns or lay.ranges):
-        raise ValueRangeError("no pattern is given, and no range: an injection stands over something")
+        raise ValueRangeError("no pattern and no range is given: name the registers to inject into")
     for name, given in (("patterns", len(lay.patterns)), ("ranges", len(lay.ranges))):
         if given > MAX_PATTERNS:
-            raise ValueRangeError(f"{given} {name}, {MAX_PATTERNS} are the most: use stars, or structures")
+            raise ValueRangeError(f"{given} {name}, at most {MAX_PATTERNS} are allowed: use stars or structures")
     found = tuple(dict.fromkeys(topics.topic(pattern) for pattern in lay.patterns))
     places = {SourceDirection(topic.source, topic.direction == "in") for topic in found}
     if len({place.source for place in places}) > 1:
-        raise PathError("one injection is over one source: lay one for each, with a stream each")
+        raise PathError("an injection covers one source: lay one for each source, each with its own stream")
     if len(places) > 1:
-        raise PathError(f"{shorten(lay.patterns[0])}, …: an injection is over /out or over /in, not over both")
+        raise PathError(f"{shorten(lay.patterns[0])}, …: an injection covers /out or /in, not both")
     if lay.direction not in wire.Direction.values():
-        raise ValueRangeError(f"direction: {lay.direction} is none; 0 is /out, 1 is /in")
+        raise ValueRangeError(f"direction: {lay.direction} is invalid; 0 is /out, 1 is /in")
     if lay.source:
         topic = topics.topic(lay.source)
         if topic.path or topic.direction:
             raise PathError(f"source: {shorten(lay.source)} is not a source's name")
         places.add(SourceDirection(topic.source, places.pop().inward if places else lay.direction == wire.DIRECTION_IN))
     if len(places) != 1:
-        raise PathError("source: ranges without a pattern need to be told whose bytes they are")
+        raise PathError("source: this field is needed for ranges without a pattern")
     return InjectTarget(places.pop(), found, tuple(lay.ranges))
 
 
@@ -74,11 +74,11 @@ class ByteRanges:
         for one in ranges:
             if not one.size or one.offset + one.size > size:
                 raise ValueRangeError(
-                    f"ranges: {one.size} bytes from byte {one.offset} on are none, or not all in the block, which has "
-                    f"{size}"
+                    f"ranges: expected at least one byte, within the block of {size} bytes; found {one.size} bytes "
+                    f"from byte {one.offset} on"
                 )
             if one.mask > 0xFF:
-                raise ValueRangeError(f"ranges: the mask {one.mask} has bits that a byte has not")
+                raise ValueRangeError(f"ranges: the mask {one.mask} is larger than a byte")
             span, mask = slice(one.offset, one.offset + one.size), one.mask or 0xFF
             self._spans.append((span, mask))
             self._bits[span] |= mask
@@ -124,7 +124,7 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
     ValueRangeError: the injection is not over all of the bytes, or there are too many pieces.
     """
     if len(pieces) > MAX_VALUES:
-        raise ValueRangeError(f"{len(pieces)} pieces, {MAX_VALUES} are the most: join neighbours, or give less at once")
+        raise ValueRangeError(f"{len(pieces)} pieces, at most {MAX_VALUES} are allowed: join neighbours, or send fewer")
     cover = np.frombuffer(bits, np.uint8)
     image, given = np.zeros(len(bits), np.uint8), np.zeros(len(bits), np.uint8)
     spans = []
@@ -133,7 +133,7 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
         wanted = cover[span] & (piece.mask or 0xFF if piece.mask <= 0xFF else 0)
         if not piece.data or span.stop > len(bits) or not wanted.all():
             raise ValueRangeError(
-                f"pieces: the injection is not over all of the {len(piece.data)} bytes from byte {piece.offset} on"
+                f"pieces: the injection does not cover all of the {len(piece.data)} bytes from byte {piece.offset} on"
             )
         image[span] ^= (image[span] ^ np.frombuffer(piece.data, np.uint8)) & wanted
         given[span] |= wanted
@@ -201,7 +201,7 @@ class InjectCall(InjectionFollower):
         self._base = InjectionBase(view.block)
         self._commands = self._selections.commands(self.source)
         if self._commands.block is not view.block:
-            raise CommandError(f"{self.source}: it was changed by a reload in this very moment; try again")
+            raise CommandError(f"{self.source}: a reload changed it concurrently; try again")
         lay = self._lay
         self._base.number = await command_client.lay(
             self._commands,
@@ -314,7 +314,7 @@ class InjectCall(InjectionFollower):
         if shadow.assignments:
             source, named = await assigned(shadow.assignments, self._topics)
             if source != self.source:
-                raise PathError(f"the injection is over {self.source}, the values are for {source}")
+                raise PathError(f"the injection covers {self.source}, but the values are for {source}")
             values |= named
         raw = raw_writes(shadow.pieces, self._bits)
         if not (values or raw):
@@ -396,4 +396,4 @@ def _check(lay: wire.Lay) -> None:
     if lay.lifetime_ms > MAX_LIFETIME_MS:
         raise ValueRangeError(f"lifetime_ms: at most {MAX_LIFETIME_MS}, a day")
     if lay.keep and lay.lifetime_ms:
-        raise ValueRangeError("keep and lifetime_ms: what is kept stays until somebody lifts it")
+        raise ValueRangeError("keep and lifetime_ms exclude each other: a kept injection stays until somebody lifts it")

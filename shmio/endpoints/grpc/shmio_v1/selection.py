@@ -65,14 +65,18 @@ class Selections:
 
         """
         if not patterns:
-            raise ValueRangeError("no pattern is given: a path, structure, glob, or a source's name for all it has")
+            raise ValueRangeError(
+                "no pattern is given: name a path, a structure, a glob, or a source for all of its registers"
+            )
         if len(patterns) > MAX_PATTERNS:
-            raise ValueRangeError(f"{len(patterns)} patterns, {MAX_PATTERNS} are the most: use stars, or structures")
+            raise ValueRangeError(
+                f"{len(patterns)} patterns, at most {MAX_PATTERNS} are allowed: use stars or structures"
+            )
         wanted: dict[SourceDirection, dict[Topic, None]] = {}
         for pattern in patterns:
             topic = self._topics.topic(pattern)
             if topic.direction == "in" and not inward:
-                raise PathError(f"{shorten(pattern)}: what goes into a source is not read here; leave out /in")
+                raise PathError(f"{shorten(pattern)}: an input of a source cannot be read here; leave out /in")
             wanted.setdefault(SourceDirection(topic.source, topic.direction == "in"), {})[topic] = None
         return {place: tuple(topics) for place, topics in wanted.items()}
 
@@ -135,8 +139,8 @@ class Selections:
             self._kept.clear()
         if self._elements + view.elements > MAX_ALL_ELEMENTS:
             raise EndpointError(
-                f"all clients together have {self._elements} elements open, {MAX_ALL_ELEMENTS} are the most: name "
-                "less, or take raw frames"
+                f"all clients together have {self._elements} elements open, at most {MAX_ALL_ELEMENTS} are allowed: "
+                "select fewer registers, or subscribe to raw frames"
             )
         return view
 
@@ -161,8 +165,8 @@ class _Budget:
         """Raise ValueRangeError if there are too many registers or elements."""
         if registers > self.registers or elements > self.elements:
             raise ValueRangeError(
-                f"the patterns name more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the most of one "
-                "call: name less, make several calls, or take raw frames"
+                f"the patterns name more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the maximum of one "
+                "call: select fewer registers, make several calls, or use raw frames"
             )
 
     def match(self, registers: int) -> None:

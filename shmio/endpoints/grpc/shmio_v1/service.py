@@ -129,9 +129,7 @@ class ShmioV1:
         """
         try:
             if len(self._open) >= MAX_STREAMS:
-                raise EndpointError(
-                    f"{MAX_STREAMS} calls of Subscribe are open, the most there may be: one takes many patterns"
-                )
+                raise EndpointError(f"{MAX_STREAMS} calls of Subscribe are open, the maximum: one takes many patterns")
             subscription = SubscribeCall(self._selections, self._wake_ups, self._virtual_time, request)
         except ShmioError as error:
             await refuse(context, error)

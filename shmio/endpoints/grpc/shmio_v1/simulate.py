@@ -75,7 +75,7 @@ class OutputEncoder:
             raise ValueRangeError(f"assignments: {len(assignments)} values, the table has {most}: give each once")
         if len(assignments) > MAX_VALUES:  # each is put in by itself
             raise ValueRangeError(
-                f"assignments: {len(assignments)} values, {MAX_VALUES} are the most by path: give them by slots"
+                f"assignments: {len(assignments)} values, at most {MAX_VALUES} are allowed by path: give them by slots"
             )
         order = self._selection.block.layout.byte_order
         async for assignment in time_sliced(assignments):
@@ -114,7 +114,7 @@ class OutputEncoder:
             raise PathError(f"{shorten(text)}: {topic.source} is reserved; begin the path with {block.source}")
         register = find(block.layout, topic.path)
         if self._by_path.keys().isdisjoint(holders(register.path)) or topic.direction == "in":
-            raise PathError(f"{shorten(text)}: it is none of the outputs of {block.source}")
+            raise PathError(f"{shorten(text)}: it is not an output of {block.source}")
         return register
 
 
@@ -194,8 +194,8 @@ class SimulateCalls:
                 ", ".join(name for name, feed in self._feeds.items() if feed.block.model_channel is not None) or "none"
             )
             raise CommandError(
-                f"{source}: no model can join it, for its connector is {block.attributes.connector!r}, not 'remote'; "
-                f"those that one can join: {can}"
+                f"{source}: no model can join it, because its connector is {block.attributes.connector!r}, not "
+                f"'remote'; sources that a model can join: {can}"
             )
         return block
 
@@ -337,8 +337,8 @@ class SimulateCall:
     async def _take(self, done: wire.Done) -> None:
         ask = self._asked
         if ask is None or done.step != ask.step:
-            asked = "none is to be done" if ask is None else f"step {ask.step} is to be done"
-            raise ValueRangeError(f"an answer to step {done.step}, and {asked}")
+            asked = "no step is pending" if ask is None else f"step {ask.step} is pending"
+            raise ValueRangeError(f"an answer to step {done.step}, but {asked}")
         self._refused = ""
         image = bytearray(ask.shown if self._image is None else self._image)
         failure = " ".join(done.failure.split()) if done.HasField("failure") else None
@@ -373,8 +373,8 @@ def _tables(block: Block) -> tuple[Selection, Selection]:
     for table in tables:
         if len(table.registers) > MAX_REGISTERS or table.elements > MAX_ELEMENTS:
             raise ValueRangeError(
-                f"{block.source} has more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the most of a "
-                "model: make several sources of it"
+                f"{block.source} has more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the maximum of a "
+                "model: split it into several sources"
             )
         _ = table.table
     return tables

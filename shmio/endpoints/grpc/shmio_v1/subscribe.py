@@ -44,7 +44,7 @@ TABLES, UPDATES, ENDED, STEP = (
 def check(request: wire.SubscribeRequest) -> None:
     """Raise ValueRangeError if options are not valid or do not go together."""
     if request.mode not in wire.Mode.values() or request.format not in wire.Format.values():
-        raise ValueRangeError(f"mode {request.mode}, format {request.format}: this version has 0 and 1 of each")
+        raise ValueRangeError(f"mode {request.mode}, format {request.format}: this version supports 0 and 1 for each")
     for name, value, most in (
         ("max_rate_hz", request.max_rate_hz, MAX_RATE_HZ),
         ("deadband", request.deadband, math.inf),
@@ -54,7 +54,7 @@ def check(request: wire.SubscribeRequest) -> None:
                 f"{name}: {value} is not a number from 0 on{'' if math.isinf(most) else f', at most {most:g}'}"
             )
     if request.mode == wire.MODE_EVERY_FRAME and (request.max_rate_hz or request.deadband):
-        raise ValueRangeError("max_rate_hz and deadband are for the mode LATEST: every frame is every frame")
+        raise ValueRangeError("max_rate_hz and deadband are only for the mode LATEST")
     if request.format == wire.FORMAT_FRAMES and request.deadband:
         raise ValueRangeError("deadband is for the format VALUES")
 
@@ -293,7 +293,7 @@ class SubscribeCall:
                 yield await self._go_over(place)
             else:
                 await self._wait()
-        raise EndpointError("a step has waited too long to be read: this client is too slow for how time is stepped")
+        raise EndpointError("the client did not read a step in time: it is too slow for the rate of steps")
 
     def _batch(self) -> tuple[bytes, bool]:
         """Return the present updates up to a bound, and whether these are all.

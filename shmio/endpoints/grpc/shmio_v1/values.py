@@ -48,7 +48,7 @@ async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, obj
     """
     if len(assignments) > MAX_VALUES:  # before looking at any
         raise ValueRangeError(
-            f"{len(assignments)} values, {MAX_VALUES} are the most: write whole arrays, or less at once"
+            f"{len(assignments)} values, at most {MAX_VALUES} are allowed: write whole arrays, or fewer at once"
         )
     values: dict[str, object] = {}
     sources: dict[str, None] = {}
@@ -56,7 +56,7 @@ async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, obj
         topic = topics.topic(assignment.path)
         register = topics.register(topic)
         if topic.direction == "out":
-            raise CommandError(f"{shorten(assignment.path)}: what comes out of a source is not written; leave out /out")
+            raise CommandError(f"{shorten(assignment.path)}: an output of a source cannot be written; leave out /out")
         if register.path in values:
             raise ValueRangeError(f"{shorten(assignment.path)}: given twice")
         values[register.path] = plain(assignment.value, register)

@@ -93,7 +93,7 @@ class Listener(Protocol):
         """Take one message. ``at_s``: its time by the topic's clock, in s; default: now."""
 
     def keep(self, message: Sized) -> None:
-        """Take one message of a step, which must not be dropped."""
+        """Queue a message of a step; such a message must not be dropped."""
 
     def lose(self) -> None:
         """Drop the messages that were not sent yet, because quality has turned bad."""

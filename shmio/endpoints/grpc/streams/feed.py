@@ -269,7 +269,7 @@ class Feed:
         return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame
 
     def _stamp(self, event: Event) -> tuple[int, int]:
-        """Return an event's number and time: of the frame, in virtual time of the step, before."""
+        """Return an event's number and time: those of the last frame, or step in virtual time."""
         return self._virtual_time.moment if self._held else Moment(event.frame, event.clock_ns)
 
 

@@ -200,7 +200,9 @@ class _Lane:
         The step waits until the client has taken the message.
         """
         if self.load.full(message, STEP_BOUND, STEP_BOUND_BYTES):
-            self._outbox.fail(f"{self.load.count} values wait to be read: too many change in one step for this stream")
+            self._outbox.fail(
+                f"{self.load.count} values are waiting: too many values change in one step for this stream"
+            )
         self._add(message)
         self._outbox.owe()
 
@@ -261,7 +263,7 @@ class EventLane(_Lane):
     def deliver(self, message: Sized) -> None:
         """Add a message; fail if there is no room."""
         if self.load.full(message, EVENT_BOUND):
-            self.fail(f"{self.load.count} messages wait to be read: the client is too slow for what is written")
+            self.fail(f"{self.load.count} messages are waiting: the client reads too slowly")
         self._add(message)
 
     def fail(self, reason: str) -> None:

@@ -115,7 +115,7 @@ class Player:
 
     @property
     def on(self) -> bool:
-        """Whether time is played."""
+        """Whether time is playing."""
         return self._task is not None
 
     @property
@@ -311,7 +311,7 @@ class Stepper:
         if peer:
             await self._publisher.settle(peer)
         if self._player.on:
-            raise TimeError("time is played at present: pause it before it can be stepped")
+            raise TimeError("time is playing: pause it before you step it")
         return await self._make(dt_ns)
 
     async def _make(self, dt_ns: int | None) -> Step:

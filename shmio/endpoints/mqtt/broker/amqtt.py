@@ -113,7 +113,7 @@ class _Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's class
 
 
 class _Writer(StreamWriterAdapter):  # type: ignore[misc]
-    """Names the clients of the UNIX socket, which have no address; aMQTT refuses a client without."""
+    """Gives clients of the UNIX socket an address, because aMQTT refuses clients without one."""
 
     def get_peer_info(self) -> tuple[str, int]:
         """The client's host and port."""

@@ -58,7 +58,7 @@ def prepare(place: Path) -> None:
         fd = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
             if os.fstat(fd).st_uid != os.getuid():
-                raise EndpointError(f"the broker's folder {place} belongs to another user")
+                raise EndpointError(f"the broker's directory {place} belongs to another user")
             os.fchmod(fd, 0o700)
         finally:
             os.close(fd)

@@ -27,8 +27,8 @@ def run(worker: Worker) -> None:
             _run(worker, mosquitto.Mosquitto(program, settings, worker.segment.instance, place), settings)
         else:
             log.warning(
-                "no mosquitto on this machine: aMQTT on %s, for development: every program of this host may publish "
-                "everything, values too",
+                "mosquitto is not installed: aMQTT on %s, for development only: every program on this host may publish "
+                "everything, even values",
                 settings.listen,
             )
             from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  of the extra, and large

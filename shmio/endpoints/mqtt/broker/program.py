@@ -17,7 +17,7 @@ INSTALL: Final = "install mosquitto (Debian: apt install mosquitto)"
 EXTRA: Final = "pip install 'shmio[broker]'"
 MISSING: Final = f'mqtt.broker: "mosquitto" is not on this machine; {INSTALL}'
 NEITHER: Final = (
-    f"mqtt.broker: there is no MQTT broker on this machine; {INSTALL}, or, for development on this host alone, "
+    f"mqtt.broker: there is no MQTT broker on this machine; {INSTALL}, or, for development on this host only, "
     f"aMQTT ({EXTRA})"
 )
 EVERYBODY: Final = frozenset(("read", "write"))
@@ -54,8 +54,8 @@ def choose_broker(settings: Mqtt) -> str | None:
         raise ConfigError(MISSING)
     for demand in _only_mosquitto(settings):
         raise ConfigError(
-            f"{demand}, which needs mosquitto, and it is not on this machine: {INSTALL}; aMQTT is for development: "
-            'it listens on loopback alone, and everybody may do everything (one [[mqtt.account]], roles = ["read", '
+            f"{demand}, which needs mosquitto, but that is not installed: {INSTALL}; aMQTT is for development: "
+            'it listens only on loopback, and everybody may do everything (one [[mqtt.account]], roles = ["read", '
             '"write"], no name)'
         )
     if find_spec("amqtt") is None:

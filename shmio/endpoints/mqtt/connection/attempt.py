@@ -27,7 +27,7 @@ from shmio.errors import ConfigError
 CONNECT_S: Final = 4.0
 """Time limit for each of TCP connect, TLS handshake and CONNACK."""
 SLOW_S: Final = 15.0
-SLOW: Final = "no answer yet: it is slow, or the name server, or the file system of mqtt.tls or mqtt.password_file"
+SLOW: Final = "no answer yet: the broker, the name server, or the file system of mqtt.tls or mqtt.password_file is slow"
 MAX_PACKET_BYTES: Final = 1 << 21
 """Maximum packet size that we accept; only MQTT 5 brokers are told."""
 

@@ -78,9 +78,9 @@ class ConnectionProblems:
 def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
     """Describe a broker's reason code."""
     if code.value in _WHO:
-        return f"it does not let us in ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
+        return f"it refuses our login ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
     if code.value in _BUSY:
-        return f"it takes no more at present ({code})"
+        return f"it accepts no more connections at present ({code})"
     if code.value == _TAKEN_OVER:
         return f"another client has connected as {policy.client_id}: give one of them another mqtt.client_id"
     return f"it refuses: {code}"
@@ -94,8 +94,8 @@ def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
     if error is not None:
         return _tls(error)
     lost = "the connection was lost"
-    missing = "wants a certificate of ours (mqtt.tls.certificate and key)" if tls else "expects TLS there (mqtt.tls)"
-    return lost if up else f"{lost} before it let us in: it is full, or {missing}, or is no broker"
+    missing = "needs a client certificate (mqtt.tls.certificate and key)" if tls else "expects TLS there (mqtt.tls)"
+    return lost if up else f"{lost} before the login: it is full, or {missing}, or is not a broker"
 
 
 def why(error: Exception, target: Target, *, tls: bool) -> str:
@@ -106,7 +106,7 @@ def why(error: Exception, target: Target, *, tls: bool) -> str:
     if isinstance(error, ssl.SSLError):
         return _tls(error)
     if isinstance(error, socket.gaierror):
-        return f"no host of this name is known ({error.strerror})"
+        return f"unknown host name ({error.strerror})"
     if isinstance(error, TimeoutError):
         return "it does not answer"
     if isinstance(error, ConnectionRefusedError | FileNotFoundError):
@@ -114,13 +114,13 @@ def why(error: Exception, target: Target, *, tls: bool) -> str:
             return "it does not run at present; shmio-supervisor logs broker says why"
         return "nothing listens there"
     if isinstance(error, ConnectionError):
-        return "it closed the connection" + (": it may speak no TLS there (mqtt.tls, and the port)" if tls else "")
+        return "it closed the connection" + (": it may not use TLS there (mqtt.tls, and the port)" if tls else "")
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def _tls(error: ssl.SSLError) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is not to be trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
+        return f"its certificate is not trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
     if "_ALERT_" in (error.reason or ""):
-        return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key: it may want some, or others"
-    return f"no TLS with it ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"
+        return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key, which it may require"
+    return f"the TLS handshake failed ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"

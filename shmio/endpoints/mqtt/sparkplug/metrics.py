@@ -38,7 +38,10 @@ _QUALITY: Final = {Quality.BAD: 0, Quality.UNCERTAIN: 500, Quality.GOOD: 192}  #
 
 
 class _Datatype(NamedTuple):
-    """Data type and protobuf field of a single value; data type and element of an array, if any."""
+    """Sparkplug's representation of a type: data type and protobuf field of a single value.
+
+    For an array, it also has the data type of the array and of its elements.
+    """
 
     datatype: int
     field: str
@@ -113,7 +116,7 @@ class Metric:
         elif self._field in ("float_value", "double_value"):
             expected = {"float_value", "double_value"}
         if field not in expected:
-            raise ValueRangeError(f"{self.name}: {field} is no value of {self.register.type}")
+            raise ValueRangeError(f"{self.name}: {field} is not a value of {self.register.type}")
         if self.register.dims:
             return self._unpacked(value)
         bits = 32 if field == "int_value" else 64

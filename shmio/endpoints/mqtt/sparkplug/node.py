@@ -63,7 +63,7 @@ class EdgeNode:
         *,
         datatypes: bool = True,
     ) -> None:
-        """``datatypes``: data messages have types, too, for hosts that do not keep the births."""
+        """Begin; ``datatypes`` adds data types to data messages, for hosts that do not store births."""
         self._group, self._node, self._datatypes = group, node, datatypes
         self._now_ms = now_ms
         self._sequence = 0
@@ -169,9 +169,9 @@ class EdgeNode:
         try:
             payload = wire.Payload.FromString(data)
         except DecodeError:
-            raise ValueRangeError(f"{topic}: this is no payload of Sparkplug B") from None
+            raise ValueRangeError(f"{topic}: this is not a Sparkplug B payload") from None
         if len(payload.metrics) > MAX_METRICS:
-            raise ValueRangeError(f"{topic}: {len(payload.metrics)} metrics, {MAX_METRICS} are the most")
+            raise ValueRangeError(f"{topic}: {len(payload.metrics)} metrics, at most {MAX_METRICS} are allowed")
         if topic == self._topic("NCMD"):
             asked = any(metric.name == REBIRTH and metric.boolean_value for metric in payload.metrics)
             if not asked:

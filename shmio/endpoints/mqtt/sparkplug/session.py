@@ -168,7 +168,7 @@ class Session:
         """The current problem; empty: none."""
         problem = self.connection.problem
         if self._host is not None and self.connection.up and not self._host.online:
-            problem = f"the primary host is not there ({self._host.topic}): {self._backlog.count} changes are kept"
+            problem = f"the primary host is offline ({self._host.topic}): {self._backlog.count} changes are kept"
         return f"Sparkplug: {problem}" if problem else ""
 
     def new_device(self, feed: Feed) -> Device:
@@ -234,7 +234,7 @@ class Session:
             self._send(self.node.death())
         elif not elsewhere:
             return
-        self.connection.drop(f"the primary host is not there ({host.topic})", politely=True)
+        self.connection.drop(f"the primary host is offline ({host.topic})", politely=True)
 
     def close(self) -> None:
         """Publish the node's death, and disconnect.

@@ -188,7 +188,7 @@ def test_a_command_for_the_process_before_is_rejected(writer: BlockWriter, insta
             bench.stop()
         last = successor.block.events.read(successor.block.events.head())
         assert last is not None
-        assert "meant for the source's process before this one" in last.text
+        assert "for an earlier process of the source" in last.text
 
 
 def test_a_command_that_comes_too_late_is_rejected(bench: Bench) -> None:
@@ -289,7 +289,7 @@ def test_of_a_connector_that_tells_too_little_nothing_is_known(bench: Bench, los
             raise WriteLostError("cut", [""])
         return [""]
 
-    with pytest.raises(ConnectorError, match="1 outcomes of 2 writes"):
+    with pytest.raises(ConnectorError, match="1 outcomes for 2 writes"):
         bench.processor.carry_out(write)
     end = bench.event()
     assert (end.command, end.item, end.items, end.kind) == (number, 0, 2, EventKind.UNKNOWN)
@@ -436,7 +436,7 @@ def test_what_is_no_command_is_told_and_passed_over(bench: Bench, writer: BlockW
     writer.block.commands.push(2, b"garbage")
     event = bench.event()
     assert (event.kind, event.writer) == (EventKind.REJECTED, 2)
-    assert "not a command" in event.text
+    assert "invalid command" in event.text
     bench.accepted(Write(0, 0, b"\0\0"))
 
 

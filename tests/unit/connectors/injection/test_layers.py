@@ -90,7 +90,7 @@ def test_what_cannot_be_is_refused() -> None:
         covering(SIZE, [whole(6, 3)])
     for number in range(2, MAX_INJECTIONS + 1):
         assert injections.lay(layer(number, whole(0, 1))) == ""
-    assert "64 injections stand" in injections.lay(layer(99, whole(0, 1)))
+    assert "64 injections cover" in injections.lay(layer(99, whole(0, 1)))
 
 
 def has(parts: list[Write], at: int, mask: int, byte: int) -> bool:

@@ -301,7 +301,7 @@ def test_values_beneath_other_injections_outlive_the_sources_process(rig: Rig) -
 def test_what_cannot_be_is_refused(rig: Rig) -> None:
     with pytest.raises(PathError, match="names no register"):
         rig.client.inject(["speeds"])
-    with pytest.raises(CommandError, match="covers what is not writable"):
+    with pytest.raises(CommandError, match="covers registers that are not writable"):
         rig.client.inject(["locked"], direction=Direction.IN)
     number = rig.client.inject(["speed"], name="test")
     (outcome,) = rig.client.shadow(number, {"axis/1": 1})
@@ -312,14 +312,14 @@ def test_what_cannot_be_is_refused(rig: Rig) -> None:
     with pytest.raises(CommandError, match="there is no injection"):
         rig.client.lift(number + 1)
     del rig.owners[5]
-    with pytest.raises(CommandError, match="nobody has the command queue"):
+    with pytest.raises(CommandError, match=r"command queue .* has no owner"):
         rig.other.inject(["speed"])
 
 
 def test_what_the_segment_has_no_room_for_is_refused(rig: Rig) -> None:
     name = "\1" * 256  # six characters each in the document that everybody reads
     laid: list[int] = []
-    with pytest.raises(CommandError, match="too much for the injections of one source"):
+    with pytest.raises(CommandError, match="injections of one source are too large"):
         laid.extend(rig.client.inject(["speed"], name=name) for _ in range(MAX_INJECTIONS))
     assert [standing.number for standing in rig.block.standing.read()] == laid
     rig.client.lift(laid[0])

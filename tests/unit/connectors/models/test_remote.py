@@ -152,7 +152,7 @@ def test_a_model_elsewhere_computes_its_outputs_and_nothing_else(instance: str) 
         assert struct.unpack(">III", latest(segment, "sim").raw) == (9, 7, 0)
         (outcome,) = source_writer.write({"sum": 7})
         assert outcome.kind is OutcomeKind.REFUSED
-        told = "the model computes sum: it is an output, which nobody writes; shmio inject shows others"
+        told = "the model computes sum: it is an output and cannot be written; shmio inject can show others"
         assert outcome.text == told
         assert [(ask.step, ask.time_ns, ask.dt_ns) for ask in model.asks] == [
             (1, 20 * MS, 20 * MS),
@@ -257,7 +257,7 @@ def test_a_model_that_leaves_within_a_step_fails_it(instance: str) -> None:
             assert model.reached.wait(PATIENCE_S)
         thread.join()
         assert errors == [
-            "step 1: sim: model 'adder' was gone before it had answered; the next step works when one is connected"
+            "step 1: sim: model 'adder' disconnected before it answered; the next step works once one is connected"
         ]
         with Model(instance):
             good(sim)
@@ -274,7 +274,7 @@ def test_another_that_joins_within_a_step_is_not_taken_for_the_one_that_was_aske
             assert model.reached.wait(PATIENCE_S)
         other = stack.enter_context(Model(instance, name="other"))
         thread.join()
-        assert "model 'adder' was gone before it had answered" in errors[0]
+        assert "model 'adder' disconnected before it answered" in errors[0]
         assert other.asks == []
         coordinator.step()
         assert [ask.step for ask in other.asks] == [2]
@@ -293,7 +293,7 @@ def test_who_writes_for_it_is_killed_within_a_step(instance: str) -> None:
             finally:
                 process.kill()
         thread.join()
-        assert "model 'mute' was gone before it had answered" in errors[0]
+        assert "model 'mute' disconnected before it answered" in errors[0]
 
 
 def test_a_successor_asks_anew_and_goes_on_with_the_registers(instance: str) -> None:

@@ -79,7 +79,7 @@ def test_it_plays_to_the_next_change_and_pauses(here: tuple[Playing, Attachment]
     playing.until(lambda: attachment.replay.status()[0].paused)
     [status] = attachment.replay.status()
     assert (status.position_s, playing.frames()) == (0.2, [])
-    with pytest.raises(CommandError, match="there is no change of other from here to the end"):
+    with pytest.raises(CommandError, match="there is no change of other between here and the end"):
         attachment.replay.to_change("other")
     assert attachment.replay.seek(0)
     [status] = attachment.replay.to_change("other", jump=True)
@@ -103,7 +103,7 @@ def test_it_plays_to_the_next_event(tmp_path: Path, instance: str) -> None:
         assert counts(playing.frames()) == list(range(7))
         assert [event.kind for event in playing.happened()] == [EventKind.ACCEPTED]
         assert attachment.replay.status()[0].paused
-        with pytest.raises(CommandError, match=r"event 'none' is none of started, .*, noted, any$"):
+        with pytest.raises(CommandError, match=r"event 'none' is unknown; valid: started, .*, noted, any$"):
             attachment.replay.to_event("none")
 
 
@@ -132,7 +132,7 @@ def test_what_lies_behind_the_end_of_what_is_played_is_not_found(tmp_path: Path,
         built(instance, stepped=False) as segment,
         Playing(segment, file, paused=True, end=0.15),
         attach(instance, writable=True) as attachment,
-        pytest.raises(CommandError, match=r"there is no change of other from here to the end of what is played"),
+        pytest.raises(CommandError, match=r"there is no change of other between here and the end of the played part"),
     ):
         attachment.replay.to_change("cell/other", jump=True)
 
@@ -189,7 +189,9 @@ def test_a_time_that_is_past_is_not_played_to(here: tuple[Playing, Attachment]) 
     playing, attachment = here
     attachment.replay.seek(0.2)
     playing.next()
-    with pytest.raises(CommandError, match=r"^cell: that is past: it is at 0\.200 s; seek to before that first$"):
+    with pytest.raises(
+        CommandError, match=r"^cell: that time has passed: the replay is at 0\.200 s; seek to before that first$"
+    ):
         attachment.replay.play_until(0.1)
     [status] = attachment.replay.status()
     assert (status.paused, status.position_s, status.until_s) == (True, 0.2, None)

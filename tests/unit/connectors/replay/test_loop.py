@@ -133,7 +133,7 @@ def test_nothing_is_written(tmp_path: Path, instance: str) -> None:
     with built(instance) as segment, Playing(segment, file) as cell:
         cell.next()  # it accepts by now
         source_writer = SourceWriter(segment.blocks["cell"], GUEST)
-        assert took(source_writer, 5) == "refused: source cell is a replay: nothing is written"
+        assert took(source_writer, 5) == "refused: source cell replays a recording: it cannot be written"
         kinds = [event.kind for event in cell.happened()]
     assert kinds == [EventKind.ACCEPTED, EventKind.REFUSED]
 

@@ -174,7 +174,7 @@ def test_what_is_not_in_the_message_stays_and_short_lists_are_filled(segment: Se
             "points: expected at most 2, found 3",
         ),
         (request("partly", point=wire.Point(x=1)), "cell/partly/z is not writable"),
-        (request("other", point=wire.Point(x=1)), "other: a structure that version 1 has no message for"),
+        (request("other", point=wire.Point(x=1)), "other: version 1 has no message for this structure"),
         (request("known/Point/x", point=wire.Point(x=1)), "known/Point/x: expected a text, found a point"),
     ],
 )

@@ -225,7 +225,7 @@ def test_a_wrong_password_is_told_and_the_right_one_heals(
     file = secret(tmp_path, "wrong\n")
     with bridge(segment, broker.address, username="cell", password_file=file) as running:
         running.until(lambda: "mqtt.password_file" in running.bridge.problem)
-        assert "does not let us in" in running.bridge.problem
+        assert "refuses our login" in running.bridge.problem
         assert "right" not in running.bridge.problem
         secret(tmp_path, "right\n")
         running.until(lambda: running.bridge.connection.up)
@@ -262,14 +262,14 @@ class Answers:
 @pytest.mark.parametrize(
     ("answer", "told"),
     [
-        (b"\x20\x03\x00\x97\x00", "it takes no more at present"),
-        (b"\x20\x03\x00\x89\x00", "it takes no more at present"),
+        (b"\x20\x03\x00\x97\x00", "it accepts no more connections at present"),
+        (b"\x20\x03\x00\x89\x00", "it accepts no more connections at present"),
         (b"\x20\x03\x00\x85\x00", "it refuses: Client identifier not valid"),
         (b"", "the connection was lost before it let us in: it is full"),
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", "the connection was lost"),
         (b"\x20\xff\xff\xff\xff\xff\xff", "the connection was lost"),
         (b"\x30\x05\x00\x09ab", "the connection was lost"),
-        (b"\x20\x02\x00\x05", "does not let us in"),
+        (b"\x20\x02\x00\x05", "refuses our login"),
     ],
 )
 def test_what_a_broker_says_is_told(segment: Segment, answer: bytes, told: str) -> None:

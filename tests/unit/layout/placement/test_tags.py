@@ -73,8 +73,8 @@ def test_name_and_byte_order_can_be_chosen() -> None:
 
 
 WRONG = {
-    'a = "INT"': "cell.toml:1:1: error: it is no tag table: ",
-    "[registers]": "it is no tag table",
+    'a = "INT"': "cell.toml:1:1: error: not a tag table: ",
+    "[registers]": "not a tag table",
     "[registers]\na = INT": "cell.toml:2:5: error: ",
     "[registers]\n\na = 'INTEGER'": "cell.toml:3:1: error: a: there is no type 'INTEGER'",
     "[registers]\na = 'ARRAY[3..1] OF INT'": "2:1: error: a: expected bounds",
@@ -82,9 +82,9 @@ WRONG = {
     "[registers]\na = 'ARRAY[0..99999999] OF BOOL'": "at most 1048576 elements",
     "[registers]\na = 'ARRAY[0..999999] OF LREAL'": "expected at most 1048576 bytes",
     "[registers]\nx = 'INT'\n'a//b' = 'INT'": "cell.toml:3:1: error: a//b: ",
-    "[registers]\n'a/b/out' = 'INT'": "it ends in a direction",
-    "[registers]\n'a/b' = 'INT'\na = 'INT'": "a is a value itself",
-    "[registers]\n'a.b' = 'INT'\n'a%2Eb' = 'INT'": "it is there twice",
+    "[registers]\n'a/b/out' = 'INT'": "the path ends in a direction",
+    "[registers]\n'a/b' = 'INT'\na = 'INT'": "a is already a register",
+    "[registers]\n'a.b' = 'INT'\n'a%2Eb' = 'INT'": "given twice",
     "[registers]\na = { type = 'INT', initial = 40000 }": "cell.toml:2:1: error: a: ",
     "[registers]\na = { type = 'INT', start = 4 }": "a: there is no 'start' here, only type, initial, comment",
     "[registers]\nb = 'INT'\na = { initial = 4 }": "cell.toml:3:1: error: a: type: this key is needed",
@@ -96,17 +96,17 @@ WRONG = {
     "[registers]\na = { type = 'ARRAY[1..3] OF INT', initial = '1, 3(2)' }": "expected at most 3 values, found more",
     "[registers]\na = { type = 'ARRAY[0..1, 0..1] OF INT', initial = [1, 2, 3, 4, 5] }": "expected at most 4 values",
     "[registers]\nb = 'INT'\na = { type = 'ARRAY[0..1, 0..1] OF INT', initial = [[1, 2], [3]] }": "3:1: error: a: "
-    "initial: expected one list",
-    '[registers]\nb = "INT"\n"a\\u0000b" = "INT"': r"3:1: error: a\x00b: 'a\x00b': a path must not hold control",
-    '[registers]\nb = "INT"\n"a\\nb" = "INT"': r"cell.toml:3:1: error: a\nb: 'a\nb': a path must not hold control",
-    "[registers]\n'a%0Ab' = 'INT'": "cell.toml:2:1: error: a%0Ab: 'a%0Ab': a path must not hold control",
-    "[registers]\na = 'INT'\nb = 'INT'\na = 'INT'": "cell.toml:4:1: error: a: it is there twice",
+    "initial: expected one flat list",
+    '[registers]\nb = "INT"\n"a\\u0000b" = "INT"': r"3:1: error: a\x00b: 'a\x00b': a path must not contain control",
+    '[registers]\nb = "INT"\n"a\\nb" = "INT"': r"cell.toml:3:1: error: a\nb: 'a\nb': a path must not contain control",
+    "[registers]\n'a%0Ab' = 'INT'": "cell.toml:2:1: error: a%0Ab: 'a%0Ab': a path must not contain control",
+    "[registers]\na = 'INT'\nb = 'INT'\na = 'INT'": "cell.toml:4:1: error: a: given twice",
     "[registers]\n'b/c' = 'INT'\n'b/c' = { type = 'ARRAY[1..2] OF INT', initial = [\n1,\n2] }\nd = 'INT'": "cell.toml"
-    ":3:1: error: 'b/c': it is there twice",
-    "[registers]\na = 'INT'\na.b = 'INT'\n": "3:1: error: a.b: it is there twice; a path with a dot is written in",
+    ":3:1: error: 'b/c': given twice",
+    "[registers]\na = 'INT'\na.b = 'INT'\n": "3:1: error: a.b: given twice; write a path with a dot in",
     "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: there is no 'b' here, only type, initial, comment; "
-    'a path with a dot is written in quotes, "a.b"',
-    "[registers]\na/b = 'INT'": "a path is written in quotes",
+    'write a path with a dot in quotes, "a.b"',
+    "[registers]\na/b = 'INT'": "write a path in quotes",
     "name = 'a'\n[registers]\nb = 'INT'\n[registers.name]\ntype = 'INTEGER'": "4:1: error: name: there is no type",
 }
 
@@ -127,7 +127,7 @@ def test_paths_that_differ_in_case_only_are_warned_of() -> None:
     found = compile_sources([Source("cell.toml", text.encode())])
     assert [register.path for register in found.layouts[0].registers] == ["a/Pos", "b", "A/pos"]
     assert [str(warning) for warning in found.warnings] == [
-        "cell.toml:4:1: warning: A/pos: only the case of letters tells it from a/Pos"
+        "cell.toml:4:1: warning: A/pos: differs only in case from a/Pos"
     ]
 
 
@@ -136,7 +136,7 @@ def test_what_is_no_text_is_refused() -> None:
 
 
 def test_a_tag_table_stands_alone() -> None:
-    with pytest.raises(LayoutError, match="stands alone"):
+    with pytest.raises(LayoutError, match="cannot be combined with other files"):
         compile_sources([Source("a.toml", b"[registers]"), Source("b.udt", b"")])
 
 

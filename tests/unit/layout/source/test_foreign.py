@@ -33,8 +33,8 @@ def workbook() -> bytes:
         ("tags.csv", b"x", "this is a table of tags"),
         ("cell.db", workbook(), "this is a spreadsheet"),
         ("cell.db", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(600), "this is a spreadsheet"),
-        ("cell.db", bytes(range(256)) * 40 + bytes(4000), "this is no text"),
-        ("cell.db", b"\x7fELF" + bytes(4000), "this is no text"),
+        ("cell.db", bytes(range(256)) * 40 + bytes(4000), "this is not a text file"),
+        ("cell.db", b"\x7fELF" + bytes(4000), "this is not a text file"),
     ],
 )
 def test_a_file_of_another_kind_is_one_fault_with_its_remedy(name: str, data: bytes, what: str) -> None:

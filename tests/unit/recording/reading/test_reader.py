@@ -138,9 +138,9 @@ def chunk(size: int, packed: bytes, compression: bytes = b"zstd", crc: int = 0) 
         (chunk(5, b"12345", b""), "ends within a record"),
         (chunk(5, b"1234", b""), "sizes contradict each other"),
         (chunk(4, b"1234", b"", crc=77), "checksum is wrong"),
-        (chunk(4, b"1234", b"lz5"), "compression 'lz5' is none that is known"),
+        (chunk(4, b"1234", b"lz5"), "compression 'lz5' is unknown"),
         (chunk(9, struct.pack("<BQ", 5, 1 << 60), b""), "ends within a record"),
-        (chunk(31, struct.pack("<BQ", 5, 22) + bytes(22), b""), "messages of channel 0, which is not described"),
+        (chunk(31, struct.pack("<BQ", 5, 22) + bytes(22), b""), "messages of channel 0, which has no description"),
     ],
 )
 def test_hostile_chunks_cost_no_memory_and_no_traceback(content: bytes, message: str, tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_a_channel_of_two_descriptions_is_refused(encodings: tuple[str, str], tm
     file = tmp_path / "x.mem"
     first, second = map(described, encodings)
     file.write_bytes(first + described(encodings[0])[len(MAGIC) :] + second[len(MAGIC) :])
-    with Reader(file) as reader, pytest.raises(RecordingError, match="channel 1 is described twice, and differently"):
+    with Reader(file) as reader, pytest.raises(RecordingError, match="channel 1 has two different descriptions"):
         list(reader.messages())
 
 
@@ -190,7 +190,8 @@ def foreign(file: Path, change: Callable[[Writer], Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [(b"", "is empty: its recorder wrote nothing"), (b"PK\3\4", "it does not begin as MCAP")]
+    ("content", "message"),
+    [(b"", "is empty: its recorder wrote nothing"), (b"PK\3\4", "it does not begin like an MCAP file")],
 )
 def test_what_is_no_recording(content: bytes, message: str, tmp_path: Path) -> None:
     file = tmp_path / "x.mem"
@@ -207,7 +208,7 @@ def test_another_programs_mcap(tmp_path: Path) -> None:
         writer.add_message(channel, 1, b"abc", 1)
 
     foreign(file, change)
-    with Reader(file) as reader, pytest.raises(RecordingError, match="is an MCAP file, but no recording of shmio"):
+    with Reader(file) as reader, pytest.raises(RecordingError, match="is an MCAP file, but not a recording of shmio"):
         survey(reader)
 
 

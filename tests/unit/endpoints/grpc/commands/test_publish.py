@@ -131,11 +131,11 @@ WRONG = [
     (wire.PubRequest(), "the path names no register"),
     (message("cell/nothing", "1"), "no such register"),
     (message("nowhere://step", "1"), "no source of this name"),
-    (message("model/clock", "1"), "it can be subscribed to, and nothing else"),
-    (message("cell/axis", "1"), "a structure that version 1 has no message for"),
+    (message("model/clock", "1"), "it can only be subscribed to"),
+    (message("cell/axis", "1"), "version 1 has no message for this structure"),
     (message("cell/inputs/2", "1"), "index [2] is outside [0..1]"),
     (message("cell/step/out", "1"), "use /in"),
-    (message("cell/secret", "1"), "not writable; the configuration has to name it in the source's `writable`"),
+    (message("cell/secret", "1"), "not writable; name it in the source's `writable` in the configuration"),
     (message("cell/step", ""), "expected a number"),
     (message("cell/step", "1.5"), "expected a whole number"),
     (message("cell/step", "40000"), "out of range"),
@@ -330,7 +330,7 @@ def test_what_was_meant_for_a_source_before_its_restart_is_never_done(
 
     asyncio.run(run())
     assert "the source was restarted meanwhile" in caplog.text
-    assert caplog.text.count("it was meant for the source's process before this one") == 2
+    assert caplog.text.count("it was for an earlier process of the source") == 2
 
 
 def test_a_source_that_says_nothing_holds_nobody_for_long(

@@ -192,7 +192,7 @@ def test_a_listener_that_is_too_slow_is_told_so(segment: Segment, monkeypatch: p
         values, error = await end(slow)
         assert values == [str(number) for number in range(2, 2 + len(values))]
         assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-        assert error.details() == "cell/step/in: 8 messages wait to be read: the client is too slow for what is written"
+        assert error.details() == "cell/step/in: 8 messages are waiting: the client reads too slowly"
         assert await value(other) == "[5,6]"
         assert served.service.counters[1] > 0
         other.cancel()

@@ -109,7 +109,7 @@ def test_one_client_cannot_have_all_calls_and_no_more_than_there_are_are_open(se
         assert "this client has 2 calls open" in await other.refused()
         await last.open(2)
         extra = Another(served)
-        assert await extra.refused() == "12 calls are open at once, which is the most: try again when others have ended"
+        assert await extra.refused() == "12 calls are open, the maximum: try again when others have ended"
         assert served.server.calls.refusals.count == 3
         served.publish(image(step=2))
         assert [await value(stream) for stream in (*other.streams, *last.streams)] == ["1"] * 4
@@ -188,7 +188,7 @@ def test_bytes_that_are_no_message_are_refused_in_a_word(
         if told is not grpc.StatusCode.UNIMPLEMENTED:  # it has no message, or is not there yet
             assert (told, message) == (
                 grpc.StatusCode.INVALID_ARGUMENT,
-                f"{method}: 7 bytes are no message of this call",
+                f"{method}: 7 bytes are not a valid message of this call",
             )
         await until_calls(served, 0)
 

@@ -223,7 +223,12 @@ def test_injections_over_each_other_are_a_chain(segment: Segment) -> None:
         ("cell/step/in", "a" * 1025, Status.INVALID_ARGUMENT, "printable characters"),
         ("cell/step/in", "CELL://step/in", Status.INVALID_ARGUMENT, "a path of its own"),
         ("cell/step/in", "SIMLOG://step", Status.ALREADY_EXISTS, "served by shmio"),
-        ("cell/secret/in", "s", Status.FAILED_PRECONDITION, "cell/secret/in: rejected: it covers what is not writable"),
+        (
+            "cell/secret/in",
+            "s",
+            Status.FAILED_PRECONDITION,
+            "cell/secret/in: rejected: it covers registers that are not writable",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(
@@ -461,7 +466,7 @@ def test_at_most_so_many_at_once(segment: Segment, monkeypatch: pytest.MonkeyPat
         streams = [await laid(served, f"cell/inputs/{place}", f"s{place}") for place in range(2)]
         status, text = await refusal(inject(served, "cell/step", "s").read())
         assert status is Status.RESOURCE_EXHAUSTED
-        assert "2 injections stand on cell already" in text
+        assert "2 injections cover cell already" in text
         for stream in streams:
             stream.cancel()
         await lifted(served)

@@ -166,7 +166,7 @@ def test_lists_are_arrays(segment: Segment) -> None:
 
 REFUSED = [
     (request("cell/step/out", 1), Status.FAILED_PRECONDITION, "use /in"),
-    (request("cell/secret", 1), Status.FAILED_PRECONDITION, "the configuration has to name it"),
+    (request("cell/secret", 1), Status.FAILED_PRECONDITION, "name it in the source's `writable`"),
     (request("cell/axis", 1), Status.INVALID_ARGUMENT, "axis: expected a structure"),
     (request("cell/axis", {}), Status.INVALID_ARGUMENT, "with some of its members, found none"),
     (request("cell/axis", {"position": 1, "torque": 1}), Status.INVALID_ARGUMENT, "axis/torque: the structure has no"),
@@ -292,7 +292,7 @@ def test_publish_goes_on_after_bytes_that_are_no_message_and_ends_with_its_conne
         await counts(served, 4, 2)
 
     with_plant(segment, test)
-    assert caplog.text.count("bytes are no PubRequest") == 2
+    assert caplog.text.count("bytes are not a PubRequest") == 2
 
 
 def test_one_read_is_one_frame(segment: Segment) -> None:

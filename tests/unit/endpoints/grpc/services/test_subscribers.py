@@ -371,7 +371,7 @@ def test_a_structure_that_no_message_can_hold_is_refused(segment: Segment, monke
     async def test(served: Endpoint) -> None:
         stream = await served.subscriber("one")
         status, text = await refusal(served.add("one", "cell/axis"))
-        assert (status, "too much for one value" in text) == (Status.INVALID_ARGUMENT, True)
+        assert (status, "too many for one value" in text) == (Status.INVALID_ARGUMENT, True)
         stream.cancel()
 
     serve(segment, test)
@@ -419,7 +419,7 @@ def test_a_uuid_is_its_clients_alone(segment: Segment) -> None:
         await stream.initial_metadata()
         rude = served.v2.CreateSubscriber(subscriber, metadata=other, timeout=TIMEOUT_S)
         status, text = await refusal(rude.read())
-        assert (status, "is another client's" in text) == (Status.ALREADY_EXISTS, True)
+        assert (status, "belongs to another client" in text) == (Status.ALREADY_EXISTS, True)
         for metadata in (other, ()):
             status, text = await refusal(served.v2.Subscribe(topic, metadata=metadata, timeout=TIMEOUT_S))
             assert (status, "no such subscriber" in text) == (Status.NOT_FOUND, True)

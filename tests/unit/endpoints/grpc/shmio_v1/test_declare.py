@@ -148,7 +148,7 @@ def test_it_ends_when_all_of_it_is_over(segment: Segment) -> None:
         ({"value": "x"}, ValueRangeError, r"injection\[1\]\.value: expected a number"),
         ({"value": None}, ValueRangeError, r"injection\[1\]\.value: this key is needed"),
         ({"amplitude": 1.0}, ValueRangeError, r"injection\[1\]\.amplitude: operation 'offset' has no such key"),
-        ({"operation": "explode"}, ValueRangeError, r"injection\[1\]\.operation: 'explode' is none"),
+        ({"operation": "explode"}, ValueRangeError, r"injection\[1\]\.operation: 'explode' is unknown"),
         ({"times": -1}, ValueRangeError, r"injection\[1\]"),
         ({"target": "cell/secret/in"}, CommandError, "not writable"),
     ],

@@ -193,7 +193,7 @@ def test_what_cannot_be_laid_or_given(segment: Segment) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         with pytest.raises(PathError, match="no such register"):
             cell.inject("cell/nothing")
-        with pytest.raises(PathError, match="not over both"):
+        with pytest.raises(PathError, match="not both"):
             cell.inject("cell/axis/in", "cell/step/out")
         with pytest.raises(CommandError, match="not writable"):
             cell.inject("cell/secret/in")
@@ -299,7 +299,7 @@ def test_bytes_and_bits_by_ranges(segment: Segment) -> None:
             assert cell["cell/inputs/0"] == 0xAE
             for wrong in ((25, b"\0"), (28, b"\0\0"), (10, b"\0", 0x10), (10, b"\0", 0x1FF), (5000, b"\0"), (26, b"")):
                 (outcome,) = shadow.set(raw=[wrong])
-                assert (outcome.kind, "is not over all" in outcome.text) == ("rejected", True)
+                assert (outcome.kind, "does not cover all" in outcome.text) == ("rejected", True)
         assert cell["cell/inputs/0"] == 0xA5
 
     with_client(segment, test)
@@ -343,17 +343,17 @@ def test_a_whole_section_of_a_block(segment: Segment) -> None:
 def test_what_is_no_range(segment: Segment) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         for ranges, message in (
-            ([(0, 0)], "are none"),
-            ([(600, 29)], "not all in the block"),
-            ([(1 << 31, 1 << 31)], "not all in the block"),
-            ([(0, 1, 0x100)], "bits that a byte has not"),
+            ([(0, 0)], "at least one byte"),
+            ([(600, 29)], "within the block of"),
+            ([(1 << 31, 1 << 31)], "within the block of"),
+            ([(0, 1, 0x100)], "larger than a byte"),
             ([(0, 1)] * 300, "256 are the most"),
         ):
             with pytest.raises(ValueRangeError, match=message):
                 cell.inject(ranges=ranges, source="cell")
         with pytest.raises(PathError, match="is not a source's name"):
             cell.inject(ranges=[(0, 1)], source="cell/step")
-        with pytest.raises(PathError, match="whose bytes they are"):
+        with pytest.raises(PathError, match="needed for ranges without a pattern"):
             cell.inject(ranges=[(0, 1)])
         with pytest.raises(CommandError, match="not writable"):
             cell.inject(ranges=[(626, 1)], source="cell/in")

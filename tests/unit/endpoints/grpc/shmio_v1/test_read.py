@@ -137,11 +137,11 @@ def test_injected_registers_are_marked_and_their_originals_told(segment: Segment
         (("cell/axis/position/in",), Status.NOT_FOUND, "leave out /in"),
         (("cell/inputs/0..2",), Status.NOT_FOUND, "outside"),
         (("cell/inputs/1..0",), Status.NOT_FOUND, "write the lower index first"),
-        (("cell/step/0..1",), Status.NOT_FOUND, "in place of an array's last index"),
+        (("cell/step/0..1",), Status.NOT_FOUND, "the place of an array's last index"),
         (("cell/%",), Status.NOT_FOUND, "hexadecimal"),
         (("cell/" + "a" * 20_000,), Status.NOT_FOUND, "at most"),
         (("cell/*" + "a" * 2_000,), Status.NOT_FOUND, "at most"),
-        (("SIMLOG://step",), Status.NOT_FOUND, "SIMLOG://step: it can be subscribed to"),
+        (("SIMLOG://step",), Status.NOT_FOUND, "SIMLOG://step: it can only be subscribed to"),
         (("cell/axis",) * 257, Status.INVALID_ARGUMENT, "257 patterns, 256 are the most"),
     ],
 )

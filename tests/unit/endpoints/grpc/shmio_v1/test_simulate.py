@@ -173,9 +173,9 @@ def test_one_that_joins_again_goes_on_from_what_was_shown(instance: str) -> None
         ({"failure": "no\n solution\x1b[2J"}, "model 'raw': no solution\\x1b[2J"),
         ({"failure": ""}, "model 'raw': it gave no reason"),
         ({"assignments": assigned(**{"axis/count": 70_000})}, "model 'raw': axis/count: "),
-        ({"assignments": assigned(target=1.0)}, "target: it is none of the outputs of drive"),
+        ({"assignments": assigned(target=1.0)}, "target: it is not an output of drive"),
         ({"assignments": assigned(**{"axis/coumt": 1})}, "near: axis/count"),
-        ({"assignments": assigned(**{"lamps/in": [True] * 10})}, "lamps/in: it is none of the outputs"),
+        ({"assignments": assigned(**{"lamps/in": [True] * 10})}, "lamps/in: it is not an output"),
         ({"values": wire.Values(doubles=wire.Doubles(slots=[7], values=[1.0]))}, "doubles: the table has no slot 7"),
         ({"values": wire.Values(doubles=wire.Doubles(values=[1.0, 2.0]))}, "doubles: 2 values for 1 slots"),
         (
@@ -246,7 +246,7 @@ def test_what_it_has_set_too_late_is_shown_with_the_next_step(instance: str) -> 
         ([Request()], Status.INVALID_ARGUMENT, "the first message of Simulate joins"),
         ([], Status.INVALID_ARGUMENT, "the first message of Simulate joins"),
         ([Request(join=wire.Join(source="nothing"))], Status.NOT_FOUND, "no source 'nothing'; there are: drive, cell"),
-        ([Request(join=wire.Join(source="cell"))], Status.FAILED_PRECONDITION, "those that one can join: drive"),
+        ([Request(join=wire.Join(source="cell"))], Status.FAILED_PRECONDITION, "sources that a model can join: drive"),
         ([Request(join=wire.Join(source="drive", name="x" * 104))], Status.INVALID_ARGUMENT, "name: at most 103 bytes"),
         ([Request(join=wire.Join(source="drive"))] * 2, Status.INVALID_ARGUMENT, "a model joins once"),
         (
@@ -284,7 +284,7 @@ def test_an_answer_to_another_step_ends_the_stream(instance: str) -> None:
         code, text = await refusal(model.work())
         assert (code, text) == (Status.INVALID_ARGUMENT, "an answer to step 9, and step 1 is to be done")
         _, text = await refusal(task)
-        assert "model 'raw' was gone before it had answered" in text
+        assert "model 'raw' disconnected before it answered" in text
 
     serve_remote(instance, test)
 
@@ -475,7 +475,7 @@ def test_a_function_computes_a_source(instance: str) -> None:
         ({"row": [1, 2, 3]}, "row: expected 2 times 3 elements, found 3"),
         ({"row": [[1], [2, 3]]}, "row: expected 2 times 3 elements"),
         ({"row": 5}, "row: expected 2 times 3 elements, found no"),
-        (7, "step gave 7, and is to give outputs by their paths"),
+        (7, "step gave 7, but must give outputs by their paths"),
     ],
 )
 def test_outputs_that_cannot_be_fail_the_step(
@@ -524,7 +524,7 @@ def test_what_its_code_raises_is_the_reason_with_the_line(instance: str) -> None
 def test_steps_one_by_one(instance: str, connects: Connect) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         async with connects(f"127.0.0.1:{served.port}") as cell, await cell.simulation("drive") as simulation:
-            with pytest.raises(RemoteError, match="no step is to be answered"):
+            with pytest.raises(RemoteError, match="there is no step to answer"):
                 await simulation.done({})
             task = asyncio.create_task(cell.step(0.5))
             work = await anext(simulation)
@@ -541,7 +541,7 @@ def test_steps_one_by_one(instance: str, connects: Connect) -> None:
             await simulation.fail("no solution")
             with pytest.raises(CommandError, match="no solution"):
                 await task
-            with pytest.raises(RemoteError, match="no step is to be answered"):
+            with pytest.raises(RemoteError, match="there is no step to answer"):
                 await simulation.fail("twice")
             simulation.close()
             assert [work async for work in simulation] == []

@@ -72,7 +72,7 @@ def test_its_connection_breaks(instance: str, stage: str, reset: bool) -> None:
             await served.until(asked)
             await connection.drop(reset=reset)
             code, text = await refusal(step)
-            assert (code, "model 'rude' was gone before it had answered" in text) == (Status.FAILED_PRECONDITION, True)
+            assert (code, "model 'rude' disconnected before it answered" in text) == (Status.FAILED_PRECONDITION, True)
         else:
             await connection.drop(reset=reset)
         await free(served, drive, 1)

@@ -255,8 +255,8 @@ def test_streams_of_equal_patterns_share_table_and_bytes(segment: Segment) -> No
         ({"max_rate_hz": math.nan}, "max_rate_hz"),
         ({"max_rate_hz": 1e9}, "at most 1e+06"),
         ({"deadband": math.inf}, "deadband"),
-        ({"deadband": 1.0, "mode": 1}, "every frame is every frame"),
-        ({"max_rate_hz": 1.0, "mode": 1}, "every frame is every frame"),
+        ({"deadband": 1.0, "mode": 1}, "only for the mode LATEST"),
+        ({"max_rate_hz": 1.0, "mode": 1}, "only for the mode LATEST"),
         ({"deadband": 1.0, "format": 1}, "deadband is for the format VALUES"),
     ],
 )

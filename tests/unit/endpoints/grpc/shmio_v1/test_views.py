@@ -160,7 +160,7 @@ def test_who_does_not_keep_up_is_told_and_left(segment: Segment, monkeypatch: py
             feed.commands.followers.tell(accepted._replace(number=number))
         code, text = await refusal(drain(stream))
         assert code is Status.RESOURCE_EXHAUSTED
-        assert "messages wait to be read" in text
+        assert "messages are waiting" in text
         assert not feed.commands.followers.busy
 
     with_plant(segment, test)

@@ -237,7 +237,8 @@ def test_values_of_a_step_are_all_kept_or_the_stream_ends(monkeypatch: pytest.Mo
             lane.keep(bytes([number]))
         assert await outbox.pop() is None
         assert (
-            outbox.failure == f"{TOPIC_BOUND + 5} values wait to be read: too many change in one step for this stream"
+            outbox.failure
+            == f"{TOPIC_BOUND + 5} values are waiting: too many values change in one step for this stream"
         )
         assert not outbox.owing
 
@@ -256,7 +257,7 @@ def test_values_of_a_step_have_a_bound_in_bytes_too(monkeypatch: pytest.MonkeyPa
         lane.keep(bytes(40))
         assert outbox.failure == ""
         lane.keep(b"1")
-        assert outbox.failure == "2 values wait to be read: too many change in one step for this stream"
+        assert outbox.failure == "2 values are waiting: too many values change in one step for this stream"
 
     asyncio.run(test())
 

@@ -132,7 +132,7 @@ def test_tls_with_certificates_of_both_sides(segment: Segment, address: Address,
             running.until(lambda: running.bridge.connection.up and not running.bridge.outbox.busy)
         trustme.CA().cert_pem.write_to_path(tmp_path / "other.pem")
         with bridge(segment, address, tls=MqttTls(ca=str(tmp_path / "other.pem"))) as running:
-            running.until(lambda: "its certificate is not to be trusted" in running.bridge.problem)
+            running.until(lambda: "its certificate is not trusted" in running.bridge.problem)
         with bridge(segment, address, tls=MqttTls(ca=str(tmp_path / "ca.pem"))) as running:
             running.until(lambda: "mqtt.tls.certificate and key" in running.bridge.problem)
             assert not running.bridge.connection.up

@@ -152,7 +152,7 @@ def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.Mo
             connection.push()
             broker.hear(0x80)
             broker.say("90 05 00 04 00 01 87", lambda: bool(connection.problem))
-            told = "does not let us subscribe: no command can come: Not authorized"
+            told = "refuses our subscription, so no command can arrive: Not authorized"
             assert told in connection.problem
             publish("open")
             broker.say("40 02 00 05", lambda: not connection.in_flight)

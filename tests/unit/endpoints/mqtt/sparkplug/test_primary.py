@@ -46,7 +46,7 @@ def test_a_node_is_born_when_its_primary_host_is_there_dies_with_it_and_keeps_wh
     writer.publish(image(step=1), cycle=1)
     with listening(broker.address, NODES) as listener, bridge(segment, broker.address, sparkplug=WAITING) as running:
         host = Host(listener)
-        running.until(lambda: "the primary host is not there (spBv1.0/STATE/scada)" in running.bridge.problem)
+        running.until(lambda: "the primary host is offline (spBv1.0/STATE/scada)" in running.bridge.problem)
         for nothing in (
             b"ONLINE",
             b"[" * 5000,
@@ -76,7 +76,7 @@ def test_a_node_is_born_when_its_primary_host_is_there_dies_with_it_and_keeps_wh
         say(listener, offline(10))
         death = host.next()
         assert (death.kind, bd_seq(death)) == ("NDEATH", bd_seq(birth))
-        running.until(lambda: "the primary host is not there" in running.bridge.problem)
+        running.until(lambda: "the primary host is offline" in running.bridge.problem)
         for step in range(4, 8):
             writer.publish(image(step=step), cycle=step)
         running.until(lambda: "4 changes are kept" in running.bridge.problem)
