@@ -89,7 +89,7 @@ def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, V
     """Return what a path names, and the value for it; PathError, ValueRangeError."""
     topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.source not in layouts:
-        raise PathError(f"{path}: nothing is served under {topic.source} in this version")
+        raise PathError(f"{path}: unknown source {topic.source}")
     register = look_up(layouts[topic.source], topic)
     try:
         return topic, read_value(text, register)

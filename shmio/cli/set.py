@@ -146,9 +146,9 @@ def _target(layouts: Mapping[str, Layout], path: str) -> tuple[str, Register]:
     """Return the source and the register that a path names; PathError."""
     topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.direction == "out":
-        raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
+        raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
     if topic.source not in layouts:
-        raise PathError(f"{path}: nothing is served under {topic.source} in this version")
+        raise PathError(f"{path}: unknown source {topic.source}")
     layout = layouts[topic.source]
     try:
         return topic.source, look_up(layout, topic)

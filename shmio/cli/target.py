@@ -116,7 +116,7 @@ def opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
         except UnknownClientError as error:
             if token is not None:
                 raise
-            raise UnknownClientError(f"{error}; here by --token-file FILE, which has the token alone") from None
+            raise UnknownClientError(f"{error}; here: --token-file FILE, a file with only the token") from None
 
 
 def config_option(arguments: argparse.Namespace) -> str | None:

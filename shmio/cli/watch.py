@@ -97,7 +97,7 @@ def _changes(cell: Cell, patterns: Sequence[str]) -> Iterator[Sequence[Reading]]
             shown |= now
             update = next(updates)
             if update.ended:
-                removed = "" if update.reason.endswith("by a reload") else ": a reload has taken it away"
+                removed = "" if update.reason.endswith("by a reload") else ": a reload removed it"
                 raise NotRunningError(f"{update.reason}{removed}")
             batch = update.readings
 

@@ -14,7 +14,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 
 def declare_request(declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool) -> Any:
-    """For Declare; ValueRangeError: a key or a value that none can have."""
+    """Return the request for Declare; ValueRangeError for an invalid key or value."""
     given = [one if isinstance(one, Mapping) else msgspec.to_builtins(one) for one in declarations]
     tables = [declaration_to_wire(table, f"injection[{index}]") for index, table in enumerate(given)]
     return wire.DeclareRequest(declarations=tables, keep=keep)

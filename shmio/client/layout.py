@@ -51,7 +51,7 @@ class BlockLayout(Layout):
 
     @property
     def places(self) -> Mapping[str, int]:
-        """Place of each register, by its path without the source."""
+        """Index of each register, by its path without the source."""
         return self.by_path
 
     def array(self, image: bytes) -> Array:

@@ -163,9 +163,9 @@ def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple
     for pattern in patterns:
         topic = parse_topic(pattern, layouts, default)
         if topic.direction == "in":
-            raise PathError(f"{pattern}: what goes into a source cannot be read; leave out /in")
+            raise PathError(f"{pattern}: an input of a source cannot be read; leave out /in")
         if topic.source not in layouts:
-            raise PathError(f"{pattern}: nothing is served under {topic.source} in this version")
+            raise PathError(f"{pattern}: unknown source {topic.source}")
         registers = named(layouts[topic.source], topic)
         if not registers:
             raise PathError(f"{pattern}: no register of {topic.source} has such a path")

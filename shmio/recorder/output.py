@@ -204,7 +204,7 @@ class Output:
             after._thread.join(WAIT_S)
         if after is None or after.whole:
             return True
-        self.error = f"{after.path} before it was not written to its end"
+        self.error = f"{after.path}, the file before it, was not written completely"
         return False
 
     def _put(self, piece: bytes) -> bool:

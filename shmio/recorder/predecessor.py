@@ -43,7 +43,7 @@ def last_positions(
             with Reader(file, own=True, beat=beat) as reader:
                 found = _positions(reader, blocks) | found
         except (OSError, RecordingError) as error:
-            log.warning("it is not known where the recording before ended: %s", error)
+            log.warning("it is unknown where the previous recording ended: %s", error)
         if found.keys() >= blocks.keys():
             break
     return found

@@ -212,7 +212,7 @@ class SubscribeCall:
         self._request = request
         self._wanted = selections.resolve(request.patterns, inward=True)
         if request.format == wire.FORMAT_FRAMES and any(place.inward for place in self._wanted):
-            raise ValueRangeError("what is written has no raw frames: leave out /in, or ask for the format VALUES")
+            raise ValueRangeError("written values have no raw frames: leave out /in, or choose the format VALUES")
         self._blocks: dict[SourceDirection, BlockUpdates] = {}
         self._inward: dict[SourceDirection, WriteFollower] = {}
         self._rings: dict[SourceDirection, Callback] = {}  # the callbacks of their wake-ups

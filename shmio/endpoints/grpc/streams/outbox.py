@@ -377,7 +377,7 @@ class SendQueue:
     def add(self, message: bytes) -> str:
         """Add a message; return why it does not fit, or an empty text."""
         if self._load.full(message, MAX_WAITING):
-            return f"{self._load.count} messages wait to be read: the client is too slow for what is told"
+            return f"{self._load.count} messages are waiting: the client reads too slowly"
         self._load.add(message)
         self._messages.append(message)
         return ""

@@ -341,7 +341,7 @@ def test_who_does_not_read_what_is_written_is_told_so(segment: Segment, monkeypa
         assert await message(stream) == ("cell/running", False)
         status, text = await end(stream)
         assert status is Status.RESOURCE_EXHAUSTED
-        assert text.startswith("cell/step/in: 8 messages wait to be read")
+        assert text.startswith("cell/step/in: 8 messages are waiting")
         await served.until(lambda: left(served))
 
     serve(segment, test)

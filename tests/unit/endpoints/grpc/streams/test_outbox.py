@@ -148,7 +148,7 @@ def test_events_wait_all_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> 
         lane.deliver(b"12345")
         StateLane(outbox).deliver(b"too late")
         assert await outbox.pop() is None
-        assert outbox.failure.startswith("cell/x/in: 1 messages wait to be read")
+        assert outbox.failure.startswith("cell/x/in: 1 messages are waiting")
         assert outbox.dropped == 3
         many = Outbox()
         lane = EventLane(many, "")
@@ -186,7 +186,7 @@ def test_when_all_streams_hold_too_much_those_with_more_than_their_part_give_way
         assert (modest.dropped, modest.states.count) == (0, 3)
         for _ in range(4):
             events.deliver(bytes(10))
-        assert slow.failure.startswith("cell/x/in: 3 messages wait to be read")
+        assert slow.failure.startswith("cell/x/in: 3 messages are waiting")
     assert outboxes.waiting_bytes == 0
     assert outboxes.dropped == hog.dropped + slow.dropped
 
