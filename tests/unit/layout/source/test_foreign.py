@@ -15,8 +15,9 @@ CSV = "Name,Path,Data Type,Logical Address,Comment\nStart,Default,Bool,%I0.0,go\
 
 
 def workbook() -> bytes:
+    """Always the same bytes: they are in the name of a test, which all processes of pytest-xdist must agree on."""
     with zipfile.ZipFile(buffer := io.BytesIO(), "w") as archive:
-        archive.writestr("xl/workbook.xml", "<workbook/>" * 1000)
+        archive.writestr(zipfile.ZipInfo("xl/workbook.xml"), "<workbook/>" * 1000)
     return buffer.getvalue()
 
 
