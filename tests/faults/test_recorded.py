@@ -109,7 +109,7 @@ def test_files_are_checked_in_their_order_and_removed(tmp_path: Path) -> None:
     watch = Watch(tmp_path, lambda file, away_ns: checked.append((file.name, away_ns >= 1000 * MS)))
     for name in "zyxwv":  # the clock goes back
         file = tmp_path / f"{name}.mem"
-        file.touch()
+        file.write_bytes(b"not empty")
         watch.look(ended=False, slack_ns=0)
         past_ns = file.stat().st_mtime_ns - 1000 * MS
         os.utime(file, ns=(past_ns, past_ns))

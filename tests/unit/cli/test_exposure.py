@@ -48,14 +48,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("sections", "writable", "said"),
     [
-        (GRPC, "[]", "ada) may write, inject and control by gRPC at 127.0.0.1:8089 and [::1]:8090, for"),
+        (GRPC, "[]", "ada) may write, inject and control by gRPC at 127.0.0.1:8089 and [::1]:8090 without logging in"),
         (GRPC + TOKEN, "[]", None),
         ('[grpc]\nlisten = ["unix:s"]\n', "[]", None),
         ('[[grpc.address]]\nlisten = "127.0.0.1:8089"\n', "[]", None),
         (
             '[[grpc.address]]\nlisten = "127.0.0.1:8089"\nroles = ["read", "write"]\n' + MQTT + FREE,
             '["**"]',
-            "ada) may write by gRPC at 127.0.0.1:8089; and write by MQTT at 127.0.0.1:1883, for",
+            "ada) may write by gRPC at 127.0.0.1:8089; and write by MQTT at 127.0.0.1:1883 without logging in",
         ),
         (MQTT + FREE, "[]", None),
         (MQTT, '["**"]', None),
