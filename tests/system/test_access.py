@@ -74,7 +74,7 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
         assert next(stream).value, "the stream of a token that stays goes on"
         (guarded.folder / "other").chmod(0o644)
         refused = guarded.supervisor("reload")
-        assert (refused.returncode, "mode 0644 lets others in" in refused.stderr) == (1, True)
+        assert (refused.returncode, "mode 0644 lets other users read it" in refused.stderr) == (1, True)
         file.write_text(before.replace('token_file = "dash"', 'token_file = "other"'))
         (guarded.folder / "other").chmod(0o600)
         assert guarded.supervisor("reload").returncode == 0

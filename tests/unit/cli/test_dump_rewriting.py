@@ -70,7 +70,7 @@ def test_cut_by_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert contents(part) == [entry for entry in contents(file) if low <= entry[0] <= high]
     assert part.stat().st_mode & 0o777 == 0o600
     assert main(["info", "part.mem"]) == 0
-    assert "made of it by shmio-dump cut" in capsys.readouterr().out
+    assert "converted by shmio-dump cut" in capsys.readouterr().out
     assert main(["cut", str(file), "-o", "part.mem"]) == 1
     assert capsys.readouterr().err == "part.mem is there already: nothing is ever overwritten\n"
     assert main(["cut", str(file), "-o", "none.mem", "--from", "100"]) == 1

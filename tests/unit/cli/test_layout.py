@@ -153,7 +153,7 @@ def test_one_block_of_several(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main([str(path), "--type-bytes", "TON_TIME=18", "--type-bytes", "Nope=2"]) == 0
     captured = capsys.readouterr()
     assert "Timers: 18 bytes" in captured.out
-    assert captured.err == "warning: --type-bytes: nothing is of the type 'Nope'\n"
+    assert captured.err == "warning: --type-bytes: nothing has the type 'Nope'\n"
     assert main([str(path), "--block", "other"]) == 1
     assert "--block: no data block 'other'; there are: Timers, Plain" in capsys.readouterr().err
 

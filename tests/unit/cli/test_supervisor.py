@@ -211,7 +211,9 @@ def test_an_idle_emulator_needs_a_number_for_each_block(example: Edit, capsys: p
     example('layout = "db201.db"\nprogram = "a50"', 'layout = "two.db"')
     assert main(["check"]) == 1
     error = capsys.readouterr().err
-    assert "emulator[0].dbNumber: this key is needed, for the data block 'Cell' has no number in its name; " in error
+    assert (
+        "emulator[0].dbNumber: this key is needed, because the data block 'Cell' has no number in its name; " in error
+    )
     assert 'block = "Cell" beside it, to serve only that block' in error
     example('layout = "two.db"', 'layout = "two.db"\nblock = "Cell"\ndbNumber = 9')
     assert main(["check"]) == 0
@@ -332,7 +334,7 @@ def test_what_is_wrong_with_other_blocks_does_not_count(example: Edit, capsys: p
     assert main(["check"]) == 0
     out = capsys.readouterr().out
     assert "Timers, 1 registers, 16 bytes" in out
-    assert "source[0].type_bytes: nothing in Timers is of the type 'Nope'" in out
+    assert "source[0].type_bytes: nothing in Timers has the type 'Nope'" in out
     example("TON_TIME = 16", "TON_TIME = 0")
     assert main(["check"]) == 1
     assert "source[0].type_bytes" in capsys.readouterr().err
@@ -420,7 +422,7 @@ TAKEN = "is the port of emulator[0].listen (127.0.0.1:1102) already; choose anot
         ("port = 1102", "prot = 1102", "source[0].prot: unknown key; did you mean port?"),
         ("port = 1102", 'port = "eleven"', "source[0].port: expected a whole number, got text"),
         ("port = 1102", 'port = "1102"', "source[0].port: expected a whole number, got text"),
-        ('host = "127.0.0.1"', 'host = "127.0.0.1:1102"', "source[0].host: '127.0.0.1:1102' is no host name"),
+        ('host = "127.0.0.1"', 'host = "127.0.0.1:1102"', "source[0].host: '127.0.0.1:1102' is not a host name"),
         ('host = "127.0.0.1"  ', "# ", 'source[0].host: this key is needed (source "cell")\n'),
         ("port = 1102", 'model = "S7_2000"', "source[0].model: 'S7_2000' is unknown; valid: S7_300, S7_400, S7_1200"),
         ("period_ms = 20", "options = {}", "source[0].options: unknown key"),
@@ -634,7 +636,7 @@ def test_nothing_is_logged_without_a_recorder(example: Edit, capsys: pytest.Capt
     Path("supervisor.toml").write_text(Path("supervisor.toml").read_text().partition("\n[recorder]")[0])
     assert main(["up", "--mode", "log"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert "there is no [recorder] section: add one" in line
+    assert "needs a [recorder] section: add one" in line
 
 
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["up", "--mode", "dead"], ["restart"], ["logs", "-n", "-1"]])
@@ -859,7 +861,7 @@ def test_what_an_emulator_cannot_serve_is_odd(folder: Path, capsys: pytest.Captu
     assert main(["check"]) == 0
     out = capsys.readouterr().out
     assert "'Enabel' names nothing in DB7; did you mean Enable?\n" in out
-    assert "it reads DB7 of emulator 'plc', which serves DB8 alone\n" in out
+    assert "it reads DB7 of emulator 'plc', which serves only DB8\n" in out
     assert "the initial value NOWHERE of Enable cannot be read as INT; an emulated PLC starts it at 0\n" in out
 
 

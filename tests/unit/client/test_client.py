@@ -63,7 +63,7 @@ def test_a_bad_value_is_not_given_for_a_good_one(segment: Segment, connects: Con
         wrong[17] = 200  # the length of a STRING[8]
         served.writer.publish(wrong, cycle=1)
         assert await cell["cell/step"] == 3
-        with pytest.raises(QualityError, match=r"cell/name: the bytes are no STRING\[8\]"):
+        with pytest.raises(QualityError, match=r"cell/name: the bytes are not a valid STRING\[8\]"):
             await cell["cell/name"]
         assert (await cell.read("cell/name")).of("cell/name")["cell/name"] is None
         served.writer.publish(image(step=4), cycle=2, quality=FrameQuality.BAD, reason="cable out")

@@ -140,9 +140,9 @@ def test_what_is_no_value_is_not_given_and_what_fails_is_given_again() -> None:
 @pytest.mark.parametrize(
     ("lacking", "message"),
     [
-        ("speed", "speed is no register that belt gives to its model: in the configuration of the instance"),
-        ("position", "position is no register that belt has from its model: .* or name it in outputs"),
-        ("drives/main", "drives/main is no register that belt gives to its model"),
+        ("speed", "speed is not a register that belt gives to its model: in the configuration of the instance"),
+        ("position", "position is not a register that belt has from its model: .* or name it in outputs"),
+        ("drives/main", "drives/main is not a register that belt gives to its model"),
     ],
 )
 def test_a_source_that_lacks_a_register_is_named(lacking: str, message: str) -> None:
@@ -158,7 +158,7 @@ def test_an_in_out_that_is_not_computed_is_to_be_named_in_inouts() -> None:
     runner = ModelRunner(Belt)
     inputs, outputs = split(values(runner, runner.begin()))
     del outputs["raw"]
-    with pytest.raises(ModelError, match="raw is no register that belt has from its model: in the configuration"):
+    with pytest.raises(ModelError, match="raw is not a register that belt has from its model: in the configuration"):
         ServedModel(Belt).start(Joined(inputs, outputs))
 
 

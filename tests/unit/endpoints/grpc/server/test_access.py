@@ -83,7 +83,7 @@ def test_a_token_may_what_its_roles_say(segment: Segment, caplog: pytest.LogCapt
             told, message = await refusal(call(channel, PUBLISH, b"", READER))
             assert told is DENIED
             assert message == (
-                "Publish needs the role write; token 'reader' has read: roles in [[grpc.token]] would have to name it"
+                "Publish needs the role write; token 'reader' has read: add it to its roles in [[grpc.token]]"
             )
             get: Any = channel.unary_unary(GET)
             basic = [("authorization", f"Basic {READER}")]

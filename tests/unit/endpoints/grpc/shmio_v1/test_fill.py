@@ -27,7 +27,9 @@ def test_values_by_path_are_few_for_each_takes_its_time(instance: str) -> None:
             image = bytearray(ROWS.size)
             asyncio.run(fill.assigned(given, image))
             assert image[4 * 4095 : 4 * 4096] == (4095).to_bytes(4, "big")
-            with pytest.raises(ValueRangeError, match=r"4097 values, 4096 are the most by path: give them by slots"):
+            with pytest.raises(
+                ValueRangeError, match=r"4097 values, at most 4096 are allowed by path: give them by slots"
+            ):
                 asyncio.run(fill.assigned([*given, given[0]], image))
         finally:
             segment.unlink()

@@ -347,7 +347,7 @@ def test_what_is_no_range(segment: Segment) -> None:
             ([(600, 29)], "within the block of"),
             ([(1 << 31, 1 << 31)], "within the block of"),
             ([(0, 1, 0x100)], "larger than a byte"),
-            ([(0, 1)] * 300, "256 are the most"),
+            ([(0, 1)] * 300, "at most 256 are allowed"),
         ):
             with pytest.raises(ValueRangeError, match=message):
                 cell.inject(ranges=ranges, source="cell")
@@ -371,7 +371,7 @@ def test_too_many_pieces_are_refused_before_any_is_looked_at(segment: Segment) -
         await call.write(wire.InjectRequest(shadow=shadow))
         while not (answers := (await asyncio.wait_for(call.read(), TIMEOUT_S)).answers):
             pass
-        assert answers[0].outcome.reason.startswith("4097 pieces, 4096 are the most")
+        assert answers[0].outcome.reason.startswith("4097 pieces, at most 4096")
         call.cancel()
 
     with_plant(segment, test)

@@ -142,7 +142,7 @@ def test_injected_registers_are_marked_and_their_originals_told(segment: Segment
         (("cell/" + "a" * 20_000,), Status.NOT_FOUND, "at most"),
         (("cell/*" + "a" * 2_000,), Status.NOT_FOUND, "at most"),
         (("SIMLOG://step",), Status.NOT_FOUND, "SIMLOG://step: it can only be subscribed to"),
-        (("cell/axis",) * 257, Status.INVALID_ARGUMENT, "257 patterns, 256 are the most"),
+        (("cell/axis",) * 257, Status.INVALID_ARGUMENT, "257 patterns, at most 256"),
     ],
 )
 def test_refusals_say_what_is_wrong(segment: Segment, patterns: tuple[str, ...], code: Any, message: str) -> None:
@@ -164,7 +164,7 @@ def test_limits(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(selection, "MAX_ALL_ELEMENTS", 599)
         code, text = await refusal(read(served, "cell/long"))
         assert code is Status.RESOURCE_EXHAUSTED
-        assert "599 are the most" in text
+        assert "at most 599 are allowed" in text
         assert (await read(served, "cell/axis")).tables
 
     serve(segment, test)

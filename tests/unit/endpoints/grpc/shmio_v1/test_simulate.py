@@ -252,7 +252,7 @@ def test_what_it_has_set_too_late_is_shown_with_the_next_step(instance: str) -> 
         (
             [Request(join=wire.Join(source="drive")), Request(done=wire.Done(step=4))],
             Status.INVALID_ARGUMENT,
-            "an answer to step 4, and none is to be done",
+            "an answer to step 4, but no step is pending",
         ),
     ],
 )
@@ -282,7 +282,7 @@ def test_an_answer_to_another_step_ends_the_stream(instance: str) -> None:
         await model.work()
         await model.done(9)
         code, text = await refusal(model.work())
-        assert (code, text) == (Status.INVALID_ARGUMENT, "an answer to step 9, and step 1 is to be done")
+        assert (code, text) == (Status.INVALID_ARGUMENT, "an answer to step 9, but step 1 is pending")
         _, text = await refusal(task)
         assert "model 'raw' disconnected before it answered" in text
 
@@ -465,8 +465,8 @@ def test_a_function_computes_a_source(instance: str) -> None:
 @pytest.mark.parametrize(
     ("outputs", "reason"),
     [
-        ({"axis/none": 1}, "axis/none: it is no output of drive; there are: axis/position, axis/moving"),
-        ({"target": 1.0}, "target: it is no output of drive"),
+        ({"axis/none": 1}, "axis/none: it is not an output of drive; there are: axis/position, axis/moving"),
+        ({"target": 1.0}, "target: it is not an output of drive"),
         ({"axis/count": 1.5}, "axis/count: expected INT, found 1.5"),
         ({"axis/position": "far"}, "axis/position: expected LREAL, found 'far'"),
         ({"axis/name": 3}, "axis/name: expected STRING"),

@@ -160,6 +160,6 @@ def test_values_that_are_none_and_too_many(segment: Segment) -> None:
 def test_too_many_are_refused_before_any_is_looked_at(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         code, text = await refusal(write(served, {f"nothing/{number}": 1 for number in range(4097)}))
-        assert (code, text.startswith("4097 values, 4096 are the most")) == (Status.INVALID_ARGUMENT, True), text
+        assert (code, text.startswith("4097 values, at most 4096")) == (Status.INVALID_ARGUMENT, True), text
 
     with_plant(segment, test)
