@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,7 +28,8 @@ class Faults:
         self._file = file
         self._tables = tables
         self._text = text
-        self._found: dict[str, None] = {}
+        self._found: dict[str, float] = {}
+        self._elsewhere: dict[str, str] = {}
         self._layout: LayoutError | None = None
         self.count = 0
         self.places: Mapping[str, Sequence[int]] = {}
@@ -53,11 +55,22 @@ class Faults:
         text = shortened(named(_PLACE.sub(self._place, message), self._tables))
         key = _KEY.match(text)
         line = self._lines.of(key[0]) if key else 0
-        self._note(f"{self._file}{f':{line}' if line else ''}: {text}")
+        own = text.partition(":")[0]
+        if own in self._elsewhere:
+            table, _, _ = own.partition(".")
+            self._note(f"{self._elsewhere[own]}: {text.removeprefix(f'{table}.')}", line)
+        else:
+            self._note(f"{self._file}{f':{line}' if line else ''}: {text}", line)
 
-    def _note(self, line: str) -> None:
-        if line not in self._found:
-            self._found[line] = None
+    def lies_in(self, file: str, table: str, lines: Mapping[str, int]) -> None:
+        """Note that these keys of a table are in another file, named relative to this one."""
+        for name, line in lines.items():
+            self._elsewhere[f"{table}.{name}"] = f"{self._file.parent / file}:{line}"
+
+    def _note(self, message: str, line: float) -> None:
+        """Note a fault for this line of the file."""
+        if message not in self._found:
+            self._found[message] = line
             self.count += 1
 
     def _place(self, match: re.Match[str]) -> str:
@@ -74,7 +87,7 @@ class Faults:
         except LayoutError as error:
             self._layout = error
             for line in str(error).splitlines():
-                self._note(line)
+                self._note(line, math.inf)  # of another file: after those of this one
 
     def raise_any(self) -> None:
         """Raise ConfigError with a line for each fault, or LayoutError if all are of one layout."""
@@ -83,7 +96,8 @@ class Faults:
         if self._layout is not None and [*self._found] == str(self._layout).splitlines():
             raise self._layout
         more = self.count - MAX_SHOWN
-        raise ConfigError("\n".join([*self._found, *([f"{self._file}: {more} more faults"] if more > 0 else [])]))
+        ordered = sorted(self._found, key=self._found.__getitem__)
+        raise ConfigError("\n".join([*ordered, *([f"{self._file}: {more} more faults"] if more > 0 else [])]))
 
 
 def shortened(message: str) -> str:

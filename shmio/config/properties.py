@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from shmio.config.wording import decode
 from shmio.errors import ConfigError
 
 MAX_FILE_BYTES = 64 << 10
 
 
-def read_properties(file: Path, key: str) -> dict[str, str]:
-    """Read a properties file as text values; ``key`` is the section that names it, for messages.
+def read_properties(file: Path, key: str) -> dict[str, tuple[str, int]]:
+    """Read the text and line of each key; ``key`` is the section that names the file, for messages.
 
     Blank lines, ``[section]`` lines and lines that begin with ``#``, ``;`` or ``!`` are skipped.
 
@@ -24,12 +25,10 @@ def read_properties(file: Path, key: str) -> dict[str, str]:
             data = stream.read(MAX_FILE_BYTES + 1)
         if len(data) > MAX_FILE_BYTES:
             raise ConfigError(f"{key}.properties: {file} is larger than {MAX_FILE_BYTES} bytes")
-        text = data.decode("utf-8-sig")
     except OSError as error:
         raise ConfigError(f"{key}.properties: {file}: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{key}.properties: {file}: not UTF-8 at byte {error.start}") from None
-    values: dict[str, str] = {}
+    text = decode(data, f"{key}.properties: {file}")
+    values: dict[str, tuple[str, int]] = {}
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
         if not stripped or stripped[0] in "#;!" or (stripped[0] == "[" and stripped[-1] == "]"):
@@ -40,5 +39,5 @@ def read_properties(file: Path, key: str) -> dict[str, str]:
             raise ConfigError(f"{key}.properties: {file}:{number}: expected key=value")
         if name in values:
             raise ConfigError(f"{key}.properties: {file}:{number}: {name} is given twice")
-        values[name] = value.strip()
+        values[name] = value.strip(), number
     return values

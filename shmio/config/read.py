@@ -38,7 +38,7 @@ from shmio.config.model import (
 )
 from shmio.config.mqtt.rules import check_mqtt, resolve_mqtt
 from shmio.config.properties import read_properties
-from shmio.config.wording import explain, explain_toml, near
+from shmio.config.wording import decode, explain, explain_toml, near
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
@@ -131,10 +131,7 @@ def read_text(file: Path) -> str:
         raise ConfigError(f"{file}: {error.strerror}") from None
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(f"{file}: larger than {MAX_FILE_BYTES} bytes")
-    try:
-        return data.decode("utf-8-sig")  # some editors write a byte order mark
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{file}: not UTF-8 at byte {error.start}") from None
+    return decode(data, str(file))
 
 
 def parse(file: Path, text: str) -> dict[str, Any]:
@@ -245,13 +242,14 @@ class _Structure:
         before = self._faults.count
         for fault in text_faults(options, key):
             self._faults.add(fault)
-        read: dict[str, str] = {}
+        texts: dict[str, str] = {}
         properties = value.get("properties")
         if isinstance(properties, str) and not any(text_faults(properties, "")):
             with self._faults.catching():
                 read = read_properties(self._folder / properties, key)
+                texts = {name: text for name, (text, _) in read.items() if name not in options}
+                self._faults.lies_in(properties, key, {name: line for name, (_, line) in read.items() if name in texts})
         usable = self._faults.count == before
-        texts = {name: text for name, text in read.items() if name not in options}
         good, found = self.table({name: value[name] for name in value if name in common}, key, name)
         if good and usable:
             return True, found | {"options": options, "texts": texts}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterable, Mapping
 from tomllib import TOMLDecodeError
 from typing import Any, get_args
@@ -21,6 +22,7 @@ from shmio.config.model import (
     PayloadName,
     ReplayedInjections,
 )
+from shmio.errors import ConfigError
 
 MAX_LINE = 80
 MAX_HINTED = 100
@@ -67,6 +69,18 @@ def explain(error: ValidationError, key: str = "") -> str:
     text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)
     text = text[:1].lower() + text[1:]
     return f"{path}: {text}" if path else text
+
+
+def decode(data: bytes, place: str) -> str:
+    """Return the text of a file; ``place`` names it. ConfigError unless it is UTF-8."""
+    try:
+        text = data.decode("utf-8-sig")  # some editors write a byte order mark
+    except UnicodeDecodeError as error:
+        utf16 = ", but UTF-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else f" at byte {error.start}"
+        raise ConfigError(f"{place}: not UTF-8{utf16}; save the file as UTF-8") from None
+    if "\0" in text:
+        raise ConfigError(f"{place}: zero bytes, as in UTF-16; save the file as UTF-8")
+    return text
 
 
 def near(word: str, names: Iterable[str]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, count, islice
@@ -29,6 +30,7 @@ MAX_SOURCES = 50
 """Most sources of one configuration; of more data blocks the user chooses one."""
 RESERVED = RESERVED_SOURCES | SECTION_PROCESSES | {"plc"}
 _DB_NUMBER = re.compile(r"[0-9]{1,5}", re.ASCII)
+_UMLAUTS: Final = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 _NAME = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_LENGTH: Final = 40
 MAX_FILES: Final = 500
@@ -39,8 +41,8 @@ class NewConfig(NamedTuple):
     """A first configuration."""
 
     text: str
-    missing: list[str]
-    """The keys that are left to fill in."""
+    missing: dict[Path, list[str]]
+    """The keys that are left to fill in, by file: the configuration or the properties file."""
     warnings: list[str]
     """What the layout compiler warns of, and the data blocks that cannot be used."""
 
@@ -68,7 +70,7 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
             f"init takes the sources of one controller ({', '.join(SOURCES)}) and at most one properties file such as "
             "plc.ini, or no file"
         )
-    properties = read_properties(others[0], "init") if others else {}
+    properties = {key: text for key, (text, _) in read_properties(others[0], "init").items()} if others else {}
     number = properties.get("dbNumber", "")
     program = read_program(sources)
     blocks, warnings = _compile(program, name, number)
@@ -76,15 +78,20 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
     layout = f"layout = {_toml(paths if len(paths) > 1 else paths[0])}"
     held = ", ".join(block.name for block in program.blocks) if len(program.blocks) > 1 else ""
     names = _source_names(blocks)
-    missing: list[str] = []
+    missing: dict[Path, list[str]] = {}
     lines = ["[instance]", f"name = {_toml(vacant_name(_instance(blocks[0]), file))}", ""]
     addresses, emulators = _emulators(layout, blocks, len(program.blocks), number) if emulated else ([], [])
     for index, block in enumerate(blocks):
         if emulated:
             device, writable = _emulated(block, number, addresses[index]), '["**"]                     # all of it'
         else:
-            device, left = _real(block, properties)
-            missing += [key for key in left if key not in missing]
+            device = []
+            for key, comment in _unknown(block, properties):
+                # The properties file is that of all blocks, and each block has a number of its own.
+                place = others[0] if others and (key == "host" or len(blocks) == 1) else file
+                device += [comment] if place == file else []
+                left = missing.setdefault(place, [])
+                left += [key] if key not in left else []
             writable = "[]                         # nothing is writable unless named"
         lines += [
             "[[source]]",
@@ -168,16 +175,12 @@ def _source_names(blocks: Sequence[Layout]) -> list[str]:
     return names
 
 
-def _real(block: Layout, properties: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """Return comment lines for the keys that are not known, and these keys."""
-    lines, missing = [], []
+def _unknown(block: Layout, properties: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield each key about the real controller that is not known, and a comment line for it."""
     if "host" not in properties:
-        missing.append("host")
-        lines.append('# host = ""                           # needed: the address of your controller')
+        yield "host", '# host = ""                           # needed: the address of your controller'
     if block.number is None and "dbNumber" not in properties:
-        missing.append("dbNumber")
-        lines.append("# dbNumber =                          # needed: the number of the data block")
-    return lines, missing
+        yield "dbNumber", "# dbNumber =                          # needed: the number of the data block"
 
 
 def _number(block: Layout, number: str) -> int:
@@ -216,7 +219,9 @@ def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) ->
 
 def _instance(block: Layout) -> str:
     """Return a name for the instance, after its block."""
-    return _NAME.sub("-", block.name.lower()).strip("-_")[:40] or "cell"
+    plain = unicodedata.normalize("NFKD", unicodedata.normalize("NFC", block.name.lower()).translate(_UMLAUTS))
+    letters = "".join(char for char in plain if not unicodedata.combining(char))
+    return _NAME.sub("-", letters).strip("-_")[:40] or "cell"
 
 
 def _addresses(roles: list[str]) -> list[str]:

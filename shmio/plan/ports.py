@@ -81,6 +81,11 @@ def in_use(address: Address) -> bool:
     return False
 
 
+def served(address: Address) -> bool:
+    """Return whether a process of this host listens at an address of it."""
+    return any(True for _ in _listening(address))
+
+
 def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
     """Return (family, socket address) for each address of a host name; ConfigError if unknown."""
     try:

@@ -109,7 +109,16 @@ class Fleet:
             quiet_ns = managed.quiet_ns(elapsed_ns)
             if managed.life.state is State.STARTING:
                 self._evict(managed)
-            event = policy.due(managed.life, now_ns, ready=managed.ready, quiet_ns=quiet_ns, limits=self._limits)
+            late = managed.life.state is State.STARTING and now_ns >= (managed.life.due_ns or now_ns)
+            waited_ns = managed.child.waited_ns() if late and managed.child else 0
+            event = policy.due(
+                managed.life,
+                now_ns,
+                ready=managed.ready,
+                quiet_ns=quiet_ns,
+                limits=self._limits,
+                waited_ns=waited_ns,
+            )
             if event is not None:
                 dying = managed.child if managed.life.killed else None
                 self.apply(managed, event, stale_segment.survivor(dying.pid) if dying else "")

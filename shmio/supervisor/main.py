@@ -304,7 +304,7 @@ class Supervisor:
         for managed in self._fleet:
             reason = policy.start_failure(managed.life, self._limits)
             if reason is not None:
-                self._failure = f"{managed.name}: {reason}"
+                self._failure = f"{managed.name}: {reason}{managed.advice}"
                 log.error("the start failed: %s", self._failure)
                 self._stop()
                 return

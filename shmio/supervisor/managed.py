@@ -88,6 +88,12 @@ class ManagedProcess:
         report = self.slot.report
         return self.child is not None and report.pid == self.child.pid and report.activity is Activity.RUNNING
 
+    @property
+    def advice(self) -> str:
+        """The end of a message about a failed start: what to do if the process was too late; else empty."""
+        late = self.life.hang and self.life.hang in self.life.note
+        return f"; see its log, {self.job.log_file}; the host may be overloaded" if late else ""
+
     def listen(self) -> None:
         """Read the problem that the process reports; log its end and what was lost."""
         running = self.life.state is State.RUNNING

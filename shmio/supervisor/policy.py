@@ -25,6 +25,8 @@ class Limits:
 
     start_s: float = 20.0
     """From the start of a process until it must report that it runs."""
+    start_most_s: float = 60.0
+    """The same for a process that has waited for a processor most of the time."""
     hang_s: float = 5.0
     """Longest time without a heartbeat while running."""
     grace_s: float = 5.0
@@ -133,7 +135,7 @@ def backoff_s(crashes: int, limits: Limits) -> float:
     return limits.backoff.wait_s(crashes - 2) if crashes > 1 else 0.0
 
 
-def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits) -> Event | None:
+def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, waited_ns: int = 0) -> Event | None:
     """Return the event that the time or the worker's report causes, if any.
 
     Args:
@@ -142,10 +144,15 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits) 
         ready: Whether it has reported that it runs.
         quiet_ns: Time without a heartbeat.
         limits: The limits that apply.
+        waited_ns: How long it has been ready to compute, but without a processor, since its start.
 
     """
-    if life.state is State.STARTING and ready:
-        return Event.READY
+    if life.state is State.STARTING:
+        if ready:
+            return Event.READY
+        since_ns = now_ns - life.spawned_ns
+        if 2 * waited_ns >= since_ns and since_ns < limits.start_most_s * 1e9:  # the host is overloaded
+            return None
     if life.state is State.RUNNING and quiet_ns >= limits.hang_s * 1e9:
         return Event.HANG
     if life.due_ns is not None and now_ns >= life.due_ns:

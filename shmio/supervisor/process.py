@@ -80,6 +80,12 @@ class ChildProcess:
         os.close(self.pidfd)
         return code
 
+    def waited_ns(self) -> int:
+        """Return how long its main thread has waited for a processor since its start, in ns; 0 if unknown."""
+        with suppress(OSError, IndexError, ValueError):  # proc(5): a kernel may lack the file
+            return int(Path(f"/proc/{self.pid}/schedstat").read_text().split()[1])
+        return 0
+
     def last_words(self) -> str:
         """Return the last line that the process left in its log file; empty if there is none."""
         with suppress(OSError), self._log_file.open("rb") as log:
@@ -118,6 +124,10 @@ class AdoptedProcess:
         """Wait for the end of the process, and close its pidfd."""
         select.select([self.pidfd], [], [])
         os.close(self.pidfd)
+
+    def waited_ns(self) -> int:
+        """Return 0: it has been running, and its start is not waited for."""
+        return 0
 
     def last_words(self) -> str:
         """Return "": where its lines begin in the log file is unknown."""

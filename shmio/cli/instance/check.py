@@ -9,10 +9,11 @@ from typing import Any
 
 from shmio.cli.run import dumps
 from shmio.cli.target import config_file
-from shmio.errors import ShmioError
+from shmio.config import Address
+from shmio.errors import ConfigError, ShmioError
 from shmio.logs import printable
-from shmio.plan.ports import taken
-from shmio.plan.prepare import peer, prepare
+from shmio.plan.ports import served, taken
+from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import Plan
 from shmio.segment import PREFIX, BlockSpec, Segment
 
@@ -22,6 +23,7 @@ def execute(arguments: argparse.Namespace) -> int:
     file = config_file(arguments)
     prepared = prepare(file)
     plan = prepared.plan
+    would_fail = _taken(file, plan)
     found: dict[str, Any] = {
         "config": str(file),
         "instance": plan.instance,
@@ -33,14 +35,15 @@ def execute(arguments: argparse.Namespace) -> int:
         "replay": [],
         "segment": f"{PREFIX}{plan.instance}",
         "segment_bytes": plan.segment_bytes,
-        "notes": [*prepared.notes, *_taken(file, plan)],
+        "notes": [*prepared.notes, *_unserved(prepared), *would_fail],
         "warnings": list(plan.warnings),
     }
     if prepared.config.replay and prepared.config.replay.file:
         replay = prepare(file, "replay").plan
         found["replay"] = [_described(block, "") for block in replay.blocks]
         found["warnings"] += [warning for warning in replay.warnings if warning not in plan.warnings]
-    print(dumps(found, indent=2) if arguments.json else "\n".join(map(printable, _lines(found))))
+    lines = [dumps(found, indent=2)] if arguments.json else _lines(found, would_fail=bool(would_fail))
+    print("\n".join(lines if arguments.json else map(printable, lines)))
     return 0
 
 
@@ -52,8 +55,30 @@ def _taken(file: Path, plan: Plan) -> list[str]:
     return [f"note: up would fail at present: {problem}" for problem in taken(plan)]
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
+def _unserved(prepared: Prepared) -> list[str]:
+    """Return a note for each S7 source that reads this host where nobody listens, nor will.
+
+    If the file has emulators, that is a warning.
+    """
+    notes = []
+    for source in prepared.config.source if not prepared.config.emulator else ():
+        device = peer(source)
+        if source.connector == "s7" and ":" in device and (address := Address.parse(device)).loopback:
+            with suppress(ConfigError):
+                if not served(address):
+                    notes.append(
+                        f"note: source {source.name} reads {device}, where nothing listens at present, and this file "
+                        "has no [[emulator]]: it will be bad until a device answers there"
+                    )
+    return notes
+
+
+def _lines(found: dict[str, Any], *, would_fail: bool) -> list[str]:
     count, processes = len(found["warnings"]), len(found["processes"])
+    warnings = f"{count} warning{'s' * (count != 1)}"
+    end = f"usable, with {warnings}" if count else "no faults found"
+    if would_fail:
+        end = f"no faults{f', {warnings}' if count else ''} in the configuration; up would fail at present"
     return [
         f"{found['config']}: instance {found['instance']}, {processes} process{'es' * (processes != 1)}",
         *(f"  {_line(source)}" for source in found["sources"]),
@@ -62,7 +87,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         f"  segment {found['segment']}: {found['segment_bytes'] / 1e6:.2f} MB of shared memory",
         *found["notes"],
         *found["warnings"],
-        f"usable, with {count} warning{'s' * (count != 1)}" if count else "no faults found",
+        end,
     ]
 
 

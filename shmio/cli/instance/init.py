@@ -21,7 +21,7 @@ def execute(arguments: argparse.Namespace) -> int:
     """Write the files, or none of them if one exists already."""
     file = config_file(arguments)
     _refuse_present(file)
-    text, missing = None, list[str]()
+    text, missing = None, dict[Path, list[str]]()
     if arguments.files:
         text, missing, warnings = new_config(file, arguments.files, arguments.block, emulated=arguments.emulated)
         for line in warnings:
@@ -37,7 +37,8 @@ def execute(arguments: argparse.Namespace) -> int:
         print(
             f"an instance or a configuration nearby is called {EXAMPLE_NAME}, too: to run both, call this one {other}"
         )
-    first = f"fill in {' and '.join(missing)} in {file}, then " if missing else ""
+    left = [f"{' and '.join(keys)} in {place}" for place, keys in missing.items()]
+    first = f"fill in {', and '.join(left)}, then " if left else ""
     check, up = (f"shmio-supervisor {verb} {option_for(file)}".rstrip() for verb in ("check", "up"))
     print(printable(f"next: {first}{check}, then {up}"))
     return 0

@@ -32,7 +32,10 @@ MAX_TEXT = 1 << 20
 _FLOATS = frozenset({"REAL", "LREAL"})
 _STRINGS = frozenset(["CHAR", "WCHAR", "STRING", "WSTRING", "DATE", "DATE_AND_TIME", "LDT", "DTL", "POINTER", "ANY"])
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
-_NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "+Infinity": math.inf, "-Infinity": -math.inf}
+_NON_FINITE = {"nan": math.nan} | {
+    f"{sign}{word}": -math.inf if sign == "-" else math.inf for sign in ("", "+", "-") for word in ("inf", "infinity")
+}
+"""Texts of values that are no numbers, in lower case: case does not count."""
 
 
 def wire_type(register: Register) -> WireType:
@@ -114,7 +117,7 @@ def _finite_or_not(value: object) -> object:
     """Convert the texts that ``json_value`` writes for NaN and infinities back to floats."""
     if isinstance(value, list):
         return [_finite_or_not(item) for item in value]
-    return _NON_FINITE.get(value, value) if isinstance(value, str) else value
+    return _NON_FINITE.get(value.lower(), value) if isinstance(value, str) else value
 
 
 def _scalar_text(value: Scalar, element: ElementType) -> str:
@@ -144,8 +147,8 @@ def _read(text: str, element: ElementType) -> Scalar:
         if value is None:
             raise ValueRangeError(f"BOOL: expected true or false, found {brief(text)}")
         return value
-    if base in _FLOATS and text in _NON_FINITE:
-        return _NON_FINITE[text]
+    if base in _FLOATS and text.lower() in _NON_FINITE:
+        return _NON_FINITE[text.lower()]
     if len(text) > MAX_NUMBER or not _NUMBER.fullmatch(text):
         raise ValueRangeError(f"{element.name}: expected a number, found {brief(text)}")
     if base in _FLOATS:

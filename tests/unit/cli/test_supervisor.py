@@ -260,6 +260,25 @@ def test_init_of_several_blocks_takes_the_one_of_the_number(capsys: pytest.Captu
     assert "DB7, 1 registers, 4 bytes" in capsys.readouterr().out
 
 
+def test_init_says_what_belongs_into_the_properties_file(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("cell.db").write_text(block('"Größe 1é"', "Int"))
+    Path("plc.ini").write_text("slot=1\n")
+    assert main(["init", "plc.ini", "cell.db"]) == 0
+    assert "next: fill in host and dbNumber in plc.ini, then" in capsys.readouterr().out
+    text = Path("supervisor.toml").read_text()
+    assert 'name = "groesse-1e"' in text
+    assert "host" not in text
+    with socket.create_server(("127.0.0.1", 0)) as plc:
+        port = plc.getsockname()[1]
+        Path("plc.ini").write_text(f"host=127.0.0.1\nport={port}\ndbNumber=7\n")
+        assert main(["check"]) == 0
+        assert "nothing listens" not in capsys.readouterr().out
+    assert main(["check"]) == 0
+    output = capsys.readouterr().out
+    assert f"note: source cell reads 127.0.0.1:{port}, where nothing listens at present" in output
+    assert output.endswith("no faults found\n")
+
+
 SEVERAL = [
     block('"Grip left"', "Array[0..99] of Int"),
     block("DB9", "Array[0..199] of DInt"),

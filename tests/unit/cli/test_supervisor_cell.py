@@ -245,6 +245,7 @@ def test_a_port_that_another_program_has_is_found_before_the_start(cell: Cell, a
     )
     assert error == told
     assert f"note: up would fail at present: {told}" in checked
+    assert checked.endswith("no faults in the configuration; up would fail at present\n")
     assert not (cell.folder / "logs").exists()
 
 

@@ -9,6 +9,7 @@ import pytest
 from shmio.config import load
 from shmio.config.lines import Lines
 from shmio.errors import ConfigError
+from shmio.plan.prepare import prepare
 
 HEAD = '[instance]\nname = "x"\n'
 MANY = """[instance]
@@ -62,31 +63,46 @@ def refused(folder: Path, text: str) -> list[str]:
 
 def test_all_faults_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
     assert refused(tmp_path, MANY) == [
-        "F:4: instance.ring: unknown key; did you mean ring_mb?",
         "F:3: instance.clock: 'Wall' is unknown; valid: wall, stepped; did you mean wall?",
+        "F:4: instance.ring: unknown key; did you mean ring_mb?",
         'F:6: source[0].connector: this key is needed (source "cell")',
         'F:8: source[0].layout: expected text or a list in [ ], got a whole number (source "cell")',
         'F:9: source[0].period_ms: expected a number, got text (source "cell")',
-        (
-            "F:38: injection[1].operation: 'ofset' is unknown; valid: set, offset, scale, clamp, noise, random, "
-            'freeze, delay, drop, flip; did you mean offset? (injection "drift")'
-        ),
         "F:12: source[1].name: 'Model' is reserved",
-        "F:17: emulator[0].name: 'model' is reserved",
         (
             "F:14: source[1].stale_ms: 1 is less than two periods of 20 ms: one late frame would make the source bad "
             '(source "Model")'
         ),
-        "F:30: injection[0].value: this key is needed for operation 'offset' (injection \"drift\")",
+        "F:17: emulator[0].name: 'model' is reserved",
         (
             "F:19: emulator[0].listen: '1102' is not an address; expected host:port, such as 127.0.0.1:8089 "
             '(emulator "model")'
         ),
-        "F:28: grpc.token[0].roles[0]: no role 'Read'; did you mean read?",
         (
             "F:23: grpc.listen[0]: 0.0.0.0:1 can be reached from other hosts in plain text; that needs a [grpc.tls] "
             "table, or insecure = true beside it"
         ),
+        "F:28: grpc.token[0].roles[0]: no role 'Read'; did you mean read?",
+        "F:30: injection[0].value: this key is needed for operation 'offset' (injection \"drift\")",
+        (
+            "F:38: injection[1].operation: 'ofset' is unknown; valid: set, offset, scale, clamp, noise, random, "
+            'freeze, delay, drop, flip; did you mean offset? (injection "drift")'
+        ),
+    ]
+
+
+def test_a_fault_in_a_properties_file_is_told_with_its_line_there(tmp_path: Path) -> None:
+    (tmp_path / "plc.ini").write_text("# PLC\nhosst=10.0.0.1\nport=eleven\n")
+    source = '[[source]]\nname = "c"\nconnector = "s7"\nlayout = "x.db"\nproperties = "plc.ini"\nperiod_ms = -1\n'
+    file = tmp_path / "supervisor.toml"
+    file.write_text(HEAD + source)
+    with pytest.raises(ConfigError) as caught:
+        prepare(file)
+    place = tmp_path / "plc.ini"
+    assert str(caught.value).split("\n") == [
+        f'{place}:2: hosst: unknown key; did you mean host? (source "c")',
+        f'{place}:3: port: expected a whole number, got text (source "c")',
+        f'{file}:8: source[0].period_ms: expected a number > 0 (source "c")',
     ]
 
 

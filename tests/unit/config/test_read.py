@@ -228,8 +228,12 @@ def test_a_missing_file_is_named_with_the_remedy(tmp_path: Path) -> None:
 
 def test_bytes_that_are_no_text_are_refused(folder: Path) -> None:
     (folder / "supervisor.toml").write_bytes(b"name = '\xff'")
-    with pytest.raises(ConfigError, match="not UTF-8 at byte 8"):
+    with pytest.raises(ConfigError, match="not UTF-8 at byte 8; save the file as UTF-8"):
         load(folder / "supervisor.toml")
+    for encoding in ("utf-16", "utf-16-le"):
+        (folder / "supervisor.toml").write_bytes("[instance]".encode(encoding))
+        with pytest.raises(ConfigError, match="UTF-16; save the file as UTF-8"):
+            load(folder / "supervisor.toml")
     (folder / "supervisor.toml").write_bytes(b"#" * (1 << 21))
     with pytest.raises(ConfigError, match="larger than"):
         load(folder / "supervisor.toml")

@@ -131,6 +131,20 @@ def test_no_report_in_time_is_a_crash(world: World) -> None:
     assert world.life.crashes == 1
 
 
+def test_a_start_without_a_processor_is_given_more_time_up_to_a_limit(world: World) -> None:
+    def after(seconds: float, waited_s: float) -> Event | None:
+        world.now_ns = world.life.spawned_ns + round(seconds * S)
+        waited_ns = round(waited_s * S)
+        return policy.due(world.life, world.now_ns, ready=False, quiet_ns=0, limits=LIMITS, waited_ns=waited_ns)
+
+    world.happens(Event.START)
+    assert after(LIMITS.start_s, 0.5 * LIMITS.start_s) is None
+    assert after(LIMITS.start_s, 0.4 * LIMITS.start_s) is Event.ELAPSED, "it waits for something else"
+    assert after(LIMITS.start_most_s - 1, LIMITS.start_most_s - 2) is None
+    assert after(LIMITS.start_most_s, LIMITS.start_most_s - 1) is Event.ELAPSED
+    assert world.passes(0, ready=True) is Event.READY
+
+
 def test_silence_while_running_is_a_crash(world: World) -> None:
     started(world)
     assert world.passes(100, quiet_s=LIMITS.hang_s - 0.001) is None, "only silence counts, not time"

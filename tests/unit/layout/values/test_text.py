@@ -82,6 +82,8 @@ def test_lreal_comes_back(value: float) -> None:
         (".5", "REAL", 0.5),
         ("5.", "REAL", 5.0),
         ("+Infinity", "REAL", math.inf),
+        ("INF", "REAL", math.inf),
+        ("-inf", "LREAL", -math.inf),
         ("5.0", "INT", 5),
         ("1.0E2", "BYTE", 100),
         ("9223372036854775807.0", "LINT", (1 << 63) - 1),
@@ -103,7 +105,7 @@ def test_what_java_and_others_print(text: str, type_: str, value: Value) -> None
             (text, "INT")
             for text in ("", "x", "32768", "5.5", "1e5", "NaN", "1_0", "0x5", "9" * 5000, "1e9999", "\u0665")
         ),
-        *((text, "REAL") for text in ("", "nan", "inf", "1e39", "1e999", "1,5", "1_0", "true", "1.0f", "0x1p3")),
+        *((text, "REAL") for text in ("", "nans", "in", "1e39", "1e999", "1,5", "1_0", "true", "1.0f", "0x1p3")),
         *((text, "LREAL") for text in ("1e309", "Infinit")),
         *((text, "BOOL") for text in ("", "2", "yes", "1.0")),
         *((text, "STRING[3]") for text in ("abcd", "€")),
