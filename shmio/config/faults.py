@@ -30,6 +30,7 @@ class Faults:
         self._text = text
         self._found: dict[str, float] = {}
         self._elsewhere: dict[str, str] = {}
+        self._warnings: list[str] = []
         self._layout: LayoutError | None = None
         self.count = 0
         self.places: Mapping[str, Sequence[int]] = {}
@@ -73,6 +74,10 @@ class Faults:
             self._found[message] = line
             self.count += 1
 
+    def warn(self, message: str) -> None:
+        """Add a warning, ``key: what is odd``, which is shown after the faults."""
+        self._warnings.append(f"{self._file}: warning: {shortened(_PLACE.sub(self._place, message))}")
+
     def _place(self, match: re.Match[str]) -> str:
         places, index = self.places.get(match[1], ()), int(match[2])
         return f"{match[1]}[{places[index] if index < len(places) else index}]"
@@ -90,14 +95,15 @@ class Faults:
                 self._note(line, math.inf)  # of another file: after those of this one
 
     def raise_any(self) -> None:
-        """Raise ConfigError with a line for each fault, or LayoutError if all are of one layout."""
+        """Raise ConfigError with a line for each fault, then the warnings; LayoutError if all are of one layout."""
         if not self.count:
             return
-        if self._layout is not None and [*self._found] == str(self._layout).splitlines():
+        if self._layout is not None and not self._warnings and [*self._found] == str(self._layout).splitlines():
             raise self._layout
         more = self.count - MAX_SHOWN
         ordered = sorted(self._found, key=self._found.__getitem__)
-        raise ConfigError("\n".join([*ordered, *([f"{self._file}: {more} more faults"] if more > 0 else [])]))
+        rest = [f"{self._file}: {more} more faults"] if more > 0 else []
+        raise ConfigError("\n".join([*ordered, *rest, *self._warnings]))
 
 
 def shortened(message: str) -> str:

@@ -94,8 +94,10 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     for index, emulator in enumerate(config.emulator):
         with faults.catching():
             emulated[emulator.name] = _check_emulator(index, emulator, files)
-    faults.raise_any()
     layouts = sources.layouts
+    if faults:
+        _warn_besides(config, layouts, faults)
+    faults.raise_any()
     with faults.catching():
         config = _spelled(config, layouts)
     declared, described = dict[str, bytes](), tuple[str, ...]()
@@ -143,14 +145,7 @@ def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
             return topic_path(patterns, layouts, default)
         return [topic_path(pattern, layouts, default) for pattern in patterns]
 
-    sources = [
-        replace(
-            source,
-            writable=[block_path(pattern, layouts[source.name]) for pattern in source.writable],
-            allow_nonfinite=tuple(block_path(pattern, layouts[source.name]) for pattern in source.allow_nonfinite),
-        )
-        for source in config.source
-    ]
+    sources = [_spelled_source(source, layouts[source.name]) for source in config.source]
     mqtt, recorder = config.mqtt, config.recorder
     if mqtt is not None:
         rules = [replace(rule, match=topics(rule.match)) for rule in mqtt.topic]
@@ -160,6 +155,25 @@ def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
         recorder = replace(recorder, registers=topics(recorder.registers))
     injections = [replace(one, target=topics(one.target)) for one in config.injection]
     return replace(config, source=sources, mqtt=mqtt, recorder=recorder, injection=injections)
+
+
+def _spelled_source(source: Source, layout: Layout) -> Source:
+    return replace(
+        source,
+        writable=[block_path(pattern, layout) for pattern in source.writable],
+        allow_nonfinite=tuple(block_path(pattern, layout) for pattern in source.allow_nonfinite),
+    )
+
+
+def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) -> None:
+    """Warn of the sources' patterns as far as their layouts are known, in spite of faults elsewhere."""
+    names = [source.name for source in config.source]
+    for index, source in enumerate(config.source):
+        if source.name in layouts and names.count(source.name) == 1:
+            with faults.catching():
+                spelled = _spelled_source(source, layouts[source.name])
+                for text in _odd_patterns(f"source[{index}]", spelled, layouts[source.name], faults):
+                    faults.warn(text)
 
 
 def peer(source: Source) -> str:
@@ -225,21 +239,26 @@ def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str
         key, layout = f"source[{index}]", layouts[source.name]
         if source.connector == "remote" and config.grpc is None:
             odd.append(f"{key}.connector: no model can connect to {source.name}, because there is no [grpc] section")
-        for name, patterns in (("writable", source.writable), ("allow_nonfinite", source.allow_nonfinite)):
-            for pattern in patterns:
-                try:
-                    if not _covers(pattern, layout):
-                        odd.append(f"{key}.{name}: {pattern!r} names nothing in {layout.name}{_near(pattern, layout)}")
-                    elif name == "allow_nonfinite" and not _covers(pattern, layout, NONFINITE):
-                        odd.append(f"{key}.{name}: {pattern!r} names no REAL or LREAL in {layout.name}")
-                except PathError as error:
-                    faults.add(f"{key}.{name}: {error}")
+        odd += _odd_patterns(key, source, layout, faults)
         number = source.options.get("dbNumber")
         if number is not None and layout.number is not None and number != layout.number:
             odd.append(f"{key}.dbNumber: {number}, but the layout is that of DB{layout.number}")
     if not config.source:
         odd.append("there is no [[source]]: the instance will hold no registers")
     return odd
+
+
+def _odd_patterns(key: str, source: Source, layout: Layout, faults: Faults) -> Iterator[str]:
+    """Yield warnings about a source's patterns that name nothing; note invalid ones."""
+    for name, patterns in (("writable", source.writable), ("allow_nonfinite", source.allow_nonfinite)):
+        for pattern in patterns:
+            try:
+                if not _covers(pattern, layout):
+                    yield f"{key}.{name}: {pattern!r} names nothing in {layout.name}{_near(pattern, layout)}"
+                elif name == "allow_nonfinite" and not _covers(pattern, layout, NONFINITE):
+                    yield f"{key}.{name}: {pattern!r} names no REAL or LREAL in {layout.name}"
+            except PathError as error:
+                faults.add(f"{key}.{name}: {error}")
 
 
 def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:

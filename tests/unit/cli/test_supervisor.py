@@ -267,7 +267,7 @@ def test_init_says_what_belongs_into_the_properties_file(capsys: pytest.CaptureF
     assert "next: fill in host and dbNumber in plc.ini, then" in capsys.readouterr().out
     text = Path("supervisor.toml").read_text()
     assert 'name = "groesse-1e"' in text
-    assert "host" not in text
+    assert "# host" not in text
     with socket.create_server(("127.0.0.1", 0)) as plc:
         port = plc.getsockname()[1]
         Path("plc.ini").write_text(f"host=127.0.0.1\nport={port}\ndbNumber=7\n")
@@ -364,6 +364,15 @@ def test_init_of_other_files_is_refused(files: list[str], capsys: pytest.Capture
     assert main(["init", *files]) == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert not Path("supervisor.toml").exists()
+
+
+def test_warnings_are_shown_besides_faults_elsewhere(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    example('"Outputs", ', '"Nothing", ')
+    example('kind = "s7"', 'kind = "s8"')
+    assert main(["check"]) == 1
+    fault, warning = capsys.readouterr().err.splitlines()
+    assert "emulator[0].kind: 's8' is unknown" in fault
+    assert warning == "supervisor.toml: warning: source[0].writable: 'Nothing' names nothing in DB201"
 
 
 def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -102,7 +102,7 @@ def test_a_fault_in_a_properties_file_is_told_with_its_line_there(tmp_path: Path
     assert str(caught.value).split("\n") == [
         f'{place}:2: hosst: unknown key; did you mean host? (source "c")',
         f'{place}:3: port: expected a whole number, got text (source "c")',
-        f'{file}:8: source[0].period_ms: expected a number > 0 (source "c")',
+        f'{file}:8: source[0].period_ms: expected a number >= 0.1 (source "c")',
     ]
 
 

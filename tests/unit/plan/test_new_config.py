@@ -25,7 +25,7 @@ def test_a_configuration_with_an_emulated_controller_can_be_used_as_it_is(tmp_pa
     text, missing, warnings = new_config(file, [source], emulated=True)
     file.write_text(text)
     config = load(file)
-    assert (missing, warnings) == ([], [])
+    assert (missing, warnings) == ({}, [])
     assert [source.name for source in config.source] == ["cell"]
     assert vacant_name(config.instance.name, tmp_path / "other.toml") == f"{config.instance.name}-2"
 
@@ -33,6 +33,6 @@ def test_a_configuration_with_an_emulated_controller_can_be_used_as_it_is(tmp_pa
 def test_of_a_real_controller_the_keys_that_nobody_knows_are_named(tmp_path: Path) -> None:
     source, file = tmp_path / "cell.db", tmp_path / "supervisor.toml"
     source.write_text(DB)
-    assert new_config(file, [source]).missing == ["host", "dbNumber"]
+    assert new_config(file, [source]).missing == {file: ["host", "dbNumber"]}
     with pytest.raises(ConfigError, match="no data block 'other'"):
         new_config(file, [source], "other")
