@@ -115,7 +115,7 @@ def test_what_a_recorder_with_another_folder_has_is_said_to_be_elsewhere(segment
     with Process(segment, tmp_path, directory=str(tmp_path / "other")) as second:
         until(lambda: second.counts("frames") + second.counts("missed") == 2 * RING + 10, "all, or missed")
         second.stop()
-    assert f"; {old.name} is not in this folder" in second.log.read_text()
+    assert f"{old.name} is not in this folder" in second.log.read_text()
     [file] = (tmp_path / "other").iterdir()
     [gap] = gaps(file)
     assert (gap.what, gap.first, gap.reason) == ("frames", 1, Reason.ELSEWHERE)
