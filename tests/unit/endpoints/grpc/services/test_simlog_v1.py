@@ -216,7 +216,7 @@ def test_injections_over_each_other_are_a_chain(segment: Segment) -> None:
         ("cell/nothing/in", "s", Status.NOT_FOUND, "no such register"),
         ("", "s", Status.NOT_FOUND, ""),
         ("s", "s", Status.NOT_FOUND, ""),
-        ("cell/axis/in", "s", Status.INVALID_ARGUMENT, "a structure"),
+        ("cell/axis/in", "s", Status.INVALID_ARGUMENT, "for this structure"),
         ("cell/step/in", "", Status.INVALID_ARGUMENT, "printable characters"),
         ("cell/step/in", "/", Status.INVALID_ARGUMENT, "printable characters"),
         ("cell/step/in", "a\nb", Status.INVALID_ARGUMENT, "printable characters"),
