@@ -6,7 +6,7 @@ import secrets
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from types import TracebackType
-from typing import Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import msgspec
 
@@ -14,12 +14,14 @@ from shmio.config import Declaration
 from shmio.config.campaign import parse_campaign
 from shmio.config.declaration import check_declarations
 from shmio.errors import CommandError, ConfigError, DeclarationError
-from shmio.injection import Program, compile_program
 from shmio.local.following import Following
 from shmio.local.writer import SourceWriter
 from shmio.model.injection import Declared, Happening
 from shmio.segment.block import Block
 from shmio.segment.events import Event, EventKind
+
+if TYPE_CHECKING:
+    from shmio.injection import Program
 
 SEED_BITS: Final = 53
 _EVENTS: Final = frozenset({EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.LIFTED})
@@ -57,6 +59,8 @@ def check(
         ConfigError: The first fault, such as ``injection[0].target: …``.
         CommandError: ``wanted`` returned False.
     """
+    from shmio.injection import compile_program  # noqa: PLC0415 - loads numpy, which nothing else here needs
+
     check_declarations(declarations)
     layouts = {source: block.layout for source, block in blocks.items()}
     periods_ns = {source: block.period_ns for source, block in blocks.items()}
