@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, Final, TypeVar
 
 from shmio.errors import PathError
@@ -12,7 +13,7 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import elements
 from shmio.recording.dump import Dump
-from shmio.recording.joining import EVENT_FIELDS, MAX_EVENTS, MAX_FRAMES, InOrder, Pair, aligned, grouped, joined
+from shmio.recording.joining import EVENT_FIELDS, MAX_EVENTS, InOrder, Pair, aligned, grouped, joined
 from shmio.recording.reading.blocks import DumpBlock
 from shmio.recording.reading.entries import Entry
 from shmio.segment import Event, EventKind, Frame, Provenance
@@ -201,8 +202,8 @@ class _Source:
     def compare(self) -> SourceDifference:
         found = self._found
         ignore = self._how.ignore
-        frames = [grouped(_frames(dump, self._name), self._frame_key, MAX_FRAMES) for dump in self._dumps]
-        in_order = InOrder(late="ends" in ignore and not {"cycle", "times"} <= {*ignore})
+        frames = [groupby(_frames(dump, self._name), self._frame_key) for dump in self._dumps]
+        in_order = InOrder(shifted="ends" in ignore and not {"cycle", "times"} <= {*ignore})
         self._compare(found.frames, joined(frames[0], frames[1], in_order), self._frames)
         if "events" not in ignore:
             events = [grouped(_events(dump, self._name), self._event_key, MAX_EVENTS) for dump in self._dumps]

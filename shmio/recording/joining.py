@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from itertools import groupby, islice, zip_longest
+from itertools import chain, groupby, islice, zip_longest
 from typing import Final, TypeVar
 
 from shmio.recording.reading.entries import Entry
@@ -13,12 +13,13 @@ from shmio.segment import Event, Frame
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
 """Content of an event, which does not depend on the run."""
 MAX_EVENTS: Final = 4096
-MAX_FRAMES: Final = 64
-"""Limits on entries of one key in memory: while time is paused, one cycle may have any number."""
+"""Limit on events of one key in memory: while time is paused, one cycle may have any number."""
+MAX_SHIFT: Final = 64
+"""Limit on the frames that one of two recordings lacks at the beginning of the first common key."""
 
 T = TypeVar("T", Frame, Event)
 Pair = tuple[Entry[T] | None, Entry[T] | None]
-Groups = Iterator[tuple[int, list[Entry[T]]]]
+Groups = Iterator[tuple[int, Iterable[Entry[T]]]]
 
 
 def grouped(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int], most: int) -> Groups[T]:
@@ -31,7 +32,7 @@ def grouped(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int], most: i
 def joined(
     first: Groups[T],
     second: Groups[T],
-    align: Callable[[Sequence[Entry[T]], Sequence[Entry[T]]], Iterable[Pair[T]]],
+    align: Callable[[Iterable[Entry[T]], Iterable[Entry[T]]], Iterable[Pair[T]]],
 ) -> Iterator[Pair[T]]:
     """Yield pairs of matching entries, with None for an entry that one recording lacks.
 
@@ -51,25 +52,46 @@ def joined(
 
 
 class InOrder:
-    """Pairs entries of one key in their order.
+    """Pairs frames of one key in their order.
 
-    If ``late``, the last ones of the first common key: a recording that began within a cycle has
-    only the cycle's last frames.
+    If ``shifted``, one of the recordings may lack the beginning of the first common key. Its frames
+    are paired with those of the other that have the same content.
     """
 
-    def __init__(self, *, late: bool) -> None:
-        self._late = late
+    def __init__(self, *, shifted: bool) -> None:
+        self._shifted = shifted
 
-    def __call__(self, ones: Sequence[Entry[T]], others: Sequence[Entry[T]]) -> Iterator[Pair[T]]:
-        """Yield pairs, with None for an entry that one group lacks."""
-        if not self._late:
-            return zip_longest(ones, others)
-        self._late = False
-        pairs = list(zip_longest(reversed(ones), reversed(others)))
-        return reversed(pairs)
+    def __call__(self, ones: Iterable[Entry[Frame]], others: Iterable[Entry[Frame]]) -> Iterator[Pair[Frame]]:
+        """Yield pairs, with None for a frame that one group lacks."""
+        if self._shifted:
+            self._shifted = False
+            first, second = iter(ones), iter(others)
+            left, right = list(islice(first, MAX_SHIFT)), list(islice(second, MAX_SHIFT))
+            shift = _shift(left, right)
+            yield from ((entry, None) for entry in left[: max(0, shift)])
+            yield from ((None, entry) for entry in right[: max(0, -shift)])
+            ones, others = chain(left[max(0, shift) :], first), chain(right[max(0, -shift) :], second)
+        yield from zip_longest(ones, others)
 
 
-def aligned(ones: Sequence[Entry[Event]], others: Sequence[Entry[Event]]) -> Iterator[Pair[Event]]:
+def _shift(ones: Sequence[Entry[Frame]], others: Sequence[Entry[Frame]]) -> int:
+    """Return how many of ``ones`` are before the first of the others; negative: the other way round.
+
+    Most pairs have the same content, or else there are most pairs, or else the last ones are paired.
+    """
+
+    def alike(shift: int) -> tuple[int, int, int]:
+        pairs = list(zip(ones[max(0, shift) :], others[max(0, -shift) :], strict=False))
+        return sum(_image(one.item) == _image(other.item) for one, other in pairs), len(pairs), abs(shift)
+
+    return max(range(1 - len(others), len(ones)), key=alike)
+
+
+def _image(frame: Frame) -> Hashable:
+    return frame.quality, frame.raw, frame.effective
+
+
+def aligned(ones: Iterable[Entry[Event]], others: Iterable[Entry[Event]]) -> Iterator[Pair[Event]]:
     """Pair events with the same content in any order, then by kind and place, then by kind."""
     left: list[Entry[Event]] = list(ones)
     right: list[Entry[Event]] = list(others)

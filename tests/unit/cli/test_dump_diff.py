@@ -236,6 +236,26 @@ def test_recordings_may_begin_and_end_within_a_cycle(diff: Diff) -> None:
     assert (status, found["frames"]["compared"], found["events"]["compared"]) == (0, 21, 21)
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "compared"),
+    [
+        ((1, 10), (1, 5), 5),  # both begin with the cycle, and one ends within it
+        ((1, 10), (3, 7), 5),
+        ((1, 150), (11, 160), 140),  # more than fit in what is searched for the beginning
+    ],
+)
+def test_recordings_of_a_paused_instance_are_compared_where_they_overlap(
+    diff: Diff, first: tuple[int, int], second: tuple[int, int], compared: int
+) -> None:
+    for file, (begin, end) in (("a.mem", first), ("b.mem", second)):
+        with build(Path(file), first=begin) as work:
+            work.block("cell")
+            for number in range(begin, end + 1):
+                work.frame(1, image(number), number=number)
+    status, found = diff("--ignore", "ends")
+    assert (status, found["frames"]["compared"]) == (0, compared)
+
+
 def test_elements_that_differ_are_named(capsys: pytest.CaptureFixture[str]) -> None:
     counting("a.mem")
 
