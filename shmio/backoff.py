@@ -12,7 +12,7 @@ class Backoff:
 
     Attributes:
         first_s: The first wait, in s.
-        most_s: The longest wait, in s.
+        most_s: The longest wait, in s, before the jitter.
         factor: Each wait is so many times as long as the one before.
         jitter: The largest random deviation, as a fraction of the wait. Use it where many clients
             would otherwise all try at the same time.

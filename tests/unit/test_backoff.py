@@ -13,3 +13,6 @@ def test_jitter_spreads_the_waits_around_the_same_value() -> None:
     waits = [Backoff(1.0, 15.0, jitter=0.5).wait_s(2) for _ in range(200)]
     assert len(set(waits)) > 1
     assert all(2.0 <= wait_s <= 6.0 for wait_s in waits)
+    longest = [Backoff(1.0, 15.0, jitter=0.5).wait_s(9) for _ in range(200)]
+    assert max(longest) > 15.0  # else many clients would try at the same time after all
+    assert all(7.5 <= wait_s <= 22.5 for wait_s in longest)
