@@ -987,8 +987,8 @@ def test_faults_of_keys_and_of_the_connector_are_told_together(
     assert main(["check"]) == 1
     err = capsys.readouterr().err.splitlines()
     assert [re.sub(r"^.*(supervisor\.toml|broken\.db):([0-9]+):", r"\2", line)[:40] for line in err] == [
-        "12 source[0].period_ms: expected a numbe",
         "11 source[0].port: expected a whole numb",
+        "12 source[0].period_ms: expected a numbe",
         "129: error: expected a known type, found",
         "139: error: expected a known type, found",
     ]
