@@ -963,14 +963,16 @@ def test_all_that_is_missing_is_told_in_one_round(example: Edit, capsys: pytest.
         assert main([verb]) == 1
         err = capsys.readouterr().err.splitlines()
         assert [re.split("; there|; valid", unplaced(line).removeprefix("supervisor.toml: "))[0] for line in err] == [
-            'source[0].slott: unknown key; did you mean slot? (source "cell")',
             'source[0].host: this key is needed (source "cell")',
             (
                 "source[0].dbNumber: this key is needed, because the layout 'Cell' has no number in its name "
                 '(source "cell")'
             ),
-            "source[1].connector: no connector 'S7'",
+            'source[0].slott: unknown key; did you mean slot? (source "cell")',
             "emulator[0].program: 'A50' is unknown",
+            "source[1].connector: no connector 'S7'",
+            "warning: source[0].writable: 'Outputs' names nothing in Cell",
+            "warning: source[0].writable: 'Robot_*/*' names nothing in Cell",
         ]
         assert all(re.match(r"supervisor\.toml:[0-9]+: ", line) for line in err)
     assert "did you mean s7?" in err[3]
