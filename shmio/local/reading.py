@@ -105,18 +105,20 @@ def _frame_codec(layout: Layout) -> FrameCodec:
     return FrameCodec(layout)
 
 
-def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
-    """Read one register of a frame, and assess its quality as of now.
+def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool = True) -> Reading:
+    """Read one register of a frame.
 
     Args:
         block: The frame's block.
         register: What to read.
         frame: The frame; None if the source has not published one yet.
+        aged: Whether its quality is that of now, which depends on its age; otherwise it is the one
+            that the frame was published with.
     """
     if frame is None:
         return Reading(block.source, register, None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
     now_ns = block.now_ns()
-    quality, reason = frame.assess(block.stale_ns, now_ns)
+    quality, reason = frame.assess(block.stale_ns, now_ns) if aged else (frame.quality, frame.reason)
     known = frame.source_ns != 0
     value = codec(register, block.layout.byte_order).decode(frame.image) if known else None
     if quality is not Quality.BAD and holds_none(value):

@@ -18,6 +18,7 @@ from shmio.model.reading import Reading
 from shmio.model.values import Provenance, Quality
 from shmio.segment.block import Block
 from shmio.segment.changed_registers import ChangeScan
+from shmio.segment.follower import FrameFollower
 from shmio.segment.frame import Frame
 
 
@@ -145,55 +146,62 @@ class _Follower:
         """When the next update may be given, if one waits for that."""
         self._registers = registers
         self._scan = ChangeScan(registers)
-        self._cursor = block.cursor(after=max(0, block.ring.head() - 1)) if every_frame else None
+        self._frames = FrameFollower(block)
+        self._every_frame = every_frame
         self._interval_s = interval_s
         self._last_s = -math.inf
-        self._frame: Frame | None = None
         self._state: object = None
 
     def take(self) -> Update | None:
         """Return the next update; None if there is none yet."""
-        frame, missed = self._next()
-        if frame is None and (frame := self._frame) is None:
-            return None
-        quality, reason = self.block.assess(frame)
+        frames, shown = self._frames, self._frames.frame
+        frame = self._next()
+        missed = 0 if frame is None else frames.take_missed()
+        if frame is None:
+            if shown is None or frames.behind:  # the last one is not stale: a newer one is not due yet
+                return None
+            frame = shown
+        aged = not frames.behind  # only the newest frame can be stale, not those that a slow reader still gets
+        frames.take(frame, aged=aged)
         # A stale reason holds the age: its text changes, the fact does not.
-        state = quality, reason.partition(":")[0], frame.provenance, frame.incarnation, self.block.standing.sequence
-        if self._frame is None or state != self._state:
+        reason = frames.reason.partition(":")[0]
+        state = frames.quality, reason, frame.provenance, frame.incarnation, self.block.standing.sequence
+        if shown is None or state != self._state:
             changed: Sequence[int] = range(len(self._registers))
-        elif frame is self._frame:
+        elif frame is shown:
             return None
         else:
-            changed = self._scan.changed(self._frame.image, frame.image)
-        self._frame, self._state = frame, state
-        if not changed and self._cursor is None:
+            changed = self._scan.changed(shown.image, frame.image)
+        self._state = state
+        if not changed and not self._every_frame:
             return None
-        self._last_s = time.monotonic()
-        readings = tuple(reading(self.block, self._registers[index], frame) for index in changed)
+        if frame is not shown:
+            self._last_s = time.monotonic()
+        readings = tuple(reading(self.block, self._registers[index], frame, aged=aged) for index in changed)
         return Update(
             self.block.source, frame.number, frame.cycle, frame.incarnation, frame.clock_ns, frame.source_ns,
-            quality, reason, frame.provenance, missed, ended=False, readings=readings,
+            frames.quality, frames.reason, frame.provenance, missed, ended=False, readings=readings,
         )  # fmt: skip
 
-    def _next(self) -> tuple[Frame | None, int]:
-        """Return the next frame, and how many were lost before it; None: there is none, or it is not due."""
-        if self._cursor is not None:
-            missed = self._cursor.missed
-            return self._cursor.poll(), self._cursor.missed - missed
+    def _next(self) -> Frame | None:
+        """Return the next frame; None: there is none, or it is not due."""
+        frames = self._frames
+        if self._every_frame:
+            return frames.poll()
         self.due_s = math.inf
-        if self._frame is not None and self.block.ring.head() == self._frame.number:
-            return None, 0
+        if frames.frame is not None and not frames.behind:
+            return None
         if time.monotonic() < self._last_s + self._interval_s:
             self.due_s = self._last_s + self._interval_s
-            return None, 0
+            return None
         try:
-            return self.block.latest(), 0
+            return frames.newest()
         except SegmentError:  # it was overwritten during each read: there will be another
-            return None, 0
+            return None
 
     def end(self, what: str) -> Update:
         """Return the last update of a source that a reload has removed."""
-        frame = self._frame
+        frame = self._frames.frame
         times = (0, 0, 0, 0, 0) if frame is None else (
             frame.number, frame.cycle, frame.incarnation, frame.clock_ns, frame.source_ns,
         )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from shmio.layout.model import Layout, Register
 from shmio.local.attach import Attachment, attach
 from shmio.model.values import Quality
-from shmio.segment import BlockSpec, BlockWriter, Segment
+from shmio.segment import BlockSpec, BlockWriter, Segment, Stamp
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)))
 LONG_NS = 3600 * 10**9
@@ -82,6 +83,30 @@ def test_a_source_that_falls_silent_is_bad(segment: Segment, cell: Attachment) -
             pass
     assert update.reason.startswith("stale")
     assert [(one.value, one.quality) for one in update.readings] == [(1, Quality.BAD)]
+
+
+def test_a_source_whose_next_update_is_not_due_is_not_stale(segment: Segment, cell: Attachment) -> None:
+    writer = segment.writer("tired")
+    publish(writer, 1, 1, 1)
+    with cell.subscribe("tired/a", max_rate_hz=1) as updates:
+        next(updates)
+        later = Stamp(time.monotonic_ns() + LONG_NS, 0, time.time_ns())  # it is good all the time
+        writer.publish(bytes(4), cycle=2, at=later)
+        update = next(updates)
+    assert (update.cycle, update.quality) == (2, Quality.GOOD)
+
+
+def test_frames_that_a_slow_reader_gets_late_have_the_quality_of_their_time(segment: Segment, cell: Attachment) -> None:
+    writer = segment.writer("tired")
+    publish(writer, 1, 1, 1)
+    with cell.subscribe("tired/a", every_frame=True) as updates:
+        next(updates)
+        writer.publish(bytes(4), cycle=2, asked_ns=time.monotonic_ns() - 60 * 10**9)
+        publish(writer, 3, 1, 1)
+        update = next(updates)
+        while update.cycle < 2:  # the first frame has become stale before the second came
+            update = next(updates)
+    assert (update.cycle, update.quality, update.readings[0].quality) == (2, Quality.GOOD, Quality.GOOD)
 
 
 def test_a_reload_ends_what_it_removes_and_goes_on_with_what_it_changes(segment: Segment, cell: Attachment) -> None:
