@@ -46,7 +46,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     if not lines and sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb":
         return _table(cell, options)
     if options.every_s is None:
-        batches = _changes(cell, options.patterns)
+        batches = _changes(cell, options.patterns, every_frame=options.host is None)
     else:
         batches = _rounds(cell, options.patterns, options.every_s)
     width = printed = 0
@@ -82,14 +82,14 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
     return 0
 
 
-def _changes(cell: Cell, patterns: Sequence[str]) -> Iterator[Sequence[Reading]]:
+def _changes(cell: Cell, patterns: Sequence[str], *, every_frame: bool) -> Iterator[Sequence[Reading]]:
     """Yield the present readings of all that the patterns name, then those that have changed.
 
     NotRunningError: The instance has ended, or a reload has removed a source or a register.
     """
     batch: Sequence[Reading] = cell.get(*patterns)
     shown: dict[str, tuple[object, ...]] = {}
-    with cell.subscribe(*patterns) as updates:
+    with cell.subscribe(*patterns, every_frame=every_frame) as updates:
         while True:
             # A stale reason holds the age: its text changes, the fact does not. repr: a NaN equals itself.
             now = {one.path: (repr(one.value), one.quality, one.reason.partition(":")[0]) for one in batch}

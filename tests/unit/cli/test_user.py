@@ -152,7 +152,7 @@ def test_who_says_yes_is_not_asked(running: str) -> None:
 
 
 def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def news(*_: object) -> None:
+    def news(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Attachment, "subscribe", news)
@@ -163,6 +163,24 @@ def watching(*arguments: str) -> subprocess.Popen[str]:
     program = "import sys; from shmio.cli.user import main; sys.exit(main())"
     command = [sys.executable, "-P", "-c", program, "watch", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_watch_prints_each_change_of_a_local_source(instance: str) -> None:
+    spec = BlockSpec("cell", LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16)
+    with Segment.create(instance, [spec], []) as segment:
+        writer = segment.writer("cell")
+        writer.publish(b"\0\7", cycle=1, source_ns=1)
+        with watching("--instance", instance, "-n", "3", "cell/a") as watch:
+            try:
+                assert watch.stdout is not None
+                assert "cell/a  7" in watch.stdout.readline()
+                for cycle, value in enumerate((8, 7), 2):  # the second before watch can have looked
+                    writer.publish(bytes((0, value)), cycle=cycle, source_ns=1)
+                out, _ = watch.communicate(timeout=20)
+            finally:
+                watch.kill()
+        segment.unlink()
+    assert [line[-1] for line in out.splitlines()] == ["8", "7"]
 
 
 def test_watch_goes_on_with_the_block_that_a_reload_has_made(instance: str) -> None:
