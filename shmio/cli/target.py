@@ -1,26 +1,19 @@
-"""Find the instance that a command acts on, here or behind an endpoint."""
+"""Find the instance that a command acts on."""
 
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from shmio.cli.interrupt import ended_by_interrupt
-from shmio.config.address import UNIX, Address
 from shmio.config.model import NAME_RULE, Name
 from shmio.config.read import read_tables
-from shmio.errors import ConfigError, ControlError, NotRunningError, UnknownClientError, UnreachableError
-from shmio.local.attach import Attachment
+from shmio.errors import ConfigError, ControlError, NotRunningError, UnreachableError
 from shmio.local.status import supervisor_silence
-from shmio.model.cell import Cell
 from shmio.segment import Segment, running_instances
 from shmio.supervisor import control
 
@@ -78,45 +71,6 @@ def target(arguments: argparse.Namespace) -> Target:
     if len(running) > 1:
         raise ControlError(f"several instances are running: choose one by --instance ({', '.join(running)})")
     return Target(running[0])
-
-
-@contextmanager
-def opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
-    """Open the instance that the options of ``shmio`` name, here or, with ``--host``, behind an endpoint.
-
-    Raises:
-        ConfigError: ``--host`` comes with options for an instance here, or the address is invalid.
-        OSError: A file cannot be read.
-        ValueRangeError: The token would go to another host in plain text.
-        UnknownClientError: The instance requires a token; the message has the option for it.
-
-    """
-    if arguments.host is None:
-        with Attachment(target(arguments).open(writable=writable)) as attachment:
-            yield attachment
-        return
-    if arguments.config is not None or arguments.instance is not None:
-        raise ConfigError("--host names the instance already: leave out -c and --instance")
-    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what is wrong it tells us, too
-    with ended_by_interrupt():  # gRPC crashes when it is broken off while it is loaded
-        from shmio.client import connect  # noqa: PLC0415  for those who ask for it alone
-    if not arguments.host.startswith(UNIX):
-        Address.parse(arguments.host)
-    token = arguments.token_file.read_text().strip() if arguments.token_file else None
-    with connect(
-        arguments.host,
-        ca=arguments.ca,
-        certificate=arguments.certificate,
-        key=arguments.key,
-        token=token,
-        token_in_plain_text=arguments.token_in_plain_text,
-    ) as client:
-        try:
-            yield client
-        except UnknownClientError as error:
-            if token is not None:
-                raise
-            raise UnknownClientError(f"{error}; here: --token-file FILE, a file with only the token") from None
 
 
 def config_option(arguments: argparse.Namespace) -> str | None:

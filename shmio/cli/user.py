@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from shmio.cli import completion, get, inject, registers, replay, step, watch
 from shmio.cli import set as set_verb
+from shmio.cli.interrupt import ended_by_interrupt
 from shmio.cli.run import add_json, complete, run
-from shmio.cli.target import opened
+from shmio.cli.target import target
+from shmio.config.address import UNIX, Address
+from shmio.errors import ConfigError, UnknownClientError
 from shmio.layout.spelling import may_be_tia_spelling, topic_path
+from shmio.local.attach import Attachment
 from shmio.model.cell import Cell
 from shmio.version import __version__
 
@@ -34,10 +40,49 @@ def main(argv: Sequence[str] | None = None) -> int:
         if verb is None:
             print(completion.script(arguments.shell))
             return 0
-        with opened(arguments, writable=arguments.writable) as cell:
+        with _opened(arguments, writable=arguments.writable) as cell:
             return verb(cell, _spelled(cell, arguments))
 
     return run(PROGRAM, command, arguments)
+
+
+@contextmanager
+def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
+    """Open the instance that the options of ``shmio`` name, here or, with ``--host``, behind an endpoint.
+
+    Raises:
+        ConfigError: ``--host`` comes with options for an instance here, or the address is invalid.
+        OSError: A file cannot be read.
+        ValueRangeError: The token would go to another host in plain text.
+        UnknownClientError: The instance requires a token; the message has the option for it.
+
+    """
+    if arguments.host is None:
+        with Attachment(target(arguments).open(writable=writable)) as attachment:
+            yield attachment
+        return
+    if arguments.config is not None or arguments.instance is not None:
+        raise ConfigError("--host names the instance already: leave out -c and --instance")
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what is wrong it tells us, too
+    with ended_by_interrupt():  # gRPC crashes when it is broken off while it is loaded
+        from shmio.client import connect  # noqa: PLC0415  for those who ask for it alone
+    if not arguments.host.startswith(UNIX):
+        Address.parse(arguments.host)
+    token = arguments.token_file.read_text().strip() if arguments.token_file else None
+    with connect(
+        arguments.host,
+        ca=arguments.ca,
+        certificate=arguments.certificate,
+        key=arguments.key,
+        token=token,
+        token_in_plain_text=arguments.token_in_plain_text,
+    ) as client:
+        try:
+            yield client
+        except UnknownClientError as error:
+            if token is not None:
+                raise
+            raise UnknownClientError(f"{error}; here: --token-file FILE, a file with only the token") from None
 
 
 def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:

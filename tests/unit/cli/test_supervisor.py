@@ -849,7 +849,7 @@ class TestTarget:
 
 def test_looking_needs_no_heavy_imports() -> None:
     """``status`` must answer at once."""
-    heavy = {"numpy", "grpc", "snap7", "asyncio"}
+    heavy = {"numpy", "grpc", "snap7", "asyncio", "shmio.local.attach"}
     code = (
         "import sys; from shmio.cli.supervisor import main; main(['status', '--json', '--instance', 'none-such']); "
         f"sys.exit(','.join({heavy!r} & set(sys.modules)))"
