@@ -32,7 +32,7 @@ from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.local.declared_injections import Campaign
 from shmio.local.following import Following
-from shmio.local.injection import Diversion, Shadow, as_given, lift_all, written
+from shmio.local.injection import Diversion, Shadow, as_given, by_path, lift_all, written
 from shmio.local.reading import View, reading
 from shmio.local.subscription import Subscription
 from shmio.local.timekeeper import TimeMethods
@@ -351,7 +351,7 @@ class Attachment(TimeMethods):
 
         Raises:
             PathError: A path names nothing, or the paths belong to several sources.
-            ValueRangeError: A value does not fit its register.
+            ValueRangeError: A value does not fit its register, or a register is given twice.
             CommandError: A register is not writable, or the source's queue has no room.
                 After any of these errors nothing has been sent.
         """
@@ -359,9 +359,7 @@ class Attachment(TimeMethods):
         for path, topic in zip(values, topics, strict=True):
             if topic.direction == "out":
                 raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
-        return self._source_writer(block).write(
-            {topic.path: value for topic, value in zip(topics, values.values(), strict=True)}, timeout_s
-        )
+        return self._source_writer(block).write(by_path(topics, values), timeout_s)
 
     def inject(self, *paths: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
         """Inject values into registers of one source, by a shadow laid over them.

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from shmio.errors import CommandError, PathError
-from shmio.layout.topic import parse_topic
+from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.layout.topic import Topic, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import cover, merge
 from shmio.local.writer import PendingCommand, SourceWriter
@@ -91,11 +91,11 @@ class Shadow:
 
         Raises:
             PathError: A path names nothing.
-            ValueRangeError: A value does not fit its register.
+            ValueRangeError: A value does not fit its register, or a register is given twice.
             CommandError: The source's queue has no room.
                 After any of these errors nothing has been sent.
         """
-        paths = {parse_topic(path, (self.source,), self.source).path: value for path, value in values.items()}
+        paths = by_path([parse_topic(path, (self.source,), self.source) for path in values], values)
         return as_given(values, self._source_writer.shadow(self.number, paths, timeout_s))
 
     def diverted(self, timeout_s: float | None = None) -> Iterator[Diversion]:
@@ -220,6 +220,16 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
     ]
     if left:
         raise CommandError(f"{len(left)} of {len(chosen)} injections were not lifted: {'; '.join(reasons)}")
+
+
+def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, object]:
+    """Return values by the paths of their topics. ValueRangeError: two topics have the same path."""
+    found: dict[str, object] = {}
+    for topic, (path, value) in zip(topics, values.items(), strict=True):
+        if topic.path in found:
+            raise ValueRangeError(f"{path}: given twice")
+        found[topic.path] = value
+    return found
 
 
 def as_given(paths: Iterable[str], outcomes: Iterable[Outcome]) -> list[Outcome]:

@@ -11,9 +11,20 @@ import pytest
 import shmio
 from shmio.errors import CommandError, PathError, SegmentError, ValueRangeError
 from shmio.layout.model import Layout, Register
+from shmio.local.injection import Shadow
 from shmio.local.writer import SourceWriter
 from shmio.model.outcome import OutcomeKind
-from shmio.segment import Attributes, BlockSpec, BlockWriter, Command, EventKind, ProcessSpec, Record, Segment
+from shmio.segment import (
+    Attributes,
+    BlockSpec,
+    BlockWriter,
+    Command,
+    Direction,
+    EventKind,
+    ProcessSpec,
+    Record,
+    Segment,
+)
 
 LAYOUT = Layout(
     "DB1",
@@ -152,6 +163,17 @@ def test_a_local_program_writes_as_a_guest(writer: BlockWriter, source: list[Ans
             cell.write({"cell/count/out": 5})
         with pytest.raises(PathError, match="none"):
             cell.write({})
+
+
+def test_a_register_that_is_given_twice_is_refused(writer: BlockWriter, instance: str) -> None:
+    """Before anything is sent: this source would not answer."""
+    twice = {"cell/count": 1, "count": 2}
+    with shmio.attach(instance, writable=True) as cell:
+        source_writer = SourceWriter(writer.block, 5)
+        shadow = Shadow(source_writer, 1, Direction.OUT, writer.block.events.cursor(), lambda *_: None, keep=True)
+        for write in (cell.set, cell.write, shadow.set):
+            with pytest.raises(ValueRangeError, match="count: given twice"):
+                write(twice)
 
 
 def test_guests_have_four_places_and_give_them_back(writer: BlockWriter, source: list[Answer], instance: str) -> None:
