@@ -23,7 +23,6 @@ from shmio.client.sync.transport import CLOSED, Channel, Duplex, Step, Stream, s
 from shmio.client.update import Snapshot, Tables, Update
 from shmio.errors import CommandError, ConflictError, PathError, RemoteError, TimeError
 from shmio.layout.glob import choose
-from shmio.layout.model import Layout
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted
 from shmio.model.outcome import Outcome
@@ -46,7 +45,7 @@ class Client:
         """Take the target, and the time limit of calls that are answered at once."""
         self.target = target
         self._channel = Channel(target, timeout_s)
-        self._layouts: Mapping[str, Layout] | None = None
+        self._layouts: Mapping[str, BlockLayout] | None = None
         connection = self._channel.grpc
         self._stub: Any = ShmioStub(connection)  # type: ignore[no-untyped-call]
         self._read = connection.unary_unary(
@@ -81,14 +80,15 @@ class Client:
         self._layouts = self.layouts()
         return self._get(patterns, self._layouts)
 
-    def _get(self, patterns: tuple[str, ...], layouts: Mapping[str, Layout]) -> list[Reading]:
+    def _get(self, patterns: tuple[str, ...], layouts: Mapping[str, BlockLayout]) -> list[Reading]:
         chosen = choose(patterns, layouts)
         if not chosen:
             return []
         found = (self.read(*patterns)).updates
-        if {(source, path) for source, update in found.items() for path in update.table.places} != {
-            (source, register.path) for source, register in chosen
-        }:
+        named = {(source, path) for source, update in found.items() for path in update.table.places}
+        if named != {(source, register.path) for source, register in chosen} or any(
+            update.table.hash != layouts[source].hash for source, update in found.items()
+        ):
             raise PathError(f"{', '.join(patterns)}: a reload has changed what this names; try again")
         return [
             found[source].reading(found[source].table.places[register.path], register) for source, register in chosen

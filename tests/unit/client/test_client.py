@@ -19,6 +19,7 @@ from shmio.segment import Quality as FrameQuality
 from shmio.segment import Segment
 from tests.unit.client.both import BOTH, Connect
 from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
+from tests.unit.endpoints.grpc.shmio_v1.test_subscribe import OTHER, reload
 from tests.unit.endpoints.harness import LAYOUT, Endpoint, image, serve
 
 
@@ -50,6 +51,19 @@ def test_values_by_path(segment: Segment, connects: Connect) -> None:
             _ = found["cell/axis/positon"]
         with pytest.raises(PathError):
             _ = found["x/nothing"]
+
+    with_client(segment, connects, test)
+
+
+@BOTH
+def test_a_reading_has_the_type_that_a_reload_has_given_the_register(segment: Segment, connects: Connect) -> None:
+    async def test(served: Endpoint, cell: Any) -> None:
+        served.publish(image(1.5))
+        (one,) = await cell.get("cell/axis/position")
+        assert (one.value, one.register.type, one.register.size) == (1.5, "REAL", 4)
+        reload(served, OTHER)
+        (one,) = await cell.get("cell/axis/position")
+        assert (one.register.type, one.register.size) == ("DINT", 4)
 
     with_client(segment, connects, test)
 
