@@ -6,7 +6,7 @@ import threading
 import time
 from typing import Final
 
-from shmio.errors import NotRunningError, ShmioError, TimeError
+from shmio.errors import NotRunningError, ShmioError, TimeError, ValueRangeError
 from shmio.local.replays import Replays
 from shmio.local.time_control import Coordinator, Step, check_step
 from shmio.model.clock import Clock
@@ -140,9 +140,11 @@ class TimeMethods:
         Raises:
             TimeError: Another program owns time, or the step failed; the message says who failed or
                 did not answer.
-            ValueRangeError: The length is not within 1 us and 1 h.
+            ValueRangeError: The length is not within 1 us and 1 h, or the number is below 1.
         """
         dt_ns = _ns(dt_s)
+        if count < 1:
+            raise ValueRangeError(f"the number of steps must be at least 1, not {count}")
         for _ in range(count):
             self._time.step(dt_ns)
         return self.clock

@@ -263,7 +263,7 @@ class Cell(Held, Protocol):
 
         Raises:
             TimeError: Another program owns time, or a step failed.
-            ValueRangeError: The length is out of range.
+            ValueRangeError: The length is out of range, or the number is below 1.
         """
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:

@@ -253,6 +253,8 @@ def test_time_is_stepped_played_and_released(cell: shmio.Cell) -> None:
     assert not cell.pause().playing
     with pytest.raises(ValueRangeError):
         cell.step(dt_s=-1)
+    with pytest.raises(ValueRangeError, match="at least 1"):
+        cell.step(count=0)
     assert not cell.release().virtual
     assert not cell.clock().virtual
 

@@ -21,7 +21,7 @@ from shmio.client.sync.model import Simulation
 from shmio.client.sync.steps import Steps
 from shmio.client.sync.transport import CLOSED, Channel, Duplex, Step, Stream, sleep
 from shmio.client.update import Snapshot, Tables, Update
-from shmio.errors import CommandError, ConflictError, PathError, RemoteError, TimeError
+from shmio.errors import CommandError, ConflictError, PathError, RemoteError, TimeError, ValueRangeError
 from shmio.layout.glob import choose
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted
@@ -323,6 +323,8 @@ class Client:
         ``dt_s``: length of each step; None: the step size. Returns the clock after the last step. TimeError: a step
         failed, or another program owns time; ValueRangeError.
         """
+        if count < 1:  # 0 would be a stream of steps without end
+            raise ValueRangeError(f"the number of steps must be at least 1, not {count}")
         if count == 1:
             return self._move(self._stub.Step, wire.StepRequest(dt_ns=calls.ns(dt_s)), calls.STEP_PATIENCE_S)
         try:

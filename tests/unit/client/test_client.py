@@ -69,6 +69,15 @@ def test_a_reading_has_the_type_that_a_reload_has_given_the_register(segment: Se
 
 
 @BOTH
+def test_no_step_at_all_is_refused(segment: Segment, connects: Connect) -> None:
+    async def test(served: Endpoint, cell: Any) -> None:
+        with pytest.raises(ValueRangeError, match="at least 1, not 0"):
+            await asyncio.wait_for(cell.step(count=0), 20)
+
+    with_client(segment, connects, test)
+
+
+@BOTH
 def test_a_bad_value_is_not_given_for_a_good_one(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, cell: Any) -> None:
         with pytest.raises(QualityError, match="cell/step: no data yet"):

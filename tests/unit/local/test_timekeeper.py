@@ -64,6 +64,12 @@ def until_step(cell: Attachment, number: int) -> None:
         block.ring.wait(block.ring.doorbell(), 10 * MS)
 
 
+def test_no_step_at_all_is_refused(cell: Attachment) -> None:
+    with pytest.raises(ValueRangeError, match="at least 1, not 0"):
+        cell.step(count=0)
+    assert cell.step(count=2).step == 2
+
+
 def test_it_plays_until_it_is_paused_and_then_time_stands(cell: Attachment) -> None:
     cell.play(rate=100, dt_s=0.01)
     until_step(cell, 5)
