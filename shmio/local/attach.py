@@ -139,10 +139,12 @@ class Attachment(TimeMethods):
 
     def layouts(self, *sources: str) -> dict[str, Layout]:
         """Return the layouts of these sources, or of all, by source. PathError: no such source."""
+        self._check_running()
         return {source: self.block(source).layout for source in dict.fromkeys(sources) or self._blocks()}
 
     def real_sources(self) -> list[str]:
         """Return the names of the sources that steps do not move, such as those with a device."""
+        self._check_running()
         return [source for source, block in self._blocks().items() if not block.attributes.stepped]
 
     def block(self, source: str | None = None) -> Block:
@@ -381,7 +383,9 @@ class Attachment(TimeMethods):
         Raises:
             PathError: A path names nothing, or the paths differ in source or direction.
             CommandError: The source refuses, or does not answer.
+            NotRunningError: The instance has stopped.
         """
+        self._check_running()
         block, topics = of_one_source("injection", paths, self._blocks())
         directions = {topic.direction or "out" for topic in topics}
         if len(directions) != 1:
@@ -430,7 +434,9 @@ class Attachment(TimeMethods):
         Raises:
             DeclarationError: A declaration is wrong.
             CommandError: A source refuses, or does not answer.
+            NotRunningError: The instance has stopped.
         """
+        self._check_running()
         campaign = Campaign(declarations, self._blocks(), self._source_writer, self._check_running, keep=keep)
         self._open.add(campaign)
         return campaign
@@ -440,7 +446,9 @@ class Attachment(TimeMethods):
 
         Raises:
             PathError: There is no such source.
+            NotRunningError: The instance has stopped.
         """
+        self._check_running()
         return [
             _with_source(source, one)
             for source in dict.fromkeys(sources) or self._blocks()
@@ -457,7 +465,9 @@ class Attachment(TimeMethods):
         Raises:
             PathError: There is no such source or injection.
             CommandError: The source does not answer.
+            NotRunningError: The instance has stopped.
         """
+        self._check_running()
         block = self.block(source)
         if not any(one.number == number and not one.lifted for one in block.standing.read()):
             raise PathError(f"{source}: there is no injection {number}; injections() lists them")
@@ -471,7 +481,9 @@ class Attachment(TimeMethods):
 
         Raises:
             CommandError: Some injections could not be lifted; the message gives the reasons.
+            NotRunningError: The instance has stopped.
         """
+        self._check_running()
         blocks = [self.block(source) for source in dict.fromkeys(sources) or self._blocks()]
         standing = [(block, one) for block in blocks for one in block.standing.read() if not one.lifted]
         lift_all([(self._source_writer(block), one.number) for block, one in standing])

@@ -10,7 +10,7 @@ from typing import Any, Final, Unpack
 
 import msgspec
 
-from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.errors import CommandError, NotRunningError, PathError, ValueRangeError
 from shmio.layout.topic import look_up, parse_topic
 from shmio.local.recording_times import moment_ns
 from shmio.model.replay import Playing, Wish
@@ -75,6 +75,8 @@ class Replays:
 
     def __call__(self, **wish: Unpack[Wish]) -> list[Playing]:
         """Change replays, as ``replay`` of :class:`shmio.Cell`; without arguments, only return their status."""
+        if not self._segment.shared.current():
+            raise NotRunningError(f"instance {self._segment.instance!r} has stopped")
         keys: dict[str, Any] = {**wish, "sources": tuple(wish.get("sources", ()))}
         for key in {"seek", "until"} & keys.keys():
             keys[key] = str(keys[key])

@@ -148,7 +148,8 @@ class Cell(Held, Protocol):
 
     :func:`shmio.attach` returns one on this host, :func:`shmio.connect` one behind gRPC. The methods
     raise the errors of :mod:`shmio.errors`; every method raises NotRunningError if the instance has
-    ended or cannot be reached.
+    ended or cannot be reached. Only ``sources`` and ``clock`` of a cell on this host then still tell
+    what was last.
     """
 
     @property

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -42,6 +43,22 @@ def writer(instance: str) -> Iterator[BlockWriter]:
 def cell(instance: str, writer: BlockWriter) -> Iterator[Attachment]:
     with shmio.attach(instance) as cell:
         yield cell
+
+
+def test_each_method_says_that_the_instance_has_stopped(instance: str, writer: BlockWriter) -> None:
+    with shmio.attach(instance, writable=True) as cell:
+        Path(f"/dev/shm/shmio-{instance}").unlink()
+        calls: list[Callable[[], object]] = [
+            cell.layouts, cell.get, cell.real_sources, cell.injections, cell.lift_all, cell.replay, cell.step,
+            cell.pause, cell.release,
+            lambda: cell.set({"cell/on": True}),
+            lambda: cell.inject("cell/on"),
+            lambda: cell.declare([{"name": "x", "target": "cell/on", "operation": "set", "value": 1}]),
+            lambda: cell.lift("cell", 1),
+        ]  # fmt: skip
+        for call in calls:
+            with pytest.raises(NotRunningError, match="has stopped"):
+                call()
 
 
 def test_values_by_path(cell: Attachment, writer: BlockWriter) -> None:
