@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
-from shmio.errors import PathError, SegmentError
+from shmio.errors import PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.layout.glob import choose
 from shmio.layout.model import Register
 from shmio.layout.topic import parse_topic
@@ -69,12 +69,13 @@ class Subscription(Following[Update]):
         self._patterns = patterns
         self._wanted: dict[str, list[str]] = {}  # by source, each pattern with its source
         self._every_frame = every_frame
-        self._interval_s = 1 / max_rate_hz if max_rate_hz > 0 and not every_frame else 0.0
+        self._interval_s = 1 / max_rate_hz if max_rate_hz > 0 else 0.0
         self._followers: list[_Follower] = []
-        self._refusal: PathError | None = None
+        self._refusal: ShmioError | None = None
         try:
+            _check(patterns, max_rate_hz, every_frame=every_frame)
             self._begin()
-        except PathError as error:  # the first update raises it, as from a remote cell
+        except (PathError, ValueRangeError) as error:  # the first update raises it, as from a remote cell
             self._refusal = error
 
     def _take(self) -> Update | None:
@@ -135,6 +136,16 @@ class Subscription(Following[Update]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) -> None:
+    """Raise ValueRangeError for what no endpoint accepts either."""
+    if not patterns:
+        raise ValueRangeError("no pattern is given: name a path, a structure, a glob, or a source")
+    if not 0 <= max_rate_hz < math.inf:
+        raise ValueRangeError(f"max_rate_hz: {max_rate_hz} is not a number from 0 on")
+    if max_rate_hz and every_frame:
+        raise ValueRangeError("max_rate_hz and every_frame exclude each other")
 
 
 class _Follower:

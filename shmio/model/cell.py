@@ -97,6 +97,7 @@ class Subscription(Held, Protocol):
 
         Raises:
             PathError: A pattern names nothing; only the first call raises it.
+            ValueRangeError: There is no pattern, or an option is wrong; only the first call raises it.
             NotRunningError: The instance has ended.
         """
 

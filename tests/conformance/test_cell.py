@@ -106,6 +106,17 @@ def test_a_pattern_that_names_nothing_is_refused(cell: shmio.Cell, pattern: str)
         next(updates)
 
 
+@pytest.mark.parametrize(
+    ("patterns", "options"),
+    [((), {}), ((AT,), {"max_rate_hz": -1.0}), ((AT,), {"max_rate_hz": 5.0, "every_frame": True})],
+)
+def test_a_subscription_that_cannot_be_is_refused(
+    cell: shmio.Cell, patterns: tuple[str, ...], options: dict[str, Any]
+) -> None:
+    with cell.subscribe(*patterns, **options) as updates, pytest.raises(ValueRangeError):
+        next(updates)
+
+
 def test_a_subscription_gives_the_present_values_then_changes(cell: shmio.Cell) -> None:
     with cell.subscribe(AT, "cell/Outputs/101") as updates:
         first = next(updates)

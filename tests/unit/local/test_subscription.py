@@ -6,9 +6,11 @@ import gc
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
+from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.local.attach import Attachment, attach
 from shmio.model.values import Quality
@@ -37,6 +39,17 @@ def segment(instance: str) -> Iterator[Segment]:
 def cell(segment: Segment) -> Iterator[Attachment]:
     with attach(segment.instance) as cell:
         yield cell
+
+
+@pytest.mark.parametrize(
+    ("patterns", "options"),
+    [((), {}), (("cell/a",), {"max_rate_hz": -1.0}), (("cell/a",), {"max_rate_hz": 5.0, "every_frame": True})],
+)
+def test_what_an_endpoint_refuses_is_refused_here_too(
+    cell: Attachment, patterns: tuple[str, ...], options: dict[str, Any]
+) -> None:
+    with cell.subscribe(*patterns, **options) as updates, pytest.raises(ValueRangeError):
+        next(updates)
 
 
 def test_a_slow_reader_gets_what_has_changed_up_to_the_newest_frame(segment: Segment, cell: Attachment) -> None:
