@@ -76,7 +76,10 @@ class Update(Protocol):
 
     @property
     def ended(self) -> bool:
-        """Whether a reload has removed the source, or all registers that were asked for."""
+        """Whether a reload has removed the source, or what a pattern named in it: no more updates come of it.
+
+        When all sources have ended, the iteration waits until it is closed or the instance ends.
+        """
 
     @property
     def readings(self) -> Sequence[Reading]:
@@ -112,10 +115,14 @@ class Shadow(Held, Protocol):
     def set(self, values: Mapping[str, object]) -> list[Outcome]:
         """Give values by path, and return the outcome of each.
 
+        It is ``rejected`` if the injection does not cover the path. Of a remote cell all values of one
+        call have the same outcome, the worst, and it is also ``rejected`` if a path or value is wrong.
+        If somebody has lifted the injection, it is ``rejected``, or a remote cell raises RemoteError.
+
         Raises:
-            PathError: There is no such register.
-            ValueRangeError: A value does not fit its register.
-            CommandError: The injection was lifted, or the source does not answer.
+            PathError: There is no such register on this host.
+            ValueRangeError: A value does not fit its register, or is of no type that has values.
+            CommandError: The injection is over, or the source's queue has no room.
         """
 
 
@@ -195,9 +202,12 @@ class Cell(Held, Protocol):
             The outcome of each value, with its path as it was given, in the given order.
 
         Raises:
-            PathError: A path names nothing, or the paths belong to several sources.
-            ValueRangeError: A value does not fit its register.
-            CommandError: A register is not writable, or the source's queue has no room.
+            PathError: A path names nothing, or on this host: the paths belong to several sources, to
+                none, or end in ``/out``.
+            ValueRangeError: A value does not fit its register, or a register is given twice; of a
+                remote cell also: the values belong to several sources, or there is none.
+            CommandError: A register is not writable, or the source's queue has no room; of a remote
+                cell also: a path ends in ``/out``.
                 After any of these errors nothing has been sent.
         """
 

@@ -23,7 +23,8 @@ class Reading:
         reason: Why the quality is not good; empty if it is.
         provenance: Where the value comes from: live, simulated, replayed or injected.
         source_time: The source's time stamp, UTC in s; None if there never was a value.
-        age_s: Age of the value by the source's clock, in s; None if there never was a frame.
+        age_s: Age of the value by the source's clock, in s; None if there never was a frame. In an update
+            of a remote cell it is not known: 0, or None while the quality is bad.
     """
 
     source: str

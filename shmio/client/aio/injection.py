@@ -55,11 +55,14 @@ class Shadow(AsyncIterator[Update]):
             arrays: Values by the columns of ``table``.
             raw: Values as raw bytes.
 
+        Returns:
+            An outcome for each value: the worst for all of them. It is ``rejected`` if a path or value is
+            wrong, or the injection does not cover it.
+
         Raises:
-            PathError: The injection does not cover a path.
-            ValueRangeError: A value does not fit its register.
-            CommandError: The injection was lifted.
-            RemoteError: The instance has ended.
+            ValueRangeError: A value is of no type that has values.
+            CommandError: The injection is over.
+            RemoteError: Somebody has lifted the injection, or the instance has ended.
         """
         values, raw = values or {}, list(raw)
         async with self._turn:
