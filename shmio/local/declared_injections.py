@@ -126,8 +126,9 @@ def read_declarations(declarations: Iterable[Mapping[str, Any] | Declaration]) -
 class Campaign(Following[Happening]):
     """Declared injections that this program has laid.
 
-    Iterate over it for their events: the iteration ends when all of them are lifted. Leaving the
-    ``with`` block lifts the rest, unless they were laid with ``keep``.
+    Iterate over it for their events: the iteration ends when all of them are lifted. Events that were
+    overwritten before they could be read are left out. Leaving the ``with`` block lifts the rest,
+    unless they were laid with ``keep``.
     """
 
     def __init__(
@@ -176,6 +177,9 @@ class Campaign(Following[Happening]):
             while (event := cursor.poll()) is not None:
                 if event.kind in _EVENTS and event.offset == 0 and (source, event.injection) in self._left:
                     return self._happening(source, event)  # of an event in parts it is the first
+            if cursor.take_missed():  # perhaps that some were lifted
+                present = {one.number for one in block.standing.read() if not one.lifted}
+                self._left = {key: one for key, one in self._left.items() if key[0] != source or key[1] in present}
             if retired:
                 self._left = {key: one for key, one in self._left.items() if key[0] != source}
         if not self._left:

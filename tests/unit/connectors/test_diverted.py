@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 
 import msgspec
@@ -181,6 +182,21 @@ def test_all_injections_are_lifted_at_once_whoever_laid_them(rig: Rig, local: At
     assert {one.source for one in lifted} == {"cell"}
     assert local.injections() == []
     assert local.lift_all() == []
+
+
+def test_a_campaign_ends_although_its_reader_has_missed_the_end(rig: Rig, local: Attachment) -> None:
+    with local.declare([{"name": "stuck", "target": "cell/speed", "operation": "set", "value": 5}]) as campaign:
+        local.lift_all()
+        head = rig.block.events.head()
+        while rig.block.events.head() <= head + rig.block.events.ring.slot_count:
+            rig.client.shadow(9999, {"speed": 1})  # there is no such injection
+        waiting = threading.Timer(20, campaign.end)  # so that a failure does not wait for ever
+        waiting.start()
+        happened = list(campaign)
+        assert waiting.is_alive(), "it has ended by itself"
+        waiting.cancel()
+        waiting.join()
+    assert happened == []
 
 
 def test_what_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
