@@ -222,7 +222,7 @@ def test_too_many_are_refused_before_any_is_looked_at(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         call = stub(served).Declare(wire.DeclareRequest(declarations=[wire.Declaration()] * 257), timeout=TIMEOUT_S)
         code, text = await refusal(call.read())
-        assert (code, text) == (Status.INVALID_ARGUMENT, "257 injections are declared, at most 256")
+        assert (code, text) == (Status.INVALID_ARGUMENT, "257 injections are declared, at most 256 are allowed")
 
     with_plant(segment, test)
 

@@ -141,7 +141,7 @@ def test_time_that_is_played_is_not_stepped(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         async with connect_aio(target(served)) as cell:
             await cell.play(dt_s=0.005)
-            with pytest.raises(CommandError, match="played"):
+            with pytest.raises(CommandError, match="playing"):
                 await anext(cell.steps(3))
             await cell.pause()
 
