@@ -120,7 +120,7 @@ def test_a_broker_that_does_not_answer_is_given_up(
         listener.until("two/row/out")
         proxy.freeze()
         time.step()
-        running.until(lambda: "did not take step 1" in running.bridge.problem)
+        running.until(lambda: "did not accept step 1" in running.bridge.problem)
         proxy.thaw()
         listener.until("one/count/out", b"1")
 
