@@ -17,10 +17,9 @@ from shmio.cli.set import Pairs, read_value
 from shmio.config import Declaration
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Layout
-from shmio.layout.naming import paths_of
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
-from shmio.layout.values.write import Write
+from shmio.layout.values.write import Write, paths_of
 from shmio.logs import printable
 from shmio.model.cell import Cell
 

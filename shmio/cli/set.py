@@ -12,10 +12,9 @@ from shmio.cli.run import PartlyDoneError, dumps, seconds
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.glob import select
 from shmio.layout.model import Layout, Register
-from shmio.layout.source.lists import split_array
 from shmio.layout.topic import look_up, parse_topic
 from shmio.layout.values.codec import Value
-from shmio.layout.values.literal import parse_literal
+from shmio.layout.values.literal import parse_literal, split_array
 from shmio.layout.values.text import from_text, wire_type
 from shmio.local.writer import MIN_PERIODS, TIMEOUT_S
 from shmio.logs import printable

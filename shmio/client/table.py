@@ -12,7 +12,7 @@ import numpy as np
 
 from shmio.errors import PathError, RemoteError
 from shmio.layout import model
-from shmio.layout.types import ElementType, element_type
+from shmio.layout.model import ElementType, element_type
 from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 

@@ -10,9 +10,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from shmio.layout.model import ByteOrder, Register, bit_positions
-from shmio.layout.types import ElementType
-from shmio.layout.values.scalar import REAL_MAX, scalar_codec
+from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
+from shmio.layout.values.codec import REAL_MAX, scalar_codec
 
 Bytes = npt.NDArray[np.uint8]
 Values = npt.NDArray[Any]

@@ -30,12 +30,10 @@ from shmio.injection.operations import (
     RandomRange,
 )
 from shmio.injection.target import Target, resolve, single
-from shmio.layout.model import Layout, Register
+from shmio.layout.model import INTEGERS, ElementType, Layout, Register
 from shmio.layout.topic import Direction
-from shmio.layout.types import INTEGERS, ElementType
-from shmio.layout.values.codec import RegisterCodec, codec
+from shmio.layout.values.codec import RegisterCodec, codec, scalar_codec
 from shmio.layout.values.literal import parse_literal
-from shmio.layout.values.scalar import scalar_codec
 from shmio.layout.values.text import from_text, wire_type
 
 NS: Final = 1_000_000_000

@@ -13,14 +13,13 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
 from shmio.errors import Diagnostic
+from shmio.layout import emit, tags
 from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Layout
-from shmio.layout.placement import emit, tags
-from shmio.layout.placement.place import MAX_TEXT, Placer
-from shmio.layout.placement.placed import Cost, Group
+from shmio.layout.place import MAX_TEXT, Cost, Group, Placer
 from shmio.layout.report import Report, TooManyErrors
 from shmio.layout.source import lexer, parser
 from shmio.layout.source.constants import Constants
-from shmio.layout.source.foreign import foreign
+from shmio.layout.source.file import decode, foreign
 from shmio.layout.source.syntax import (
     Array,
     BlockDeclaration,
@@ -30,7 +29,6 @@ from shmio.layout.source.syntax import (
     TypeDeclaration,
     Unit,
 )
-from shmio.layout.source.text_encoding import decode
 
 MAX_ALL_REGISTERS = 500_000
 MAX_ALL_STRUCTURES = 500_000

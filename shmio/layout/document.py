@@ -13,6 +13,7 @@ import msgspec
 
 from shmio.errors import LayoutError, PathError
 from shmio.layout.model import (
+    ALIASES,
     MAX_BLOCK_BYTES,
     MAX_DIMENSIONS,
     MAX_ELEMENTS,
@@ -22,9 +23,9 @@ from shmio.layout.model import (
     Layout,
     Register,
     array_size,
+    element_type,
 )
 from shmio.layout.topic import MAX_TOPIC, canonical_path
-from shmio.layout.types import ALIASES, element_type
 
 MAX_JSON_BYTES = 128 << 20
 

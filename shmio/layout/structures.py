@@ -11,8 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Register
-from shmio.layout.types import INTEGERS
+from shmio.layout.model import INTEGERS, Register
 
 Elementary = Literal["float", "uint32", "uint64", "string"]
 

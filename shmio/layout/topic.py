@@ -1,8 +1,13 @@
 """Topics: the paths by which clients name registers.
 
 A topic is ``<source>/<member>/…[/<index>…]``, optionally followed by ``/in`` or ``/out``. Before
-the direction, the path may end in a part of a register (see ``parts.py``): a slice in place of the
-last index (``Inputs/2..5``), or a bit or another part of an integer (``Inputs/8.%X0``).
+the direction, the path may end in a part of a register:
+
+- ``Inputs/2..5``: a range in place of an array's last index; the slice has one dimension.
+- ``Outputs/13.%X0``: a bit of an integer, as in STEP 7's slice access; bit 0 is the lowest.
+  ``.%B1`` is a byte, ``.%W0`` a word, ``.%D0`` a double word; number 0 is the least significant.
+
+A member's name never ends in such a part: its ``%`` would be encoded.
 
 A leading slash is accepted, and so is ``<SCHEME>://``, whose scheme is a source's name in any case.
 In a member's name ``/ % + #`` are percent-encoded, and so is the first letter of a member named
@@ -15,25 +20,29 @@ import difflib
 import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from typing import Literal, TypeVar, cast
+from typing import Final, Literal, TypeVar, cast
 
 from shmio.config import RESERVED_SOURCES
 from shmio.errors import PathError
-from shmio.layout.model import MAX_DEPTH, MAX_DIMENSIONS, Layout, Register
-from shmio.layout.parts import PART, RANGE, part_of, slice_of
+from shmio.layout.model import INTEGERS, MAX_DEPTH, MAX_DIMENSIONS, Layout, Register, array_size
 
 Direction = Literal["in", "out"]
 
 _Found = TypeVar("_Found")
 
 MAX_TOPIC = 16_384
-MAX_SEGMENTS = MAX_DEPTH * (1 + MAX_DIMENSIONS)  # names, each with its indices
+_MAX_SEGMENTS = MAX_DEPTH * (1 + MAX_DIMENSIONS)  # names, each with its indices
 _NEAR_CANDIDATES = 500
 _NEAR_CHARACTERS = 200
 _SOURCES_SHOWN = 4
 
 _SCHEME = re.compile(r"([^/:]+)://")
 _INDEX = re.compile(r"0|-?[1-9][0-9]{0,9}")
+_PART: Final = re.compile(r"(?P<head>.+)\.%(?P<kind>[XBWD])(?P<number>[0-9]{1,3})")
+"""Matches a last segment that names a part of an integer."""
+_RANGE: Final = re.compile(r"(?P<low>0|-?[1-9][0-9]{0,9})\.\.(?P<high>0|-?[1-9][0-9]{0,9})")
+"""Matches a last segment that names a slice."""
+_WIDTHS: Final = {"B": ("BYTE", 1), "W": ("WORD", 2), "D": ("DWORD", 4)}
 _ESCAPE = re.compile(r"%([0-9A-Fa-f]{2})?")
 _RESERVED = re.compile(r"[/%+#]")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -44,7 +53,7 @@ class Topic:
     """A register's path within a source, and a direction if one was named.
 
     ``path`` is in canonical encoding, and empty when the text named only the source. ``named``
-    tells whether the text named the source; otherwise the source is the default one.
+    is False if the text named no source, and the source is the default one.
     """
 
     source: str
@@ -73,7 +82,7 @@ def decode_segment(segment: str) -> str:
     """
     if "%" not in segment:
         return segment
-    if PART.fullmatch(segment):  # none is a name: not one of them decodes
+    if _PART.fullmatch(segment):  # no name looks like that: its % would not decode
         raise PathError(
             f"{shorten(segment)}: a bit or another part of a register is allowed only at the end of a register's path"
         )
@@ -104,13 +113,13 @@ def canonical_path(path: str, *, parts: bool = False) -> str:
             more segments than the deepest layout.
 
     """
-    segments = path.split("/", MAX_SEGMENTS)
-    if len(segments) > MAX_SEGMENTS:
-        raise PathError(f"{shorten(path)}: a path has at most {MAX_SEGMENTS} segments")
+    segments = path.split("/", _MAX_SEGMENTS)
+    if len(segments) > _MAX_SEGMENTS:
+        raise PathError(f"{shorten(path)}: a path has at most {_MAX_SEGMENTS} segments")
     if "" in segments:
         raise PathError(f"{shorten(path)}: empty segment in the path")
     suffix = ""
-    if parts and (part := PART.fullmatch(segments[-1])):
+    if parts and (part := _PART.fullmatch(segments[-1])):
         segments[-1], suffix = part["head"], f".%{part['kind']}{int(part['number'])}"
     canonical = "/".join(encode_segment(decode_segment(segment)) for segment in segments) + suffix
     if _CONTROL.search(canonical):
@@ -209,10 +218,10 @@ def find(layout: Layout, path: str) -> Register:
     if index is not None:
         return layout.registers[index]
     head, _, last = path.rpartition("/")
-    if part := PART.fullmatch(last):
+    if part := _PART.fullmatch(last):
         whole = find(layout, path[: -len(last) + part.end("head")])
         return part_of(layout, whole, part["kind"], int(part["number"]))
-    if bounds := RANGE.fullmatch(last):
+    if bounds := _RANGE.fullmatch(last):
         if (found := _array(layout, head)) is None:
             raise PathError(f"{shorten(path)}: a range must take the place of an array's last index")
         return slice_of(layout, *found, int(bounds["low"]), int(bounds["high"]))
@@ -223,16 +232,69 @@ def find(layout: Layout, path: str) -> Register:
     raise PathError(_unknown(layout, path))
 
 
+def part_of(layout: Layout, register: Register, kind: str, number: int) -> Register:
+    """Return a bit (kind ``X``), byte (``B``), word (``W``) or double word (``D``) of an integer.
+
+    Raises:
+        PathError: The register is not an integer, or has no such part.
+
+    """
+    path = f"{register.path}.%{kind}{number}"
+    if register.dims or register.type not in INTEGERS:
+        what = "an array" if register.dims else register.type
+        raise PathError(f"{path}: {what} has no such part: bits, bytes and words are of one integer")
+    size = register.size
+    if kind == "X":
+        byte, bit = divmod(number, 8)
+        if byte >= size:
+            raise PathError(f"{path}: {register.type} has bits 0 to {8 * size - 1}")
+        at = size - 1 - byte if layout.byte_order == "big" else byte
+        return Register(path, "BOOL", (), register.offset + at, bit, 1, 1, register.comment)
+    name, width = _WIDTHS[kind]
+    if width >= size or number >= size // width:
+        widths = [(other, step) for other, (_, step) in _WIDTHS.items() if step < size]
+        there = [f"%X0 to %X{8 * size - 1}", *(f"%{other}0 to %{other}{size // step - 1}" for other, step in widths)]
+        raise PathError(f"{path}: {register.type} has no such part; it has {', '.join(there)}")
+    at = size - width * (number + 1) if layout.byte_order == "big" else width * number
+    return Register(path, name, (), register.offset + at, None, width, 1, register.comment)
+
+
+def slice_of(layout: Layout, array: Register, leading: tuple[int, ...], low: int, high: int) -> Register:
+    """Return the elements ``low`` to ``high`` of an array's last dimension as one register.
+
+    ``leading`` holds the indices of the other dimensions.
+
+    Raises:
+        PathError: The array has no such row, or lacks some of these elements.
+
+    """
+    path = "/".join((array.path, *map(str, leading), f"{low}..{high}"))
+    if len(array.dims) != len(leading) + 1:
+        raise PathError(f"{path}: a range must take the place of an array's last index")
+    if high < low:
+        raise PathError(f"{path}: write the lower index first")
+    first = layout.element(array, (*leading, low))
+    layout.element(array, (*leading, high))
+    count = high - low + 1
+    if first.bit is None:
+        size = array_size(array.element, (count,))
+        return Register(path, array.type, ((low, high),), first.offset, None, size, count, array.comment)
+    size = -(-(first.bit + count) // 8)
+    return Register(
+        path, "BOOL", ((low, high),), first.offset, first.bit, size, count, array.comment, partial=True
+    )  # fmt: skip
+
+
 def names_part(path: str) -> bool:
     """Return whether a path names a slice, or a bit or another part of an integer."""
     last = path.rpartition("/")[2]
-    return bool(PART.fullmatch(last) or RANGE.fullmatch(last))
+    return bool(_PART.fullmatch(last) or _RANGE.fullmatch(last))
 
 
 def holders(path: str) -> Iterator[str]:
     """Yield a canonical path and the paths that contain it: elements, arrays, structures."""
     yield path
-    if part := PART.fullmatch(path):
+    if part := _PART.fullmatch(path):
         path = part["head"]
         yield path
     while path := path.rpartition("/")[0]:
@@ -253,7 +315,7 @@ def find_each(layout: Layout, path: str) -> Iterator[Register]:
     """
     register = find(layout, path)
     head, _, last = path.rpartition("/")
-    if path in layout.by_path or not RANGE.fullmatch(last):
+    if path in layout.by_path or not _RANGE.fullmatch(last):
         yield register
         return
     ((low, high),) = register.dims

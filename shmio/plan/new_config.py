@@ -17,7 +17,7 @@ from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, read_tables
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program
 from shmio.layout.model import Layout
-from shmio.layout.source.foreign import HEAD_BYTES, foreign
+from shmio.layout.source.file import HEAD_BYTES, foreign
 from shmio.logs import printable
 from shmio.plan.layouts import read_program, summarize
 from shmio.plan.ports import in_use

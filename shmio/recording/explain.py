@@ -9,11 +9,10 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from shmio.layout.model import Layout, Register
-from shmio.layout.naming import paths_of
 from shmio.layout.topic import find
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.text import json_value, to_text
-from shmio.layout.values.write import Write, bits_of
+from shmio.layout.values.write import Write, bits_of, paths_of
 from shmio.layout.values.write import apply as write_to
 from shmio.segment.events import NO_WRITER, Event, EventKind
 from shmio.segment.processes import GUEST_SLOTS, WRITERS

@@ -6,10 +6,9 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from shmio.layout.model import Layout
-from shmio.layout.naming import paths_of
 from shmio.layout.topic import find_each
 from shmio.layout.values.codec import Value, codec
-from shmio.layout.values.write import Write
+from shmio.layout.values.write import Write, paths_of
 from shmio.layout.values.write import apply as write_to
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 

@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Protocol
 
 from shmio.errors import LayoutError, ModelError, ShmioError
 from shmio.layout.model import Layout
-from shmio.layout.placement.tag_place import place_tags
 from shmio.layout.structures import members
+from shmio.layout.tags import place_tags
 from shmio.layout.topic import canonical_path
 from shmio.simulation.ports import Ends, Port
 
@@ -24,7 +24,7 @@ class DeclaringModel(Protocol):
 class Declaration:
     """One declaration of a model. On the class it is this object, on a model its value.
 
-    The value of a single register is a bool, int, float or str, see ``shmio.layout.values.scalar``.
+    The value of a single register is a bool, int, float or str, see ``shmio.layout.values.codec``.
     An array's is a tuple, of tuples for several dimensions; a one-dimensional array of BYTE is
     bytes. A structure's is a dict of its members' values; setting it changes the members that are
     named.

@@ -11,9 +11,7 @@ import numpy as np
 
 from shmio.errors import ValueRangeError
 from shmio.layout.model import ByteOrder, Register
-from shmio.layout.values.checks import brief
-from shmio.layout.values.codec import codec
-from shmio.layout.values.scalar import scalar_codec
+from shmio.layout.values.codec import brief, codec, scalar_codec
 
 _NUMBERS: Final = frozenset({int, float, np.float64})
 

@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 
 from shmio.layout.model import Layout, Register
-from shmio.layout.naming import path_at
-from shmio.layout.values.write import Write, cover
+from shmio.layout.values.write import Write, cover, path_at
 
 _EXPONENTS: Final = {"REAL": b"\x7f\x80\0\0", "LREAL": b"\x7f\xf0\0\0\0\0\0\0"}
 """The exponent bits, most significant byte first. A number with all of them set is not finite."""

@@ -1,4 +1,9 @@
-"""Constants of the sources, and the bounds and initial values that use them."""
+"""Whole numbers and constants of a source.
+
+Bounds of arrays, lengths of strings, and indices are whole numbers, constants, or sums and products
+of both, as in classic SCL. The parser reads them with the functions here; ``Constants`` evaluates
+them when a declaration is placed, and puts constants into initial values.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +11,116 @@ import re
 from collections.abc import Iterable
 
 from shmio.errors import Diagnostic, ShmioError
-from shmio.layout.source.expression import HIGHEST, LOWEST
-from shmio.layout.source.syntax import Bound, Constant, ConstantDeclaration, Sum
+from shmio.layout.model import DEFAULT_STRING, INTEGERS, MAX_DIMENSIONS, string_limit
+from shmio.layout.source.lexer import Cursor, Kind
+from shmio.layout.source.syntax import Bound, Bounds, Constant, ConstantDeclaration, Sum
 
-MAX_DEFINITIONS = 32  # length of a chain of constants that are defined by constants
+_LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1  # a DINT, as Siemens demands of bounds
+_TYPED = INTEGERS | {"B", "W", "DW", "L"}
+_BASES = {"2": "01", "8": "01234567", "16": "0123456789ABCDEF"}
+
+
+def bounds(at: Cursor) -> Bounds:
+    """Read ``[low..high, …]``; ``[*]`` has no bounds."""
+    at.expect("[", "'[' and the bounds of the array")
+    dims: list[tuple[Bound, Bound]] = []
+    flexible = False
+    while True:
+        start = at.token
+        if at.accept("*"):
+            flexible = True
+        else:
+            low = bound(at, "the lower bound")
+            at.expect("..", "'..' between the bounds")
+            high = bound(at, "the upper bound")
+            if isinstance(low, int) and isinstance(high, int) and low > high:
+                raise at.fault(start, f"expected a lower bound not above the upper, found {low}..{high}")
+            dims.append((low, high))
+        if not at.accept(","):
+            break
+        if len(dims) == MAX_DIMENSIONS:
+            raise at.fault(start, f"an array has at most {MAX_DIMENSIONS} dimensions")
+    at.expect("]", "']' after the bounds")
+    return () if flexible else tuple(dims)
+
+
+def string_length(at: Cursor, base: str) -> Bound:
+    """Read ``[length]`` after STRING or WSTRING, if there is one."""
+    if not (at.token.is_punct("[") or at.token.is_punct("(")):
+        return DEFAULT_STRING
+    closing = "]" if at.advance().text == "[" else ")"
+    token = at.token
+    length = bound(at, "the string's length")
+    if isinstance(length, int) and not 1 <= length <= string_limit(base):
+        raise at.fault(token, f"expected a {base} length of 1 to {string_limit(base)}, found {token}")
+    at.expect(closing, f"'{closing}' after the string's length")
+    return length
+
+
+def bound(at: Cursor, what: str) -> Bound:
+    """Read a whole number within 32 bits, or an expression of constants."""
+    position = at.position
+    terms: list[tuple[int, tuple[int | Constant, ...]]] = []
+    sign = 1
+    while True:
+        while at.token.is_punct("-") or at.token.is_punct("+"):
+            sign = -sign if at.advance().text == "-" else sign
+        factors = [_factor(at, what)]
+        while at.accept("*"):
+            factors.append(_factor(at, what))
+        terms.append((sign, tuple(factors)))
+        if not (at.token.is_punct("-") or at.token.is_punct("+")):
+            break
+        sign = -1 if at.advance().text == "-" else 1
+    (sign, (first, *rest)), *more = terms
+    if rest or more or isinstance(first, Constant):
+        return Sum(tuple(terms), position)
+    if not _LOWEST <= sign * first <= _HIGHEST:
+        raise at.fault(at.token, f"expected {what} within 32 bits, found {sign * first}")
+    return sign * first
+
+
+def integer(at: Cursor, what: str) -> int:
+    """Read a literal whole number: no constant, no expression."""
+    token = at.token
+    value = bound(at, what)
+    if not isinstance(value, int):
+        raise at.fault(token, f"expected {what} as a number, found {token}")
+    return value
+
+
+def _factor(at: Cursor, what: str) -> int | Constant:
+    position, token = at.position, at.token
+    if token.kind is Kind.WORD and token.text.upper() in _TYPED:
+        at.advance()
+        if at.accept("#"):  # INT#5
+            return _number(at, what)
+        return Constant(token.text, position)
+    at.accept("#")  # marks a name as local
+    if at.token.kind in (Kind.WORD, Kind.QUOTED):
+        return Constant(at.advance().text, position)
+    return _number(at, what)
+
+
+def _number(at: Cursor, what: str) -> int:
+    token = at.token
+    digits, base = token.text.replace("_", ""), 10
+    if token.kind is not Kind.NUMBER or not digits.isdecimal():
+        raise at.expected(f"{what}, a whole number")
+    at.advance()
+    if digits in _BASES and at.accept("#"):  # 16#FF
+        base, allowed = int(digits), _BASES[digits]
+        token = at.token
+        digits = token.text.replace("_", "").upper()
+        if token.kind not in (Kind.NUMBER, Kind.WORD) or not digits or not set(digits) <= set(allowed):
+            raise at.expected(f"{what}, a whole number")
+        at.advance()
+    if len(digits) > 34 or (value := int(digits, base)) > 1 << 32:
+        raise at.fault(token, f"expected {what} within 32 bits, found {token}")
+    return value
+
+
+_MAX_DEFINITIONS = 32  # length of a chain of constants that are defined by constants
 _HUGE = 1 << 64
 # Text in single quotes is kept; then "NAME", #NAME, and a value that is nothing but a name.
 _NAME = re.compile(r"""'(?:[^'$]|\$.)*'|"([^"]*)"|(?<![\w"])\#(\w+)|^\s*([^\W\d]\w*)\s*$""", re.DOTALL)
@@ -52,7 +163,7 @@ class Constants:
         if isinstance(bound, int):
             return bound
         value = self._sum(bound, 0)
-        if not LOWEST <= value <= HIGHEST:
+        if not _LOWEST <= value <= _HIGHEST:
             raise BoundFault(bound.position.error(f"expected a whole number within 32 bits, found {value}"))
         return value
 
@@ -78,7 +189,7 @@ class Constants:
         number = scope._declared[name.lower()].number
         if number is None:
             raise BoundFault(at.error(f"expected a whole number, but the constant {name!r} is not one"))
-        if depth >= MAX_DEFINITIONS:
+        if depth >= _MAX_DEFINITIONS:
             raise BoundFault(at.error(f"the constant {name!r} is defined by way of itself"))
         value = number if isinstance(number, int) else scope._sum(number, depth + 1)
         scope._numbers[name.lower()] = value
@@ -94,7 +205,7 @@ class Constants:
     def _value(self, match: re.Match[str], depth: int) -> str:
         name = match[1] or match[2] or match[3]
         declaration = self.find(name) if name else None
-        if declaration is None or depth >= MAX_DEFINITIONS:
+        if declaration is None or depth >= _MAX_DEFINITIONS:
             return match[0]
         if _NAME.fullmatch(declaration.value):  # the name of another constant
             return _NAME.sub(lambda inner: self._value(inner, depth + 1), declaration.value)

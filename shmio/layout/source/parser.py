@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 from shmio.layout.model import MAX_DEPTH
 from shmio.layout.report import MAX_ERRORS, Report, TooManyErrors
-from shmio.layout.source.expression import bound, bounds, integer, string_length
-from shmio.layout.source.lexer import Kind, Token
+from shmio.layout.source.constants import bound, bounds, integer, string_length
+from shmio.layout.source.lexer import Cursor, Kind, SyntaxFault, Token
 from shmio.layout.source.syntax import (
     Array,
     Assignment,
@@ -29,20 +29,34 @@ from shmio.layout.source.syntax import (
     TypeDeclaration,
     Unit,
 )
-from shmio.layout.source.token_cursor import Cursor, SyntaxFault
 
-TOP = ("DATA_BLOCK", "TYPE", "FUNCTION", "FUNCTION_BLOCK", "ORGANIZATION_BLOCK")
-INTERFACE = {section.value: section for section in Section}
-SECTIONS = (*INTERFACE, "VAR_RETAIN", "VAR_TEMP", "CONST", "LABEL")
-BLOCK_SECTIONS = ("VAR", "VAR_RETAIN")
+_TOP = ("DATA_BLOCK", "TYPE", "FUNCTION", "FUNCTION_BLOCK", "ORGANIZATION_BLOCK")
+_INTERFACE = {section.value: section for section in Section}
+_SECTIONS = (*_INTERFACE, "VAR_RETAIN", "VAR_TEMP", "CONST", "LABEL")
+_BLOCK_SECTIONS = ("VAR", "VAR_RETAIN")
 _SECTION_WORDS = ("RETAIN", "NON_RETAIN", "DB_SPECIFIC")
-STOPS = ("END_STRUCT", "END_VAR", "END_CONST", "END_TYPE", "END_DATA_BLOCK", "END_FUNCTION_BLOCK", "BEGIN", *TOP)
+_STOPS = ("END_STRUCT", "END_VAR", "END_CONST", "END_TYPE", "END_DATA_BLOCK", "END_FUNCTION_BLOCK", "BEGIN", *_TOP)
 _NUMBERED_TYPES = ("UDT", "FB", "SFB")
+_HEADER = (
+    *("AUTHOR", "FAMILY", "NAME", "VERSION", "CODE_VERSION1", "STANDARD"),
+    *("KNOW_HOW_PROTECT", "UNLINKED", "READ_ONLY", "NON_RETAIN", "RETAIN"),
+)
+_NUMBERED = ("DB", "UDT", "FB", "FC", "OB", "SFB")
+_DB_NUMBER = re.compile(r"DB([1-9][0-9]{0,4})", re.IGNORECASE)
+_PROTECTED = (
+    "the block {!r} is know-how protected and its declaration is not in the source: remove the protection in its "
+    "properties and export it again, or write its members here"
+)
 _SPACED = "the name {!r} has spaces and no quotes (as in print, where underscores can be lost); it is kept as written"
 _PLAIN = re.compile(r"\w+")
 
 
-class Declarations:
+def parse(file: str, text: str, tokens: list[Token], report: Report) -> Unit:
+    """Parse one file; report errors and leave the wrong declarations out of the result."""
+    return _Parser(Cursor(file, text, tokens, report)).unit()
+
+
+class _Declarations:
     """Reads declarations at a cursor.
 
     ``interface`` is True for declarations of a function block, whose names have no spaces.
@@ -62,7 +76,7 @@ class Declarations:
             return Struct(self.members("END_STRUCT", 0), position), ()
         members: list[Member] = []
         constants: list[ConstantDeclaration] = []
-        while self.at.token.is_word(*(SECTIONS if self.interface else BLOCK_SECTIONS)):
+        while self.at.token.is_word(*(_SECTIONS if self.interface else _BLOCK_SECTIONS)):
             keyword = self.at.advance().text.upper()
             if keyword in ("VAR_TEMP", "LABEL"):  # an instance does not store them
                 end = "END_VAR" if keyword == "VAR_TEMP" else "END_LABEL"
@@ -75,7 +89,7 @@ class Declarations:
             else:
                 while self.at.token.is_word(*_SECTION_WORDS) and not self.at.names_member():
                     self.at.advance()
-                section = INTERFACE.get(keyword, Section.STATIC) if self.interface else None
+                section = _INTERFACE.get(keyword, Section.STATIC) if self.interface else None
                 members += (replace(member, section=section) for member in self.members("END_VAR", 0))
             self.at.accept(";")
         if self.interface:
@@ -123,7 +137,7 @@ class Declarations:
     def stops(self) -> bool:
         """Return whether a list of members stops here although its end keyword is missing."""
         token = self.at.token
-        return token.kind is Kind.END or (token.is_word(*STOPS) and not self.at.names_member())
+        return token.kind is Kind.END or (token.is_word(*_STOPS) and not self.at.names_member())
 
     def recovering(self, read: Callable[[], None]) -> None:
         """Run one production; after a syntax error report it and skip to the end of the statement."""
@@ -147,7 +161,7 @@ class Declarations:
         values: dict[str, str] = {}
         while not self.at.accept("}"):
             token = self.at.token
-            if token.kind is Kind.END or token.is_punct("{") or token.is_word(*STOPS):
+            if token.kind is Kind.END or token.is_punct("{") or token.is_word(*_STOPS):
                 raise self.at.fault(opening, "the attributes that begin here have no '}'")
             self.at.advance()
             if token.kind in (Kind.WORD, Kind.QUOTED) and self.at.accept(":="):
@@ -218,7 +232,7 @@ class Declarations:
         if token.kind is Kind.QUOTED:
             self.at.advance()
             return Named(token.text, True, position)
-        if token.kind is not Kind.WORD or token.is_word(*STOPS, *SECTIONS):
+        if token.kind is not Kind.WORD or token.is_word(*_STOPS, *_SECTIONS):
             raise self.at.expected("a type")
         self.at.advance()
         if token.is_word("STRING", "WSTRING"):
@@ -226,23 +240,6 @@ class Declarations:
         if token.is_word(*_NUMBERED_TYPES) and self.at.token.kind is Kind.NUMBER:
             return Named(token.text + self.at.advance().text, False, position)  # UDT 10 is UDT10
         return Named(token.text, False, position)
-
-
-_HEADER = (
-    *("AUTHOR", "FAMILY", "NAME", "VERSION", "CODE_VERSION1", "STANDARD"),
-    *("KNOW_HOW_PROTECT", "UNLINKED", "READ_ONLY", "NON_RETAIN", "RETAIN"),
-)
-_NUMBERED = ("DB", "UDT", "FB", "FC", "OB", "SFB")
-_DB_NUMBER = re.compile(r"DB([1-9][0-9]{0,4})", re.IGNORECASE)
-_PROTECTED = (
-    "the block {!r} is know-how protected and its declaration is not in the source: remove the protection in its "
-    "properties and export it again, or write its members here"
-)
-
-
-def parse(file: str, text: str, tokens: list[Token], report: Report) -> Unit:
-    """Parse one file; report errors and leave the wrong declarations out of the result."""
-    return _Parser(Cursor(file, text, tokens, report)).unit()
 
 
 @dataclass(slots=True)
@@ -256,7 +253,7 @@ class _Header:
 class _Parser:
     def __init__(self, cursor: Cursor) -> None:
         self.at = cursor
-        self.declare = Declarations(cursor)
+        self.declare = _Declarations(cursor)
 
     def unit(self) -> Unit:
         unit = Unit()
@@ -282,7 +279,7 @@ class _Parser:
 
     def resume(self) -> None:
         """Skip to the beginning of the next declaration."""
-        while not self.at.at_end() and not self.at.token.is_word(*TOP):
+        while not self.at.at_end() and not self.at.token.is_word(*_TOP):
             self.at.advance()
 
     @contextmanager
@@ -301,7 +298,7 @@ class _Parser:
                 if resume:
                     self.resume()
         if resume and len(inner.errors) >= MAX_ERRORS:
-            self.at.skip_to_any(*TOP)
+            self.at.skip_to_any(*_TOP)
         self.at.report = outer
 
     def block(self) -> BlockDeclaration:
@@ -317,14 +314,14 @@ class _Parser:
             header = self.header()
             if header.protected and self.at.token.is_word("BEGIN", "END_DATA_BLOCK"):
                 raise SyntaxFault(position.error(_PROTECTED.format(name)))
-            if self.at.token.is_word("STRUCT", *BLOCK_SECTIONS):
+            if self.at.token.is_word("STRUCT", *_BLOCK_SECTIONS):
                 body, constants = self.declare.sections()
             else:
                 body = self.declare.body_type()
                 header = self.header(header)  # STEP 7 allows it before and after the type's name
             self.at.accept(";")
             if self.at.accept_word("BEGIN"):
-                while not self.at.token.is_word("END_DATA_BLOCK", *TOP) and self.at.token.kind is not Kind.END:
+                while not self.at.token.is_word("END_DATA_BLOCK", *_TOP) and self.at.token.kind is not Kind.END:
                     self.declare.recovering(lambda: self.assignment(assignments))
             self.at.expect_word("END_DATA_BLOCK")
         faults = (*found.errors, *found.warnings)
@@ -395,7 +392,7 @@ class _Parser:
                 word = self.at.advance()
                 header.protected |= word.is_word("KNOW_HOW_PROTECT")
                 if self.at.accept(":") or self.at.accept("="):
-                    while self.at.token.line == word.line and not self.at.token.is_word("STRUCT", "BEGIN", *SECTIONS):
+                    while self.at.token.line == word.line and not self.at.token.is_word("STRUCT", "BEGIN", *_SECTIONS):
                         if self.at.advance().kind is Kind.END:
                             break
             else:

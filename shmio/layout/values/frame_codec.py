@@ -25,10 +25,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shmio.layout.model import Layout, Register, bit_positions
-from shmio.layout.types import ElementType
+from shmio.layout.model import ElementType, Layout, Register, bit_positions
 from shmio.layout.values.calendar import DATE_EPOCH_DAYS, FIRST_DT_NS, LAST_DT_NS, NS_PER_DAY, NS_PER_MS, NS_PER_SECOND
-from shmio.layout.values.scalar import MAX_LTOD_NS, MAX_TOD_MS
+from shmio.layout.values.codec import MAX_LTOD_NS, MAX_TOD_MS
 
 Bytes = npt.NDArray[np.uint8]
 Array = npt.NDArray[Any]

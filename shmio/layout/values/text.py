@@ -18,11 +18,8 @@ import msgspec
 import numpy as np
 
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Register
-from shmio.layout.types import ElementType
-from shmio.layout.values.checks import brief, out_of_range, to_bool
-from shmio.layout.values.codec import Value, flatten
-from shmio.layout.values.scalar import Scalar, bounds, scalar_codec
+from shmio.layout.model import ElementType, Register
+from shmio.layout.values.codec import Scalar, Value, bounds, brief, flatten, out_of_range, scalar_codec, to_bool
 
 WireType = Literal["double", "int", "bool", "string"]
 

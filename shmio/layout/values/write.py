@@ -1,15 +1,20 @@
-"""Turn new values of registers into writes to a block: bytes, or a bit without its neighbours."""
+"""Writes to a block: bytes, or a bit without its neighbours.
+
+Functions here turn new values into writes, find the bits that registers have, and name the registers
+whose bits writes set, by paths that :func:`shmio.layout.topic.find` reads.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 from shmio.errors import PathError
 from shmio.layout.glob import Glob
-from shmio.layout.model import ByteOrder, Layout, Register, element_position
-from shmio.layout.topic import find_each, names_part
+from shmio.layout.model import INTEGERS, ByteOrder, Layout, Register, element_position
+from shmio.layout.topic import find_each, names_part, part_of, slice_of
 from shmio.layout.values.codec import codec
 
 
@@ -170,3 +175,124 @@ def _fill_rows(mask: bytearray, register: Register) -> None:
     for at, bits in enumerate(own, register.offset):
         if mask[at] & bits == bits:
             mask[at] = 0xFF
+
+
+# -- paths of writes -----------------------------------------------------------------------------------------
+
+
+def paths_of(layout: Layout, writes: Iterable[Write]) -> list[str]:
+    """Return the paths of the bits that writes set, in address order.
+
+    A register that is written in part is named by slices, elements, bytes or bits. A type without
+    parts, such as REAL, is named as a whole. Bytes outside the block or of no register are skipped.
+    """
+    bits = bytearray(layout.size)
+    touched: set[int] = set()
+    for offset, mask, data in writes:
+        stop = min(offset + len(data), layout.size)
+        for at in range(offset, stop):
+            bits[at] |= mask or 0xFF
+        touched.update(_overlapping(layout, offset, stop))
+    return [path for index in sorted(touched) for path in _register_paths(layout, layout.registers[index], bits)]
+
+
+def path_at(layout: Layout, offset: int) -> str:
+    """Return the path of the register or array element at a byte, or an empty string."""
+    for index in _overlapping(layout, offset, offset + 1):
+        register = layout.registers[index]
+        if not register.dims or register.bit is not None:
+            return register.path
+        place = _index_of(register, (offset - register.offset) // register.element.stride)
+        return "/".join((register.path, *map(str, place)))
+    return ""
+
+
+def _overlapping(layout: Layout, start: int, stop: int) -> range:
+    """Return the indices of the registers that share a byte with a range."""
+    first = bisect_right(layout.registers, start, key=lambda register: register.offset + register.size)
+    return range(first, bisect_left(layout.registers, stop, key=lambda register: register.offset))
+
+
+def _register_paths(layout: Layout, register: Register, bits: bytearray) -> Iterator[str]:
+    share = _share(register, bits)
+    own = bits_of(register)
+    if not any(share):
+        return
+    if share == own:
+        yield register.path
+    elif register.dims:
+        yield from _element_paths(layout, register, share, bits)
+    elif register.type in INTEGERS:
+        yield from _part_paths(layout, register, share)
+    else:
+        yield register.path
+
+
+def _share(register: Register, bits: bytearray) -> bytes:
+    """Return the bits that belong to a register."""
+    there = bytes(bits[register.offset : register.offset + register.size])
+    if register.bit is None or register.dims:
+        return there
+    return bytes([there[0] & 1 << register.bit])
+
+
+def _touched_elements(array: Register, share: bytes) -> range:
+    """Return a range of elements that includes all those with some of these bits."""
+    first, stop = len(share) - len(share.lstrip(b"\0")), len(share.rstrip(b"\0"))
+    if array.bit is None:
+        return range(first // array.element.stride, min(array.count, -(-stop // array.element.stride)))
+    if len(array.dims) == 1:
+        return range(8 * first, min(array.count, 8 * stop))
+    return range(array.count)
+
+
+def _index_of(array: Register, flat: int) -> tuple[int, ...]:
+    """Return the declared indices of an element; the last index runs fastest."""
+    index: tuple[int, ...] = ()
+    for low, high in reversed(array.dims):
+        flat, place = divmod(flat, high - low + 1)
+        index = (low + place, *index)
+    return index
+
+
+def _element_paths(layout: Layout, array: Register, share: bytes, bits: bytearray) -> Iterator[str]:
+    """Yield the paths of an array's elements; neighbours within its last dimension form a slice."""
+    run: list[tuple[int, ...]] = []
+    for flat in _touched_elements(array, share):
+        index = _index_of(array, flat)
+        element = layout.element(array, index)
+        whole = _share(element, bits) == bits_of(element)
+        if run and (not whole or index[:-1] != run[-1][:-1]):
+            yield _run_path(layout, array, run)
+            run = []
+        if whole:
+            run.append(index)
+        else:
+            yield from _register_paths(layout, element, bits)
+    if run:
+        yield _run_path(layout, array, run)
+
+
+def _run_path(layout: Layout, array: Register, run: list[tuple[int, ...]]) -> str:
+    if len(run) == 1:
+        return layout.element(array, run[0]).path
+    return slice_of(layout, array, run[0][:-1], run[0][-1], run[-1][-1]).path
+
+
+def _part_paths(layout: Layout, register: Register, share: bytes) -> Iterator[str]:
+    """Yield the paths of an integer's bits, least significant first.
+
+    Whole bytes, words and double words are named as such.
+    """
+    ascending = share[::-1] if layout.byte_order == "big" else share
+    at = 0
+    while at < len(ascending):
+        for kind, width in (("D", 4), ("W", 2), ("B", 1)):
+            if width < len(ascending) and at % width == 0 and ascending[at : at + width] == b"\xff" * width:
+                yield part_of(layout, register, kind, at // width).path
+                at += width
+                break
+        else:
+            bits = (8 * at + bit for bit in range(8) if ascending[at] >> bit & 1)
+            yield from (part_of(layout, register, "X", number).path for number in bits)
+            at += 1

@@ -21,8 +21,7 @@ from shmio.endpoints.grpc.time.virtual_time import Moment
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import decode_segment, encode_segment, shorten
-from shmio.layout.values.codec import Value, codec
-from shmio.layout.values.scalar import scalar_codec
+from shmio.layout.values.codec import Value, codec, scalar_codec
 from shmio.layout.values.text import from_text, wire_type
 from shmio.wire import simlog_v2_pb2 as wire
 

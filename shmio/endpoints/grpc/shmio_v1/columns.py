@@ -11,10 +11,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from shmio.endpoints.grpc.streams.encoding import field
-from shmio.layout.model import ByteOrder, Register, bit_positions
-from shmio.layout.types import ElementType
-from shmio.layout.values.date_types import Buffer
-from shmio.layout.values.scalar import Scalar, scalar_codec
+from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
+from shmio.layout.values.codec import Buffer, Scalar, scalar_codec
 from shmio.model.values import Column
 
 Array = np.ndarray[Any, np.dtype[Any]]

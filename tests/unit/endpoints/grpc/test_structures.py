@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from grpc import StatusCode
 
-from shmio.layout.placement.tag_place import place_tags
 from shmio.layout.structures import CONTENTS
+from shmio.layout.tags import place_tags
 from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment

@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Dims, Register, array_size
-from shmio.layout.types import element_type
+from shmio.layout.model import Dims, Register, array_size, element_type
 from shmio.layout.values.codec import Value, codec
 
 

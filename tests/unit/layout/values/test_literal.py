@@ -5,12 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Dims, Register
-from shmio.layout.source.lists import split_array
-from shmio.layout.types import element_type
-from shmio.layout.values.codec import Value
-from shmio.layout.values.literal import default_text, literal_text, parse_literal, scalar_literal
-from shmio.layout.values.scalar import scalar_codec
+from shmio.layout.model import Dims, Register, element_type
+from shmio.layout.values.codec import Value, scalar_codec
+from shmio.layout.values.literal import default_text, literal_text, parse_literal, scalar_literal, split_array
 
 
 def array(type_: str, dims: Dims, count: int) -> Register:

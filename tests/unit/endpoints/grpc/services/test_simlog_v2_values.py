@@ -20,9 +20,8 @@ from shmio.endpoints.grpc.services.simlog_v2_values import (
     to_wire,
 )
 from shmio.errors import ValueRangeError
-from shmio.layout.model import ByteOrder, Layout, Register, array_size
+from shmio.layout.model import ByteOrder, Layout, Register, array_size, element_type
 from shmio.layout.topic import Topic
-from shmio.layout.types import element_type
 from shmio.layout.values.codec import codec
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2

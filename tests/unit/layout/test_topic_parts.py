@@ -7,12 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.errors import PathError
-from shmio.layout.model import ByteOrder, Layout, Register, array_size
-from shmio.layout.naming import paths_of
+from shmio.layout.model import INTEGERS, ByteOrder, Layout, Register, array_size, element_type
 from shmio.layout.topic import find
-from shmio.layout.types import INTEGERS, element_type
 from shmio.layout.values.codec import codec
-from shmio.layout.values.write import Write, apply, bits_of, encode
+from shmio.layout.values.write import Write, apply, bits_of, encode, paths_of
 from shmio.segment.changed_registers import ChangeScan
 
 ORDERS: st.SearchStrategy[ByteOrder] = st.sampled_from(["big", "little"])

@@ -1,4 +1,4 @@
-"""Compute the offsets of declarations, by Siemens' rules for blocks with standard access.
+"""Place declarations: give each member its offset, by Siemens' rules for blocks with standard access.
 
 - BOOL takes the next bit; anything else begins at the next whole byte.
 - One-byte types take the next byte; all wider types, strings included, begin at an even byte.
@@ -7,33 +7,139 @@
   members. An in-out of a structured type is a POINTER to the caller's argument.
 
 Each type is placed once, however often it is used. The size of the expansion is computed, and
-limited, before anything is expanded. ``docs/reference/layout-rules.md`` gives the rules with their
-evidence.
+limited, before ``emit.py`` expands anything. ``docs/reference/layout-rules.md`` gives the rules with
+their evidence.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from shmio.layout.model import MAX_BLOCK_BYTES, MAX_DEPTH, MAX_ELEMENTS, MAX_REGISTERS, MAX_STRUCTURES, Dims, array_size
-from shmio.layout.placement import system_types
-from shmio.layout.placement.placed import Cost, Field, Group, Leaf, Repeat, extent_of, round_up
+from shmio.layout.model import (
+    BYTE,
+    MAX_BLOCK_BYTES,
+    MAX_DEPTH,
+    MAX_ELEMENTS,
+    MAX_REGISTERS,
+    MAX_STRUCTURES,
+    POINTER,
+    STRUCTURED,
+    Dims,
+    ElementType,
+    array_size,
+    element_type,
+    string_limit,
+)
 from shmio.layout.report import Report
+from shmio.layout.source import system_types
 from shmio.layout.source.constants import BoundFault, Constants
 from shmio.layout.source.syntax import Array, Bounds, Member, Named, Position, Section, Struct, Type, TypeDeclaration
 from shmio.layout.topic import encode_segment
-from shmio.layout.types import BYTE, POINTER, STRUCTURED, ElementType, element_type, string_limit
 
-MAX_NAME = 128  # characters, as in TIA Portal
+_MAX_NAME = 128  # characters, as in TIA Portal
 MAX_TEXT = 32 << 20  # characters of all expanded paths, comments and initial values together
-
-
 _OPAQUE = (
     "the system type '{name}' is kept as {size} bytes without meaning, because its members are not public; "
     'if you know them, give it as a PLC data type: TYPE "{name}" STRUCT … END_STRUCT; END_TYPE'
 )
 _SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, --type-bytes "{name}=…" of shmio-layout'
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """A register: an elementary type or an array of one; ``size`` in bytes, without padding."""
+
+    element: ElementType
+    dims: Dims
+    size: int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of elements in each dimension."""
+        return tuple(high - low + 1 for low, high in self.dims)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A placed structure; ``size`` in bytes, always even. ``opaque``: its members are unknown."""
+
+    fields: dict[str, Field]  # by name in lower case: S7 names are case-insensitive
+    size: int
+    cost: Cost
+    height: int
+    opaque: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """An array of structures."""
+
+    group: Group
+    dims: Dims
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A member with its place in its structure: ``offset`` in bytes, ``bit`` for a single BOOL."""
+
+    segment: str
+    member: Member
+    type: Leaf | Group | Repeat
+    offset: int
+    bit: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Size of an expansion: registers, their elements, characters of their texts, structures."""
+
+    registers: int = 0
+    elements: int = 0
+    text: int = 0
+    structures: int = 0
+
+    def plus(self, inner: Cost, times: int, text_each: int) -> Cost:
+        """Return this cost plus ``times`` the inner one.
+
+        ``text_each`` is the number of characters by which each inner register's path gets longer.
+        """
+        return Cost(
+            self.registers + times * inner.registers,
+            self.elements + times * inner.elements,
+            self.text + times * (inner.text + inner.registers * text_each),
+            self.structures + times * inner.structures,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Extent:
+    """Space that a member takes.
+
+    ``size`` (with padding) and ``align`` are in bytes, ``cost`` is the size of its expansion, and
+    ``height`` the number of structure levels below it.
+    """
+
+    size: int
+    align: int
+    cost: Cost
+    height: int
+
+
+def _extent_of(placed: Leaf | Group | Repeat) -> _Extent:
+    """Return the space that a placed type takes as a member."""
+    if isinstance(placed, Leaf):
+        cost = Cost(1, math.prod(placed.shape))
+        if placed.dims:
+            return _Extent(_round_up(placed.size, 2), 2, cost, 0)
+        return _Extent(placed.size, placed.element.align, cost, 0)
+    if isinstance(placed, Group):
+        return _Extent(placed.size, 2, Cost(structures=1).plus(placed.cost, 1, 0), placed.height)
+    group, count = placed.group, math.prod(high - low + 1 for low, high in placed.dims)
+    index_text = sum(1 + max(len(str(low)), len(str(high))) for low, high in placed.dims)
+    cost = Cost(elements=count, structures=count).plus(group.cost, count, index_text)
+    return _Extent(count * group.size, 2, cost, group.height)
 
 
 class Placer:
@@ -77,19 +183,19 @@ class Placer:
         section: Section | None = None
         for member in struct.members:
             if member.section is not section:
-                section, bits = member.section, round_up(bits, 16)
+                section, bits = member.section, _round_up(bits, 16)
             if _takes_no_room(member):
                 continue
             placed = self._member(member, fields, depth)
             if placed is None:
                 good = False
                 continue
-            extent = extent_of(placed)
+            extent = _extent_of(placed)
             if isinstance(placed, Leaf) and placed.element.base == "BOOL" and not placed.dims:
                 offset, bit = divmod(bits, 8)
                 bits += 1
             else:
-                offset, bit = round_up(round_up(bits, 8) // 8, extent.align), None
+                offset, bit = _round_up(_round_up(bits, 8) // 8, extent.align), None
                 bits = (offset + extent.size) * 8
             segment = encode_segment(member.name)
             initial = self._constants.substitute(member.initial)
@@ -98,8 +204,8 @@ class Placer:
             height = max(height, extent.height + 1)
             known = member if initial == member.initial else replace(member, initial=initial)
             fields[member.name.lower()] = Field(segment, known, placed, offset, bit)
-            good = good and self._fits(member.position, round_up(bits, 8) // 8, cost, height)
-        return Group(fields, round_up(round_up(bits, 8) // 8, 2), cost, height) if good else None
+            good = good and self._fits(member.position, _round_up(bits, 8) // 8, cost, height)
+        return Group(fields, _round_up(_round_up(bits, 8) // 8, 2), cost, height) if good else None
 
     def named(self, name: Named) -> ElementType | Group | None:
         """Look up a type, elementary or defined by the user; report an error and return None."""
@@ -114,7 +220,7 @@ class Placer:
             return element
         key = name.name.lower()
         if key not in self.placed and key in self._type_bytes:
-            self.placed[key] = opaque(name, self._type_bytes[key])
+            self.placed[key] = _opaque(name, self._type_bytes[key])
         if key in self._open:
             keys = [*self._open]
             chain = " → ".join([*keys[keys.index(key) :], key])
@@ -126,7 +232,7 @@ class Placer:
                 self.placed[key] = self._declared(key, declaration, depth)
             elif size := system_types.length(name.name):
                 self._report.add(name.position.warning(_OPAQUE.format(name=name.name, size=size)))
-                self.placed[key] = opaque(name, size)
+                self.placed[key] = _opaque(name, size)
             else:
                 self._refuse(name.position, self._unknown(name))
                 return None
@@ -161,8 +267,8 @@ class Placer:
             where = f"line {first.member.position.line}"
             self._refuse(member.position, f"expected a new name, found {member.name!r} again ({where})")
             return None
-        if len(member.name) > MAX_NAME:
-            self._refuse(member.position, f"a name is at most {MAX_NAME} characters long")
+        if len(member.name) > _MAX_NAME:
+            self._refuse(member.position, f"a name is at most {_MAX_NAME} characters long")
             return None
         if member.section is Section.IN_OUT and _is_structured(member.type):
             return Leaf(POINTER, (), POINTER.size)
@@ -224,13 +330,13 @@ class Placer:
         self._report.add(position.error(message))
 
 
-def opaque(name: Named, size: int) -> Group:
+def _opaque(name: Named, size: int) -> Group:
     """Return a structure of which only the size is known."""
     at = name.position
     member = Member("bytes", Array(((0, size - 1),), Named("BYTE", False, at), at), "", None, at)
     leaf = Leaf(BYTE, ((0, size - 1),), size)
-    cost = Cost().plus(extent_of(leaf).cost, 1, len(member.name) + 1)
-    return Group({member.name: Field(member.name, member, leaf, 0, None)}, round_up(size, 2), cost, 1, opaque=True)
+    cost = Cost().plus(_extent_of(leaf).cost, 1, len(member.name) + 1)
+    return Group({member.name: Field(member.name, member, leaf, 0, None)}, _round_up(size, 2), cost, 1, opaque=True)
 
 
 def _is_structured(type_: Type) -> bool:
@@ -250,3 +356,8 @@ def _takes_no_room(member: Member) -> bool:
         and not type_.quoted
         and type_.name.upper() == "VARIANT"
     )
+
+
+def _round_up(value: int, step: int) -> int:
+    """Return the value rounded up to a multiple of ``step``."""
+    return -(-value // step) * step

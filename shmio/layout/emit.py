@@ -12,20 +12,102 @@ from itertools import groupby
 
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Dims, Register
-from shmio.layout.placement.placed import Field, Group, Leaf, Repeat
+from shmio.layout.place import Field, Group, Leaf, Repeat
 from shmio.layout.report import Report
 from shmio.layout.source.constants import Constants
-from shmio.layout.source.lists import REPEAT, split_array, split_items
 from shmio.layout.source.syntax import Assignment, Position
 from shmio.layout.values import calendar
-from shmio.layout.values.checks import brief
-from shmio.layout.values.literal import default_text
+from shmio.layout.values.codec import brief
+from shmio.layout.values.literal import REPEAT, default_text, split_array, split_items
 
 _NAMED = re.compile(r'\s*(?:"([^"]*)"|(\w+))\s*:=(.*)', re.DOTALL)
 _BRACKETS = {"(": ")", "[": "]"}
+_DTL_PARTS = ("YEAR", "MONTH", "DAY", "WEEKDAY", "HOUR", "MINUTE", "SECOND", "NANOSECOND")
+_DTL = "DTL#{YEAR:04}-{MONTH:02}-{DAY:02}-{HOUR:02}:{MINUTE:02}:{SECOND:02}.{NANOSECOND:09}"
+_Layers = tuple[Mapping[str, str], ...]
 
 
-def member_values(text: str, group: Group) -> dict[str, str]:
+def registers(group: Group, report: Report) -> Iterator[Register]:
+    """Yield the registers of a placed block in address order."""
+    return _Expansion(report).registers(group, "", 0, ())
+
+
+class _Expansion:
+    """Flattens structures.
+
+    A structure's initial value is split and passed to its members as a layer; the outermost layer
+    that names a member wins.
+    """
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+        # Caches: each text is parsed once, however often its structure is expanded.
+        self._split: dict[tuple[int, str], dict[str, str]] = {}
+        self._listed: dict[tuple[int, str], list[str | None]] = {}
+        self._told: set[Position] = set()
+
+    def registers(self, group: Group, prefix: str, base: int, layers: _Layers) -> Iterator[Register]:
+        for key, field in group.fields.items():
+            path, offset = prefix + field.segment, base + field.offset
+            given = [layer[key] for layer in layers if key in layer]
+            if field.member.initial is not None:
+                given.append(field.member.initial)
+            if isinstance(field.type, Leaf):
+                yield _register(field, field.type, path, offset, given[0] if given else None)
+            elif isinstance(field.type, Group):
+                inner = tuple(self._members(text, field.type, field) for text in given)
+                yield from self.registers(field.type, f"{path}/", offset, inner)
+            else:
+                yield from self._elements(field, field.type, path, offset, given)
+
+    def _elements(self, field: Field, array: Repeat, path: str, offset: int, given: list[str]) -> Iterator[Register]:
+        texts = []
+        for text in given:
+            key = id(array), text
+            if key not in self._listed:
+                self._listed[key] = _element_values(text, array.dims)
+            texts.append(self._listed[key])
+        for flat, index in enumerate(_indices(array.dims)):
+            own = [values[flat] for values in texts]
+            layers = tuple(self._members(text, array.group, field) for text in own if text is not None)
+            yield from self.registers(array.group, f"{path}/{index}/", offset + flat * array.group.size, layers)
+
+    def _members(self, text: str, group: Group, field: Field) -> dict[str, str]:
+        key = id(group), text
+        if key not in self._split:
+            try:
+                self._split[key] = _member_values(text, group)
+            except ValueRangeError as error:
+                self._split[key] = {}
+                position = field.member.position
+                if position not in self._told:
+                    self._told.add(position)
+                    what = f"the initial value of the structure {field.member.name!r} is ignored: {error}"
+                    self._report.add(position.warning(what))
+        return self._split[key]
+
+
+def _register(field: Field, leaf: Leaf, path: str, offset: int, initial: str | None) -> Register:
+    is_bool = leaf.element.base == "BOOL"
+    return Register(
+        path=path,
+        type=leaf.element.name,
+        dims=leaf.dims,
+        offset=offset,
+        bit=(field.bit or 0) if is_bool else None,
+        size=leaf.size,
+        count=math.prod(leaf.shape),
+        comment=field.member.comment,
+        initial=initial,
+    )
+
+
+def _indices(dims: Dims) -> Iterator[str]:
+    ranges = (range(low, high + 1) for low, high in dims)
+    return ("/".join(map(str, index)) for index in itertools.product(*ranges))
+
+
+def _member_values(text: str, group: Group) -> dict[str, str]:
     """Split a structure's initial value into the texts of its members.
 
     Returns:
@@ -52,7 +134,7 @@ def member_values(text: str, group: Group) -> dict[str, str]:
     return values
 
 
-def element_values(text: str, dims: Dims) -> list[str | None]:
+def _element_values(text: str, dims: Dims) -> list[str | None]:
     """Return the text for each element of an array of structures; None for an element without one."""
     shape = tuple(high - low + 1 for low, high in dims)
     values: list[str | None] = [None] * math.prod(shape)
@@ -89,164 +171,6 @@ def _inside_structure(text: str) -> str | None:
     return text[1:-1] if len(text) >= 2 and _BRACKETS.get(text[0]) == text[-1] else None
 
 
-DTL_PARTS = ("YEAR", "MONTH", "DAY", "WEEKDAY", "HOUR", "MINUTE", "SECOND", "NANOSECOND")
-_DTL = "DTL#{YEAR:04}-{MONTH:02}-{DAY:02}-{HOUR:02}:{MINUTE:02}:{SECOND:02}.{NANOSECOND:09}"
-
-
-class InitialTexts:
-    """Initial value of one register as source text, to which assignments are applied.
-
-    Only the assigned elements of an array are stored: an array may be large and its assignments
-    few.
-    """
-
-    def __init__(self, register: Register) -> None:
-        self._register = register
-        self._whole = register.initial
-        self._elements: dict[int, str] = {}
-        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # DTLs that are assigned by member
-
-    def set(self, index: tuple[int, ...], text: str) -> None:
-        """Assign one element, or the whole register if ``index`` is empty."""
-        self._parts.pop(index, None)
-        if not index:
-            self._whole = text
-            self._elements.clear()
-            self._parts.clear()
-            return
-        self._elements[self._flat(index)] = text
-
-    def set_part(self, index: tuple[int, ...], part: str, text: str) -> bool:
-        """Assign one member of a DTL; return False if the text is not a whole number."""
-        digits = text.replace("_", "")
-        if not digits.isdecimal() or not digits.isascii() or len(digits) > 9:
-            return False
-        parts = self._parts.get(index)
-        if parts is None:
-            current = self._elements.get(self._flat(index)) if index else self._whole
-            ns = calendar.parse_moment((current or "").rpartition("#")[2]) or 0
-            moment = [int(field) for field in re.findall(r"[0-9]+", calendar.format_moment(ns, 9))]
-            parts = dict(zip(DTL_PARTS, [*moment[:3], 0, *moment[3:]], strict=True))
-        parts[part] = int(digits)
-        self.set(index, _DTL.format(**parts))
-        self._parts[index] = parts
-        return True
-
-    def _flat(self, index: tuple[int, ...]) -> int:
-        flat = 0
-        for i, (low, high) in zip(index, self._register.dims, strict=True):
-            flat = flat * (high - low + 1) + i - low
-        return flat
-
-    def __str__(self) -> str:
-        if not self._elements:
-            return self._whole or ""
-        default = default_text(self._register.element)
-        assigned = sorted(self._elements)
-        runs: list[tuple[str, int]] = []
-        position = 0
-        for start, count, text in split_array(self._whole or "", self._register.shape):
-            self._fill(runs, assigned, position, start, default)
-            self._fill(runs, assigned, start, start + count, text)
-            position = start + count
-        self._fill(runs, assigned, position, self._register.count, default)
-        merged = [(text, sum(n for _, n in group)) for text, group in groupby(runs, key=lambda run: run[0])]
-        return f"[{', '.join(text if n == 1 else f'{n}({text})' for text, n in merged)}]"
-
-    def _fill(self, runs: list[tuple[str, int]], assigned: list[int], start: int, stop: int, text: str) -> None:
-        """Append the elements from ``start`` to ``stop``; unassigned ones get ``text``."""
-        for flat in assigned[bisect_left(assigned, start) : bisect_left(assigned, stop)]:
-            if flat > start:
-                runs.append((text, flat - start))
-            runs.append((self._elements[flat], 1))
-            start = flat + 1
-        if stop > start:
-            runs.append((text, stop - start))
-
-
-Layers = tuple[Mapping[str, str], ...]
-
-
-def registers(group: Group, report: Report) -> Iterator[Register]:
-    """Yield the registers of a placed block in address order."""
-    return _Expansion(report).registers(group, "", 0, ())
-
-
-class _Expansion:
-    """Flattens structures.
-
-    A structure's initial value is split and passed to its members as a layer; the outermost layer
-    that names a member wins.
-    """
-
-    def __init__(self, report: Report) -> None:
-        self._report = report
-        # Caches: each text is parsed once, however often its structure is expanded.
-        self._split: dict[tuple[int, str], dict[str, str]] = {}
-        self._listed: dict[tuple[int, str], list[str | None]] = {}
-        self._told: set[Position] = set()
-
-    def registers(self, group: Group, prefix: str, base: int, layers: Layers) -> Iterator[Register]:
-        for key, field in group.fields.items():
-            path, offset = prefix + field.segment, base + field.offset
-            given = [layer[key] for layer in layers if key in layer]
-            if field.member.initial is not None:
-                given.append(field.member.initial)
-            if isinstance(field.type, Leaf):
-                yield _register(field, field.type, path, offset, given[0] if given else None)
-            elif isinstance(field.type, Group):
-                inner = tuple(self._members(text, field.type, field) for text in given)
-                yield from self.registers(field.type, f"{path}/", offset, inner)
-            else:
-                yield from self._elements(field, field.type, path, offset, given)
-
-    def _elements(self, field: Field, array: Repeat, path: str, offset: int, given: list[str]) -> Iterator[Register]:
-        texts = []
-        for text in given:
-            key = id(array), text
-            if key not in self._listed:
-                self._listed[key] = element_values(text, array.dims)
-            texts.append(self._listed[key])
-        for flat, index in enumerate(_indices(array.dims)):
-            own = [values[flat] for values in texts]
-            layers = tuple(self._members(text, array.group, field) for text in own if text is not None)
-            yield from self.registers(array.group, f"{path}/{index}/", offset + flat * array.group.size, layers)
-
-    def _members(self, text: str, group: Group, field: Field) -> dict[str, str]:
-        key = id(group), text
-        if key not in self._split:
-            try:
-                self._split[key] = member_values(text, group)
-            except ValueRangeError as error:
-                self._split[key] = {}
-                position = field.member.position
-                if position not in self._told:
-                    self._told.add(position)
-                    what = f"the initial value of the structure {field.member.name!r} is ignored: {error}"
-                    self._report.add(position.warning(what))
-        return self._split[key]
-
-
-def _register(field: Field, leaf: Leaf, path: str, offset: int, initial: str | None) -> Register:
-    is_bool = leaf.element.base == "BOOL"
-    return Register(
-        path=path,
-        type=leaf.element.name,
-        dims=leaf.dims,
-        offset=offset,
-        bit=(field.bit or 0) if is_bool else None,
-        size=leaf.size,
-        count=math.prod(leaf.shape),
-        comment=field.member.comment,
-        initial=initial,
-    )
-
-
-def _indices(dims: Dims) -> Iterator[str]:
-    ranges = (range(low, high + 1) for low, high in dims)
-    return ("/".join(map(str, index)) for index in itertools.product(*ranges))
-
-
 def assign(
     group: Group,
     found: Sequence[Register],
@@ -261,7 +185,7 @@ def assign(
     if not assignments:
         return tuple(found)
     by_path = {register.path: index for index, register in enumerate(found)}
-    texts: dict[int, InitialTexts] = {}
+    texts: dict[int, _InitialTexts] = {}
     for assignment in assignments:
         target = _target(group, assignment)
         if target is None:
@@ -272,7 +196,7 @@ def assign(
             report.add(assignment.position.error(target))
             continue
         index = by_path[target.path]
-        text = texts.setdefault(index, InitialTexts(found[index]))
+        text = texts.setdefault(index, _InitialTexts(found[index]))
         value = constants.substitute(assignment.value) or ""
         if not target.part:
             text.set(target.index, value)
@@ -328,7 +252,7 @@ def _target(group: Group, assignment: Assignment) -> _Target | str | None:
         and place.element.base == "DTL"
         and len(parts) == 1
         and isinstance(part, str)
-        and part.upper() in DTL_PARTS
+        and part.upper() in _DTL_PARTS
     ):
         return _Target(path, element, part.upper())
     return f"expected ':=' and a value, found {_written(part)}"
@@ -346,3 +270,74 @@ def _expected_index(dims: Dims, found: str | tuple[int, ...]) -> str:
 
 def _written(part: str | tuple[int, ...]) -> str:
     return repr(part) if isinstance(part, str) else str(list(part))
+
+
+class _InitialTexts:
+    """Initial value of one register as source text, to which assignments are applied.
+
+    Only the assigned elements of an array are stored: an array may be large and its assignments
+    few.
+    """
+
+    def __init__(self, register: Register) -> None:
+        self._register = register
+        self._whole = register.initial
+        self._elements: dict[int, str] = {}
+        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # DTLs that are assigned by member
+
+    def set(self, index: tuple[int, ...], text: str) -> None:
+        """Assign one element, or the whole register if ``index`` is empty."""
+        self._parts.pop(index, None)
+        if not index:
+            self._whole = text
+            self._elements.clear()
+            self._parts.clear()
+            return
+        self._elements[self._flat(index)] = text
+
+    def set_part(self, index: tuple[int, ...], part: str, text: str) -> bool:
+        """Assign one member of a DTL; return False if the text is not a whole number."""
+        digits = text.replace("_", "")
+        if not digits.isdecimal() or not digits.isascii() or len(digits) > 9:
+            return False
+        parts = self._parts.get(index)
+        if parts is None:
+            current = self._elements.get(self._flat(index)) if index else self._whole
+            ns = calendar.parse_moment((current or "").rpartition("#")[2]) or 0
+            moment = [int(field) for field in re.findall(r"[0-9]+", calendar.format_moment(ns, 9))]
+            parts = dict(zip(_DTL_PARTS, [*moment[:3], 0, *moment[3:]], strict=True))
+        parts[part] = int(digits)
+        self.set(index, _DTL.format(**parts))
+        self._parts[index] = parts
+        return True
+
+    def _flat(self, index: tuple[int, ...]) -> int:
+        flat = 0
+        for i, (low, high) in zip(index, self._register.dims, strict=True):
+            flat = flat * (high - low + 1) + i - low
+        return flat
+
+    def __str__(self) -> str:
+        if not self._elements:
+            return self._whole or ""
+        default = default_text(self._register.element)
+        assigned = sorted(self._elements)
+        runs: list[tuple[str, int]] = []
+        position = 0
+        for start, count, text in split_array(self._whole or "", self._register.shape):
+            self._fill(runs, assigned, position, start, default)
+            self._fill(runs, assigned, start, start + count, text)
+            position = start + count
+        self._fill(runs, assigned, position, self._register.count, default)
+        merged = [(text, sum(n for _, n in group)) for text, group in groupby(runs, key=lambda run: run[0])]
+        return f"[{', '.join(text if n == 1 else f'{n}({text})' for text, n in merged)}]"
+
+    def _fill(self, runs: list[tuple[str, int]], assigned: list[int], start: int, stop: int, text: str) -> None:
+        """Append the elements from ``start`` to ``stop``; unassigned ones get ``text``."""
+        for flat in assigned[bisect_left(assigned, start) : bisect_left(assigned, stop)]:
+            if flat > start:
+                runs.append((text, flat - start))
+            runs.append((self._elements[flat], 1))
+            start = flat + 1
+        if stop > start:
+            runs.append((text, stop - start))

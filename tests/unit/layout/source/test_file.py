@@ -1,15 +1,17 @@
-"""Files that are given for a source and are none: one line says what they are, and what to do."""
+"""The encodings of a source, and files of other kinds: one line says what they are, and what to do."""
 
 from __future__ import annotations
 
+import codecs
 import io
 import zipfile
 
 import pytest
 
 from shmio.errors import LayoutError
-from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.compiler import Compiled, Source, compile_sources
 
+TEXT = 'DATA_BLOCK "Größe"\nSTRUCT\n "µ" : Int; // für É\nEND_STRUCT;\nEND_DATA_BLOCK\n'
 XML = '<?xml version="1.0" encoding="utf-8"?>\n<Document>\n  <SW.Blocks.GlobalDB ID="0"/>\n</Document>\n'
 CSV = "Name,Path,Data Type,Logical Address,Comment\nStart,Default,Bool,%I0.0,go\nStop,Default,Bool,%I0.1,no\n"
 
@@ -62,3 +64,53 @@ def test_a_key_that_takes_long_to_read_is_refused_at_once() -> None:
     text = f'[registers]\na = "INT"\n{".".join("a" * 20_000)} = "INT"\n'
     with pytest.raises(LayoutError, match=r"t\.toml:3:1: error: a key has more than 64 parts"):
         compile_sources([Source("t.toml", text.encode())])
+
+
+def compile_bytes(data: bytes) -> Compiled:
+    return compile_sources([Source("x.db", data)])
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        TEXT.encode(),
+        codecs.BOM_UTF8 + TEXT.encode(),
+        codecs.BOM_UTF16_LE + TEXT.encode("utf-16-le"),
+        codecs.BOM_UTF16_BE + TEXT.replace("\n", "\r\n").encode("utf-16-be"),
+    ],
+    ids=["utf-8", "utf-8 with a mark", "utf-16-le", "utf-16-be"],
+)
+def test_unicode(data: bytes) -> None:
+    compiled = compile_bytes(data)
+    (layout,) = compiled.layouts
+    (register,) = layout.registers
+    assert (layout.name, register.path, register.comment) == ("Größe", "µ", "für É")
+    assert not compiled.warnings
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "latin-1"])
+def test_what_is_not_utf8_is_windows_with_a_warning(encoding: str) -> None:
+    compiled = compile_bytes(TEXT.encode(encoding))
+    assert compiled.layouts[0].registers[0].comment == "für É"
+    (warning,) = compiled.warnings
+    assert str(warning).startswith("x.db:1:15: warning: not UTF-8: read as Windows-1252")
+    assert "save the file as UTF-8" in warning.message
+
+
+def test_characters_that_only_windows_has() -> None:
+    assert compile_bytes(TEXT.replace("É", "€ „x“").encode("cp1252")).layouts[0].registers[0].comment == "für € „x“"
+
+
+def test_bytes_without_a_character_in_windows_are_kept() -> None:
+    compiled = compile_bytes(b'DATA_BLOCK "b" STRUCT a : Int; // \xff \x81\nEND_STRUCT; END_DATA_BLOCK')
+    assert compiled.layouts[0].registers[0].comment == "ÿ \x81"
+
+
+@pytest.mark.parametrize("data", [codecs.BOM_UTF16_LE + b"a\0\n\0\x00\xdc", codecs.BOM_UTF16_BE + b"\0a\0\n\0"])
+def test_a_mark_that_lies_names_the_place_and_the_remedy(data: bytes) -> None:
+    with pytest.raises(LayoutError, match=r"^x\.db:2:1: error: expected UTF-16-.E, .* export the source again"):
+        compile_bytes(data)
+
+
+def test_a_utf8_mark_that_lies_is_windows() -> None:
+    assert "read as Windows-1252" in compile_bytes(codecs.BOM_UTF8 + TEXT.encode("cp1252")).warnings[0].message

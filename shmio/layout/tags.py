@@ -1,17 +1,35 @@
-"""Place the registers of a tag table in a block, one after the other."""
+"""Compile tag tables: TOML files that name the registers of a source without a data block.
+
+::
+
+    name = "cell"                 # optional: the file's name
+    [registers]
+    "joints/R3200/Link1/R/position" = "LREAL"
+    "joints/Kuka.j1/R" = { type = "LREAL", initial = 0.5, comment = "rad" }
+    "lamps" = { type = "ARRAY[1..8] OF BOOL", initial = [true] }
+    "safetyzones/Z1" = "SafetyZone"
+
+Keys are paths as in topics. Types are those of S7, or structures of known shape, whose members
+become registers. Values lie in the order of the file, each at a multiple of its size, in the byte
+order ``byte_order`` (default: little, as on this machine); a single BOOL takes a byte of its own.
+The initial values of an array are one list, in the order of its elements.
+"""
 
 from __future__ import annotations
 
 import math
 import re
+import tomllib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cached_property
 from pathlib import PurePath
 from typing import Annotated, Final, Literal
 
 import msgspec
 
-from shmio.config.wording import explain
+from shmio.config.lines import MAX_PARTS, too_long
+from shmio.config.wording import explain, explain_toml
 from shmio.errors import Diagnostic, PathError, ValueRangeError
 from shmio.layout.model import (
     MAX_BLOCK_BYTES,
@@ -20,24 +38,29 @@ from shmio.layout.model import (
     MAX_REGISTERS,
     ByteOrder,
     Dims,
+    ElementType,
     Layout,
     Register,
     array_size,
+    element_type,
 )
 from shmio.layout.report import Report, TooManyErrors
-from shmio.layout.source.lists import split_array
+from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.layout.structures import CONTENTS, members
 from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
-from shmio.layout.types import ElementType, element_type
-from shmio.layout.values.literal import parse_literal
+from shmio.layout.values.literal import parse_literal, split_array
 from shmio.logs import printable
 
-MAX_ALIGN: Final = 8
-
+SUFFIX: Final = ".toml"
+_MAX_ALIGN: Final = 8
+_PLACE = re.compile(r" \(at (?:line ([0-9]+), column ([0-9]+)|end of document)\)")
+_LONG_NUMBER = re.compile(r"[0-9_]{4300}")
+_NAME = r"""("(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[A-Za-z0-9_-]+)[ \t]*"""
+_TABLE = r"registers[ \t]*\.[ \t]*"
+_KEY = re.compile(rf"^[ \t]*(?:(?:{_TABLE})?{_NAME}[.=]|\[[ \t]*{_TABLE}{_NAME}[].])", re.MULTILINE)
 _ARRAY = re.compile(r"ARRAY\s*\[([^\]]*)\]\s*OF\s+(\S+)", re.IGNORECASE)
 _BOUNDS = re.compile(r"\s*(-?[0-9]{1,9})\s*\.\.\s*(-?[0-9]{1,9})\s*")
 _TEXTS: Final = frozenset({"STRING", "WSTRING", "CHAR", "WCHAR"})
-
 _Scalar = bool | int | float | str
 
 
@@ -47,12 +70,24 @@ class _Tag(msgspec.Struct, forbid_unknown_fields=True):
     comment: Annotated[str, msgspec.Meta(max_length=1000)] = ""
 
 
-class Table(msgspec.Struct, forbid_unknown_fields=True):
+class _Table(msgspec.Struct, forbid_unknown_fields=True):
     """Content of a tag table's file."""
 
     registers: Annotated[dict[str, object], msgspec.Meta(min_length=1, max_length=MAX_REGISTERS)]
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)] = ""
     byte_order: ByteOrder = "little"
+
+
+def compile_tags(file: str, data: bytes, report: Report) -> Layout:
+    """Compile one tag table; warnings stay in the report.
+
+    Raises:
+        LayoutError: The table is wrong; ``diagnostics`` has everything found.
+    """
+    table = _read(file, data, report)
+    report.raise_errors()
+    lines = _Lines(data.decode())
+    return _place_table(file, table, report, lines.line_of)
 
 
 def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder = "little") -> Layout:
@@ -71,10 +106,76 @@ def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder
         LayoutError: A register is wrong; each of the ``diagnostics`` begins with the path.
     """
     places = {path: place for place, path in enumerate(registers, 1)}
-    return place_table(name, Table(dict(registers), name, byte_order), Report([name]), places.__getitem__)
+    return _place_table(name, _Table(dict(registers), name, byte_order), Report([name]), places.__getitem__)
 
 
-def place_table(file: str, table: Table, report: Report, line_of: Callable[[str], int]) -> Layout:
+def _read(file: str, data: bytes, report: Report) -> _Table:
+    """Return the file's content; after an error report it and return an empty table."""
+    if len(data) > MAX_SOURCE_BYTES:
+        report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
+        return _Table({})
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        report.add(Diagnostic(file, data.count(b"\n", 0, error.start) + 1, 1, "it is not in UTF-8"))
+        return _Table({})
+    if line := too_long(text, MAX_SOURCE_BYTES):
+        what = f"a key has more than {MAX_PARTS} parts; write a path with dots in quotes"
+        report.add(Diagnostic(file, line, 1, what))
+        return _Table({})
+    try:
+        return msgspec.convert(tomllib.loads(text), _Table)
+    except msgspec.ValidationError as error:
+        report.add(Diagnostic(file, 1, 1, f"not a tag table: {explain(error)}"))
+    except (ValueError, RecursionError) as error:
+        report.add(_syntax_error(file, text, error))
+    return _Table({})
+
+
+def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
+    """Return tomllib's error as a diagnostic with its place."""
+    where = _PLACE.search(str(error))
+    if where is None:
+        number = _LONG_NUMBER.search(text)
+        return Diagnostic(file, text.count("\n", 0, number.start()) + 1 if number else 1, 1, explain_toml(error, text))
+    lines = text.split("\n")
+    line, column = (int(where[1]), int(where[2])) if where[1] else (len(lines), len(lines[-1]) + 1)
+    if not str(error).startswith("Cannot overwrite a value"):
+        hint = "; write a path in quotes" if str(error).startswith("Expected '='") else ""
+        return Diagnostic(file, line, column, f"{_PLACE.sub('', explain_toml(error, text))}{hint}")
+    while line > 1 and not _KEY.match(lines[line - 1]):
+        line -= 1  # tomllib gives the end of the value
+    key = shorten(lines[line - 1].partition("=")[0].strip())
+    return Diagnostic(file, line, 1, f"{key}: given twice; write a path with a dot in quotes")
+
+
+class _Lines:
+    """Finds the line of a key of a table on demand."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def line_of(self, key: str) -> int:
+        """Return the last line on which a search finds the key, or 1."""
+        return self._found.get(key, 1)
+
+    @cached_property
+    def _found(self) -> dict[str, int]:
+        lines: dict[str, int] = {}
+        line, counted = 1, 0
+        for match in _KEY.finditer(self._text):
+            line += self._text.count("\n", counted, match.start())
+            counted = match.start()
+            key = match[1] or match[2]
+            if key.startswith('"') and "\\" in key:
+                with suppress(ValueError):  # the line may be part of a multi-line string
+                    lines |= dict.fromkeys(tomllib.loads(f"{key} = 0"), line)
+            else:
+                lines[key[1:-1] if key[0] in "\"'" else key] = line
+        return lines
+
+
+def _place_table(file: str, table: _Table, report: Report, line_of: Callable[[str], int]) -> Layout:
     """Place a table's registers.
 
     ``line_of`` returns the line of a key, for diagnostics.
@@ -101,7 +202,7 @@ class _Placer:
         self._end = 0
         self._elements = 0
 
-    def place(self, table: Table) -> None:
+    def place(self, table: _Table) -> None:
         """Place all registers and report errors.
 
         Raises:
@@ -127,7 +228,7 @@ class _Placer:
             most = f"{MAX_BLOCK_BYTES} bytes and {MAX_ELEMENTS} elements"
             self._report.add(Diagnostic(self._file, 1, 1, f"expected at most {most}, found more"))
 
-    def layout(self, table: Table) -> Layout:
+    def layout(self, table: _Table) -> Layout:
         """Return the layout of the placed registers."""
         name = table.name or PurePath(self._file).stem
         return Layout(name, None, self._end, False, tuple(self._registers.values()), table.byte_order)
@@ -231,7 +332,7 @@ def _type(text: str) -> tuple[ElementType, Dims]:
 
 
 def _align(element: ElementType) -> int:
-    return min(element.size, MAX_ALIGN) if element.size & element.size - 1 == 0 else element.align
+    return min(element.size, _MAX_ALIGN) if element.size & element.size - 1 == 0 else element.align
 
 
 def _literal(value: _Scalar | list[_Scalar], element: ElementType) -> str:

@@ -1,1 +1,0 @@
-"""Place declarations: give each register its offset, by Siemens' placement rules."""
