@@ -13,8 +13,8 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Address, Grpc, load
-from shmio.endpoints.grpc.server import memory
-from shmio.endpoints.grpc.server.listeners import Listeners
+from shmio.endpoints.grpc.server import limits
+from shmio.endpoints.grpc.server.access import Listeners
 from shmio.endpoints.grpc.server.server import Server
 from shmio.endpoints.grpc.services.services import Services
 from shmio.endpoints.grpc.streams.feed import Feeds
@@ -32,7 +32,7 @@ FOREIGN_LOGGERS: Final = ("asyncio", "grpc._cython.cygrpc")
 
 def run(worker: Worker) -> None:
     """Serve until the worker is stopped."""
-    memory.limit_arenas()
+    limits.limit_arenas()
     rations = {name: LogRateLimit(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
     for name, ration in rations.items():
         logging.getLogger(name).addFilter(ration)
@@ -69,12 +69,12 @@ async def _serve(worker: Worker) -> None:
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
-    trimmer = memory.Trimmer()
+    trimmer = limits.Trimmer()
     virtual_time = VirtualTime()
     wake_ups = WakeUps()
     feeds = Feeds(worker.segment, writer, wake_ups, on_quality, virtual_time)
     services = Services(worker.segment, worker.slot, virtual_time, wake_ups, feeds, config.default_source)
-    server = Server(services)
+    server = Server(services.calls)
     feeds.start()
     await services.stepper.start(worker.before.pid)
     ports = await server.start(listeners.listeners, config.tls, place.gid)

@@ -15,9 +15,8 @@ from google.protobuf.struct_pb2 import Value
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from shmio.config import Address
-from shmio.endpoints.grpc.server.access import Keys, ListenerAccess
+from shmio.endpoints.grpc.server.access import Keys, Listener, ListenerAccess
 from shmio.endpoints.grpc.server.call_guard import CallLimits, OpenCalls
-from shmio.endpoints.grpc.server.listeners import Listener
 from shmio.endpoints.grpc.server.server import Server
 from shmio.endpoints.grpc.services.services import Services
 from shmio.endpoints.grpc.streams.feed import Feed
@@ -135,7 +134,7 @@ async def endpoint(
     wake_ups = WakeUps()
     feeds = {name: Feed(block, WRITER, wake_ups, on_quality, virtual_time) for name, block in segment.blocks.items()}
     service = Services(segment, segment.processes.find("grpc"), virtual_time, wake_ups, feeds, next(iter(feeds)))
-    server = Server(service, OpenCalls(limits))
+    server = Server(service.calls, OpenCalls(limits))
     for source in feeds:
         await server.set_source(source, False)
     ports = await server.start([LOOPBACK._replace(address=Address("127.0.0.1", port))])

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 
 from shmio.endpoints.grpc.commands.topics import Shape, Topics, shape
 from shmio.endpoints.grpc.injection.injections import ShadowKind, Shadows
-from shmio.endpoints.grpc.server.rejected_calls import Refusals
+from shmio.endpoints.grpc.server.call_guard import Refusals
 from shmio.endpoints.in_flight import Done, in_words
 from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Any
 
 import grpc
 from grpc_health.v1 import health_pb2 as wire
 from grpc_health.v1 import health_pb2_grpc
 
+from shmio.endpoints.grpc.server.error_status import Context
 from shmio.layout.topic import shorten
-
-Context = grpc.aio.ServicerContext[Any, Any]
 
 
 class Health(health_pb2_grpc.HealthServicer):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -15,12 +15,10 @@ from grpc_reflection.v1alpha import reflection
 from shmio.config import Address, Tls, UnixAddress
 from shmio.config.tls import read_tls
 from shmio.config.unix_socket import SocketFile, clear
-from shmio.endpoints.grpc.server.aio_server import CoreServer
-from shmio.endpoints.grpc.server.call_guard import CallGuard, OpenCalls
-from shmio.endpoints.grpc.server.file_descriptors import room, shortage
+from shmio.endpoints.grpc.server.access import Listener
+from shmio.endpoints.grpc.server.call_guard import CallGuard, CoreServer, OpenCalls
 from shmio.endpoints.grpc.server.health import Health
-from shmio.endpoints.grpc.server.listeners import Listener
-from shmio.endpoints.grpc.services.services import Services
+from shmio.endpoints.grpc.server.limits import room, shortage
 from shmio.errors import EndpointError
 
 MAX_REQUEST_BYTES = 1 << 20
@@ -46,7 +44,10 @@ OPTIONS = [
 class Server:
     """Serves all services on each listening address, behind a :class:`CallGuard` each."""
 
-    def __init__(self, services: Services, calls: OpenCalls | None = None) -> None:
+    def __init__(
+        self, services: Mapping[str, dict[str, grpc.RpcMethodHandler[Any, Any]]], calls: OpenCalls | None = None
+    ) -> None:
+        """``services``: the handlers of each service, by its full name; ``calls``: default: none is open."""
         self.calls = OpenCalls() if calls is None else calls
         """The open calls on all addresses."""
         self._services = services
@@ -98,7 +99,7 @@ class Server:
             self._servers.append(server)
         for server in self._servers:
             await server.start()
-        for service in (health.OVERALL_HEALTH, *self._services.calls):
+        for service in (health.OVERALL_HEALTH, *self._services):
             self._health.set(service, serving=True)
         return ports
 
@@ -152,10 +153,10 @@ class Server:
             (f"{pending}_hard_limit", most + most // 4),
         ]
         server = CoreServer(options, gate)
-        for name, calls in self._services.calls.items():
+        for name, calls in self._services.items():
             server.add_registered_method_handlers(name, calls)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
-        names = [*self._services.calls, health.SERVICE_NAME, reflection.SERVICE_NAME]
+        names = [*self._services, health.SERVICE_NAME, reflection.SERVICE_NAME]
         reflection.enable_server_reflection(names, server)
         return server
 

@@ -15,7 +15,7 @@ from shmio.endpoints.grpc.commands.publish import Publisher, Request
 from shmio.endpoints.grpc.commands.topics import Shape, TimeTopic, Topics, shape
 from shmio.endpoints.grpc.injection.injection import Injection
 from shmio.endpoints.grpc.injection.injections import ShadowKind, Shadows, shadow_path
-from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.services.simlog_v1_values import encoder, message_type, read, time_stamp
 from shmio.endpoints.grpc.streams.channel import Subject
 from shmio.endpoints.grpc.streams.outbox import EventLane, Lane, Outbox, Outboxes, StateLane

@@ -17,8 +17,8 @@ from shmio.endpoints.grpc.commands.publish import Publisher, Request
 from shmio.endpoints.grpc.commands.topics import Shape, TimeTopic, Topics, shape
 from shmio.endpoints.grpc.injection.injections import Shadow, ShadowKind, Shadows, shadow_paths
 from shmio.endpoints.grpc.server.access import holder_of
-from shmio.endpoints.grpc.server.time_slices import time_sliced
-from shmio.endpoints.grpc.services.error_status import refuse
+from shmio.endpoints.grpc.server.error_status import Context, refuse
+from shmio.endpoints.grpc.server.limits import time_sliced
 from shmio.endpoints.grpc.services.simlog_v2_values import (
     MAX_ELEMENTS,
     MAX_MEMBERS,
@@ -243,8 +243,6 @@ class Subscribers:
 
 
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
-
-Context = grpc.aio.ServicerContext[Any, Any]
 
 
 class SimlogV2:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import grpc
 
-from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.endpoints.grpc.time.virtual_time import TimeStatus

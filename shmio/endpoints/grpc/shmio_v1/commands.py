@@ -10,7 +10,7 @@ import grpc
 
 from shmio.endpoints.grpc.commands import command_client
 from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1 import describe
 from shmio.endpoints.grpc.shmio_v1.declare import DeclareCall
 from shmio.endpoints.grpc.shmio_v1.inject import InjectCall

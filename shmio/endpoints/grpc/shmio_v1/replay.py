@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import grpc
 
-from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.errors import ShmioError, ValueRangeError
 from shmio.local.replays import ReplayRequest, Replays
 from shmio.model.replay import Playing

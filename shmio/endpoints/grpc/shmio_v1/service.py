@@ -9,7 +9,7 @@ from typing import Any, Final
 import grpc
 
 from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1 import describe
 from shmio.endpoints.grpc.shmio_v1.clock import TimeCalls
 from shmio.endpoints.grpc.shmio_v1.commands import CommandCalls

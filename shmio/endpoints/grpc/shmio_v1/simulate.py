@@ -11,8 +11,8 @@ from typing import Any
 import grpc
 import numpy as np
 
-from shmio.endpoints.grpc.server.time_slices import time_sliced
-from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.server.error_status import Context, refuse
+from shmio.endpoints.grpc.server.limits import time_sliced
 from shmio.endpoints.grpc.shmio_v1.clock import clock
 from shmio.endpoints.grpc.shmio_v1.columns import KINDS, DecodedImage, pack
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_ELEMENTS, MAX_REGISTERS

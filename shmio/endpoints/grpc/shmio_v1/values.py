@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.server.time_slices import time_sliced
+from shmio.endpoints.grpc.server.limits import time_sliced
 from shmio.endpoints.grpc.shmio_v1.views import Selection
 from shmio.errors import CommandError, ValueRangeError
 from shmio.layout.model import Register

@@ -232,7 +232,7 @@ def test_a_stream_that_ends_leaves_nothing_at_the_feed(segment: Segment) -> None
 
 def test_a_taken_address_is_refused_by_name(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        second = Server(served.service)
+        second = Server(served.service.calls)
         with pytest.raises(EndpointError, match=f"127.0.0.1:{served.port}"):
             await second.start([LOOPBACK._replace(address=Address("127.0.0.1", served.port))])
         await second.stop()
@@ -250,7 +250,7 @@ def test_tls_serves_those_who_trust_it(segment: Segment, tmp_path: Path) -> None
     topic = wire.TopicDescriptor(path="cell/step")
 
     async def test(served: Endpoint) -> None:
-        secure = Server(served.service)
+        secure = Server(served.service.calls)
         (port,) = await secure.start([LOOPBACK._replace(address=Address("localhost", 0), encrypted=True)], tls)
         known = grpc.ssl_channel_credentials(
             authority.cert_pem.bytes(), client_cert.private_key_pem.bytes(), client_cert.cert_chain_pems[0].bytes()
@@ -262,7 +262,7 @@ def test_tls_serves_those_who_trust_it(segment: Segment, tmp_path: Path) -> None
         async with grpc.aio.secure_channel(f"localhost:{port}", anonymous) as channel:
             stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
             assert await code(stub.GetTopic(topic, timeout=TIMEOUT_S)) is grpc.StatusCode.UNAVAILABLE
-        unusable = Server(served.service)
+        unusable = Server(served.service.calls)
         with pytest.raises(ConfigError, match=r"grpc\.tls\.(key|certificate)"):
             await unusable.start([LOOPBACK], Tls(certificate="/nowhere", key="/nowhere"))
         await unusable.stop()

@@ -74,7 +74,7 @@ def test_who_has_no_good_certificate_gets_nowhere(
     party = Party(tmp_path)
 
     async def test(served: Endpoint) -> None:
-        server = Server(served.service)
+        server = Server(served.service.calls)
         (port,) = await server.start([LOOPBACK._replace(address=Address("localhost", 0), encrypted=True)], party.tls)
         async with party.channel(port, INTRUDERS[intruder](party)) as channel:
             stub: Any = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
@@ -103,7 +103,7 @@ def test_handshakes_without_a_certificate_and_broken_off_ones_harm_nobody(segmen
                 connection.sendall(b"\x16\x03\x01\x02\0\x01\0\x01\xfc\x03\x03"[: 1 + number % 11])
 
     async def test(served: Endpoint) -> None:
-        server = Server(served.service)
+        server = Server(served.service.calls)
         (port,) = await server.start([LOOPBACK._replace(address=Address("localhost", 0), encrypted=True)], party.tls)
         flood = Flood()
         with flood.upon(("localhost", port), context):

@@ -12,8 +12,7 @@ import grpc
 import pytest
 
 from shmio.config import UnixAddress
-from shmio.endpoints.grpc.server.access import Keys, ListenerAccess
-from shmio.endpoints.grpc.server.listeners import Listener
+from shmio.endpoints.grpc.server.access import Keys, Listener, ListenerAccess
 from shmio.endpoints.grpc.server.server import Server
 from shmio.errors import EndpointError
 from shmio.segment import Segment
@@ -28,14 +27,14 @@ def test_it_serves_there_and_leaves_nothing(segment: Segment, tmp_path: Path, na
     listener = Listener(UnixAddress(str(file)), ListenerAccess(Keys()))
 
     async def test(served: Endpoint) -> None:
-        server = Server(served.service)
+        server = Server(served.service.calls)
         await server.start([listener])
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
         async with grpc.aio.insecure_channel(f"unix:{quote(str(file))}") as channel:
             stub: Any = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
             topic = await stub.GetTopic(TopicDescriptor(path="cell/step"), timeout=TIMEOUT_S)
             assert topic.msgType == "int"
-            second = Server(served.service)
+            second = Server(served.service.calls)
             with pytest.raises(EndpointError, match="another program listens there"):
                 await second.start([listener])
             await second.stop()
@@ -51,7 +50,7 @@ def test_a_group_may_open_it(segment: Segment, tmp_path: Path) -> None:
     file = tmp_path / "s"
 
     async def test(served: Endpoint) -> None:
-        server = Server(served.service)
+        server = Server(served.service.calls)
         await server.start([Listener(UnixAddress(str(file)), ListenerAccess(Keys()))], gid=os.getegid())
         assert (stat.S_IMODE(file.stat().st_mode), file.stat().st_gid) == (0o660, os.getegid())
         await server.stop()

@@ -16,7 +16,7 @@ import grpc
 import pytest
 
 import shmio
-from shmio.endpoints.grpc.server.rejected_calls import LINES, TURN_S
+from shmio.endpoints.grpc.server.call_guard import LINES, TURN_S
 from shmio.layout.model import Layout
 from shmio.layout.values.write import cover
 from shmio.segment import EventKind, Segment

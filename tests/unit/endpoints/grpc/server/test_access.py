@@ -16,8 +16,7 @@ import trustme
 
 from shmio.config import Address, Grpc, Tls, Token
 from shmio.config.model import Client, Listening
-from shmio.endpoints.grpc.server.access import NEEDS, Keys, ListenerAccess
-from shmio.endpoints.grpc.server.listeners import Listener, Listeners
+from shmio.endpoints.grpc.server.access import NEEDS, Keys, Listener, ListenerAccess, Listeners
 from shmio.endpoints.grpc.server.server import Server
 from shmio.segment import Segment
 from shmio.wire import simlog_v1_pb2 as wire
@@ -47,7 +46,7 @@ LOCAL = Grpc(listen=["127.0.0.1:0"], token=BOTH)
 async def guarded(
     served: Endpoint, listeners: Sequence[Listener], tls: Tls | None = None
 ) -> AsyncIterator[tuple[Server, list[int]]]:
-    server = Server(served.service)
+    server = Server(served.service.calls)
     try:
         yield server, await server.start(listeners, tls)
     finally:

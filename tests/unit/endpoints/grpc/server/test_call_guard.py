@@ -11,7 +11,7 @@ import grpc
 import pytest
 
 from shmio.endpoints.grpc.server.access import NEEDS, client_of
-from shmio.endpoints.grpc.server.call_guard import CallLimits
+from shmio.endpoints.grpc.server.call_guard import LINES, CallLimits, Refusals
 from shmio.segment import Segment
 from shmio.wire import simlog_v1_pb2 as wire
 from tests.unit.endpoints import http2
@@ -210,3 +210,23 @@ def test_bytes_that_are_no_message_are_refused_in_a_word(
 )
 def test_a_client_is_a_token_or_a_host_or_here_a_connection(peer: str, token: str | None, client: str) -> None:
     assert client_of(peer, token) == client
+
+
+def test_a_turn_has_few_lines_and_the_rest_is_told_at_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    async def test() -> None:
+        refusals = Refusals(turn_s=0.01)
+        for number in range(3 * LINES):
+            refusals.add(f"reason {number}", "cell/a", "ipv4:127.0.0.1:5")
+        assert refusals.count == 3 * LINES
+        assert [record.getMessage() for record in caplog.records] == [
+            f"publish refused: reason {number}" for number in range(LINES)
+        ]
+        async with asyncio.timeout(20):
+            while len(caplog.records) <= LINES:  # noqa: ASYNC110  the log is what is waited for
+                await asyncio.sleep(0)
+        assert caplog.records[-1].getMessage() == f"publish refused: {2 * LINES} more in 0.01 s"
+        refusals.add("once more", "cell/a", "ipv4:127.0.0.1:5")
+        assert caplog.records[-1].getMessage() == "publish refused: once more"
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(test())

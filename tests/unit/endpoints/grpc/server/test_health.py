@@ -27,7 +27,7 @@ async def told(watch: Any) -> int:
 
 def test_watchers_are_told_changes_and_the_end(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        server = Server(served.service)
+        server = Server(served.service.calls)
         [port] = await server.start([LOOPBACK])
         async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
             stub: Any = health_pb2_grpc.HealthStub(channel)
@@ -50,7 +50,7 @@ def test_watchers_are_told_changes_and_the_end(segment: Segment) -> None:
 
 def test_a_watcher_that_takes_nothing_keeps_no_news_from_others(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        server = Server(served.service)
+        server = Server(served.service.calls)
         [port] = await server.start([LOOPBACK])
         await server.set_source("cell", True)
         connection = await http2.Connection.open(port)

@@ -57,7 +57,7 @@ def test_calls_of_unknown_names_stop_nobody(
     file = str(tmp_path / "s")
 
     async def test(served: Endpoint) -> None:
-        server = Server(served.service)
+        server = Server(served.service.calls)
         listeners = [
             LOOPBACK,
             LOOPBACK._replace(address=Address("localhost", 0), encrypted=True),
@@ -104,7 +104,7 @@ def test_calls_of_unknown_names_stop_nobody(
 def test_grpcio_without_what_we_build_on_is_refused_at_start(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     async def test(served: Endpoint) -> None:
         with pytest.raises(EndpointError, match=r"grpcio \S+ lacks _ServicerContext.* install another version"):
-            await Server(served.service).start([LOOPBACK])
+            await Server(served.service.calls).start([LOOPBACK])
 
     async def run() -> None:
         async with endpoint(segment) as served:
