@@ -17,8 +17,7 @@ from common import Child, begin, db201, interleave, table
 
 from shmio.config.address import Address
 from shmio.connectors.loop import SourceLoop, WallClock
-from shmio.connectors.s7.connector import S7Connector
-from shmio.connectors.s7.options import S7Options
+from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.connectors.schedule import Schedule
 from shmio.segment import BlockSpec, ProcessSpec, Segment
 

@@ -74,7 +74,7 @@ SLOW = (
     "tests/unit/cli/test_interrupt.py",
     "tests/unit/config/test_faults.py::test_hostile_files",
     "tests/unit/connectors/replay/test_recording.py::test_a_damaged_place_is_bad",
-    "tests/unit/connectors/s7/test_client.py::test_references_wrap_around",
+    "tests/unit/connectors/s7/test_connector.py::test_references_wrap_around",
     "tests/unit/endpoints/grpc/commands/test_publish.py::test_many_streams",
     "tests/unit/endpoints/grpc/commands/test_publish.py::test_ten_thousand",
     "tests/unit/endpoints/grpc/server/test_call_guard.py::test_the_limits_hold",

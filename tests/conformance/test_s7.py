@@ -10,8 +10,7 @@ import snap7
 
 from shmio.config import Address
 from shmio.connectors.base import Connector
-from shmio.connectors.s7.connector import S7Connector
-from shmio.connectors.s7.options import S7Options
+from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.emulators.emulator import Emulator
 from shmio.emulators.programs import Counter, generations
 from shmio.emulators.s7_jobs import Traits

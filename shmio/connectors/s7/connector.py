@@ -1,22 +1,416 @@
-"""The S7 connector: one data block of one controller."""
+"""The S7 connector: its keys, and the client that reads and writes one data block.
+
+For one thread. ``submit`` sends the requests of a read and returns; ``collect`` waits for the
+image. In between, more reads may be submitted, up to ``depth``, and writes may be sent at any time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ipaddress
+import re
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Annotated
 
-from shmio.connectors.base import Connector
-from shmio.connectors.s7.client import LONGEST_WRITE_S, S7Client
-from shmio.connectors.s7.options import S7Options
-from shmio.errors import ConfigError
+import msgspec
+
+from shmio.config.wording import meant
+from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.blocks import BlockRead, BlockWrite, SizeProbe, ends, waves
+from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
+from shmio.connectors.s7.mode import ModeQuery
+from shmio.connectors.s7.transport import Operation, Transport, Window
+from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
 
+MAX_DEPTH = 4  # reads in flight at once; with more, images would only be older
+LONGEST_WRITE_S = 20  # limit for a whole batch; ``timeout`` if that is longer
 
-class S7Connector(Connector):
-    """Reads the whole block each cycle.
+# The slot of the CPU in its rack, by family, where nothing is configured.
+_CPU_SLOT = {"S7_300": 2, "S7_400": 3, "S7_1200": 1, "S7_1500": 1}
 
-    A read of several PDUs does not show a single instant of the PLC.
+
+class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """Address of the controller and parameters of the session; the keys are those of ``plc.ini``.
+
+    ValueError for an invalid host or model.
     """
+
+    host: Annotated[str, msgspec.Meta(min_length=1, max_length=253)]
+    model: str | None = None
+    """``S7_300``, ``S7_400``, ``S7_1200`` or ``S7_1500``.
+
+    Only the default of ``slot`` depends on it.
+    """
+    port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 102
+    rack: Annotated[int, msgspec.Meta(ge=0, le=7)] = 0
+    slot: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None
+    timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
+    """Milliseconds for connecting, for reading the block, and for each answer to a write."""
+    packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
+    """The most data bytes in one read; the controller's PDU size limits it too."""
+    dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
+    """The data block; the layout's own number if absent."""
+    maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named as its siblings
+    """The most requests in flight; the controller's limit applies too."""
+
+    def __post_init__(self) -> None:
+        if not _is_host(self.host):
+            raise ValueError(f"host: {self.host!r} is not a host name or address; give the port in the key port")
+        if self.model is not None and _family(self.model) not in _CPU_SLOT:
+            raise ValueError(
+                f"model: {self.model!r} is unknown; valid: {', '.join(_CPU_SLOT)}{meant(self.model, _CPU_SLOT)}"
+            )
+
+    @property
+    def cpu_slot(self) -> int:
+        """The slot as configured, else the model's usual one."""
+        if self.slot is not None:
+            return self.slot
+        return 1 if self.model is None else _CPU_SLOT[_family(self.model)]
+
+    @property
+    def peer(self) -> str:
+        """``host:port`` for messages, IPv6 in brackets."""
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def _family(model: str) -> str:
+    """Return the model as the table has it: ``s7-1500`` is ``S7_1500``."""
+    return model.strip().upper().replace("-", "_").replace(" ", "_")
+
+
+def _is_host(text: str) -> bool:
+    """Return whether the text is an IP address (IPv6 with a zone too) or a valid host name."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return re.fullmatch(r"[^\s:/\[\]@]+", text) is not None and _is_name(text)
+    return True
+
+
+def _is_name(text: str) -> bool:
+    """Return whether the text can be looked up: no label is empty or longer than 63 bytes."""
+    try:
+        text.encode("idna")
+    except UnicodeError:
+        return False
+    return True
+
+
+class S7Client:
+    """Reads and writes one block of one controller.
+
+    Any error closes the socket, so that a late answer is never taken for the next one. ``connect``
+    may then be called again.
+    """
+
+    def __init__(self, options: S7Options, db_number: int, size: int) -> None:
+        """Prepare to read ``size`` bytes of DB ``db_number``.
+
+        Raises:
+            ConfigError: S7 cannot address the block.
+
+        """
+        if not 1 <= size <= pdu.MAX_BLOCK_SIZE:
+            raise ConfigError(f"DB{db_number} of {size} bytes: S7 reads blocks of 1 to {pdu.MAX_BLOCK_SIZE} bytes")
+        if not 1 <= db_number <= 65535:
+            raise ConfigError(f"DB{db_number}: data blocks are numbered 1 to 65535")
+        self.options = options
+        self.db_number = db_number
+        self.size = size
+        self._timeout_ns = options.timeout * 1_000_000
+        self._transport: Transport | None = None
+        self._session = pdu.Session(0, 0)
+        # A reconnect does not reset the references, so that old answers stay unknown.
+        self._window = Window(0, 0)
+        self._under_way: deque[BlockRead] = deque()
+        self._idle: list[BlockRead] = []
+        self._mode = ModeQuery()
+        self._close_on_error = _CloseOnError(self.close, options)
+
+    @property
+    def timeout_s(self) -> float:
+        """The longer of ``timeout`` and the limit for a batch of writes, in s."""
+        return max(self.options.timeout / 1000, LONGEST_WRITE_S)
+
+    @property
+    def connected(self) -> bool:
+        """Whether a session is open, as far as is known."""
+        return self._transport is not None
+
+    @property
+    def pdu_size(self) -> int:
+        """Size of the largest PDU as granted, in bytes; 0 before the first session."""
+        return self._session.pdu_size
+
+    @property
+    def jobs(self) -> int:
+        """Requests kept in flight: as granted, at most ``maxJobs``; 0 before the first session."""
+        return self._session.jobs
+
+    @property
+    def depth(self) -> int:
+        """Reads that may be in flight at once in this session, at least 1."""
+        return max(1, len(self._idle) + len(self._under_way))
+
+    @property
+    def doubt(self) -> str:
+        """Why values may not change (the PLC is in STOP); empty if there is no reason."""
+        return self._mode.doubt
+
+    def connect(self) -> None:
+        """Open a session and query the operating mode.
+
+        It takes at most ``timeout``, plus the host name lookup.
+
+        Raises:
+            ConnectorError: No controller answers, it does not speak S7, or it refuses the session.
+
+        """
+        self.close()
+        with _CloseOnError(self.close, self.options, opening=True):
+            self._transport = transport = Transport(self.options.host, self.options.port, self._timeout_ns)
+            deadline_ns = transport.deadline_ns
+            transport.send(pdu.connect_request(self.options.rack, self.options.cpu_slot), deadline_ns)
+            tpdu_size = pdu.parse_connect_confirm(transport.next_frame(deadline_ns))
+            asked = pdu.Session(min(pdu.WANTED_PDU_SIZE, tpdu_size - 3), pdu.WANTED_JOBS)
+            reference = self._window.reference
+            self._window.reference = (reference + 1) & 0xFFFF
+            transport.send(pdu.setup_request(reference, asked.jobs, asked.pdu_size), deadline_ns)
+            granted = pdu.parse_setup_answer(transport.next_frame(deadline_ns), reference, asked)
+            if transport.left:
+                raise ConnectorError("unexpected bytes after the session was set up")
+            self._use(granted, transport)
+        with self._close_on_error:
+            self._ask_mode()
+            self._flush()
+            self._finish(self._mode, deadline_ns)
+
+    def read(self) -> bytes:
+        """Read the whole block within ``timeout``; for use while no read is in flight.
+
+        A read of several PDUs does not show a single instant of the controller.
+
+        Returns:
+            ``size`` bytes as the controller sent them.
+
+        Raises:
+            ConnectorError: See :meth:`collect`.
+
+        """
+        self.submit()
+        image = None
+        while image is None:
+            image = self.collect(self._under_way[0].deadline_ns)
+        return image
+
+    def submit(self) -> None:
+        """Send the requests of one read without waiting. At most ``depth`` reads may be in flight.
+
+        Raises:
+            ConnectorError: There is no session, or it was lost.
+
+        """
+        if self._transport is None:
+            raise ConnectorError("not connected")
+        if not self._idle:
+            raise RuntimeError(f"no more than {self.depth} reads may be under way")
+        with self._close_on_error:
+            read = self._idle.pop()
+            read.begin(time.monotonic_ns() + self._timeout_ns)
+            self._under_way.append(read)
+            self._window.add(read)
+            self._ask_mode()
+            self._flush()
+
+    def collect(self, until_ns: int) -> bytes | None:
+        """Wait for the oldest read.
+
+        Args:
+            until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
+
+        Returns:
+            ``size`` bytes; None if the read is not complete by ``until_ns``.
+
+        Raises:
+            ConnectorError: There is no session, a wrong answer, a refusal, or no answer within
+                ``timeout`` of ``submit``. The session is closed then.
+
+        """
+        if self._transport is None:
+            raise ConnectorError("not connected")
+        if not self._under_way:
+            raise RuntimeError("no read is under way")
+        read = self._under_way[0]
+        with self._close_on_error:
+            if not self._advance(read, min(until_ns, read.deadline_ns)):
+                if time.monotonic_ns() >= read.deadline_ns:
+                    raise TimeoutError
+                return None
+            if read.refusal is not None:
+                raise self._explained(read.refusal, read.deadline_ns)
+            self._idle.append(self._under_way.popleft())
+            return read.data
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Write in this order; reads may be in flight.
+
+        A batch that does not fit one PDU takes several jobs. It is not atomic and may be done in
+        part, and the controller may serve jobs in flight in any order. Each answer must come within
+        ``timeout`` of the one before.
+
+        Returns:
+            For each write "" if the controller confirmed it, else why it refused it.
+
+        Raises:
+            WriteLostError: The session was lost, or the batch took longer than LONGEST_WRITE_S and
+                ``timeout``.
+
+        """
+        if self._transport is None:
+            raise WriteLostError("not connected", [Lost.UNSENT] * len(writes))
+        outcomes = [""] * len(writes)
+        begun: list[BlockWrite] = []
+        try:
+            with self._close_on_error:
+                begun_ns = time.monotonic_ns()
+                end_ns = begun_ns + round(self.timeout_s * 1e9)
+                for wave in waves(self.db_number, self.pdu_size, writes, outcomes):
+                    begun.append(wave)
+                    self._window.add(wave, urgent=True)
+                    self._flush()
+                    self._finish_wave(wave, end_ns)
+                spent_ns = time.monotonic_ns() - begun_ns  # the writes delayed these answers
+                self._mode.deadline_ns += spent_ns
+                for read in self._under_way:
+                    read.deadline_ns += spent_ns
+        except ConnectorError as error:
+            raise WriteLostError(str(error), ends(outcomes, begun)) from None
+        return outcomes
+
+    def close(self) -> None:
+        """Close the socket, if open."""
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+        self._window = Window(0, self._window.reference)
+        self._under_way.clear()
+        self._idle.clear()
+        self._mode.lost()
+
+    # -- session -------------------------------------------------------------------------------------------------------
+
+    def _use(self, granted: pdu.Session, transport: Transport) -> None:
+        """Create the requests and buffers that all reads of this session use."""
+        jobs = min(granted.jobs, self.options.maxJobs or granted.jobs)
+        self._session = pdu.Session(granted.pdu_size, jobs)
+        self._window = Window(jobs, self._window.reference)
+        transport.reserve(jobs, granted.pdu_size + pdu.FRAME_OVERHEAD)
+        chunk = min(granted.pdu_size - pdu.READ_OVERHEAD, self.options.packetSize or self.size, self.size)
+        first = BlockRead(self.db_number, self.size, chunk)
+        depth = min(max(1, jobs // first.count), MAX_DEPTH)
+        self._idle = [first, *(BlockRead(self.db_number, self.size, chunk) for _ in range(depth - 1))]
+
+    # -- requests and answers ------------------------------------------------------------------------------------------
+
+    def _ask_mode(self) -> None:
+        """Queue a mode query if one is due; TimeoutError if the answer to the last one is late."""
+        now_ns = time.monotonic_ns()
+        if not self._mode.complete:  # after a long period the answer may be in the socket
+            self._advance(self._mode, now_ns)
+        if self._mode.due(now_ns):
+            self._mode.begin(now_ns, now_ns + self._timeout_ns)
+            self._window.add(self._mode)
+        elif self._mode.overdue(now_ns):
+            raise TimeoutError
+
+    def _flush(self) -> None:
+        """Send the requests that may be sent."""
+        assert self._transport is not None  # noqa: S101 - for the type checker
+        if self._window.waiting and (requests := self._window.due()):
+            try:
+                self._transport.send(requests, time.monotonic_ns() + self._timeout_ns)
+            except OSError:
+                if not self._transport.taken:
+                    self._window.take_back()
+                raise
+
+    def _advance(self, operation: Operation, until_ns: int) -> bool:
+        """Send and receive until the operation is complete.
+
+        Return False if it is not by ``until_ns``.
+        """
+        while not operation.complete:
+            if self._step(until_ns) is None:
+                return False
+            if not operation.complete and time.monotonic_ns() >= until_ns:
+                return False
+        return True
+
+    def _step(self, until_ns: int) -> int | None:
+        """Receive once, then send what may be sent.
+
+        Returns:
+            The number of answers; None if nothing came until ``until_ns``.
+
+        """
+        transport, window = self._transport, self._window
+        assert transport is not None  # noqa: S101 - for the type checker
+        if not transport.receive(until_ns):
+            return None
+        answers = 0
+        while (frame := transport.frame()) is not None:
+            window.accept(frame)
+            answers += 1
+        if window.idle and transport.left:
+            raise ConnectorError("unexpected bytes after the last answer")
+        self._flush()
+        return answers
+
+    def _finish(self, operation: Operation, deadline_ns: int) -> None:
+        if not self._advance(operation, deadline_ns):
+            raise TimeoutError
+
+    def _finish_wave(self, wave: BlockWrite, end_ns: int) -> None:
+        """Wait for all jobs of a wave: ``timeout`` between answers, until ``end_ns`` at most."""
+        deadline_ns = time.monotonic_ns() + self._timeout_ns
+        while not wave.complete:
+            answers = self._step(min(deadline_ns, end_ns))
+            now_ns = time.monotonic_ns()
+            if answers:
+                deadline_ns = now_ns + self._timeout_ns
+            if now_ns >= deadline_ns:
+                raise TimeoutError
+            if now_ns >= end_ns and not wave.complete:
+                raise ConnectorError(
+                    f"{self.options.peer} has not served all writes of a cycle within {self.timeout_s:g} s: write less "
+                    "at once"
+                )
+
+    def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:
+        """If the block is too short, probe its real length, and return a refusal that names it."""
+        if refusal.code != OUT_OF_RANGE:
+            return refusal
+        probe = SizeProbe(self.db_number, self.size, self.pdu_size)
+        try:
+            while probe.found is None:
+                probe.begin()
+                self._window.add(probe, urgent=True)
+                self._flush()
+                self._finish(probe, deadline_ns)
+        except (ConnectorError, OSError, EOFError):
+            return refusal
+        return RefusedError(explain_size(self.db_number, self.size, probe.found), OUT_OF_RANGE)
+
+
+class S7Connector(S7Client, Connector):
+    """The client of the data block that a layout describes."""
 
     Options = S7Options
     can_write = True
@@ -29,50 +423,53 @@ class S7Connector(Connector):
             )
         if layout.byte_order != "big":
             raise ConfigError(f"layout: {layout.name!r} is in little-endian byte order, a controller's block is not")
-        self._client = S7Client(options, number, layout.size)
-        self._timeout_s = max(options.timeout / 1000, LONGEST_WRITE_S)
-
-    @property
-    def timeout_s(self) -> float:
-        """The longer of ``timeout`` and the limit for a batch of writes, in s."""
-        return self._timeout_s
-
-    @property
-    def depth(self) -> int:
-        """Reads that may be in flight with the granted jobs."""
-        return self._client.depth
-
-    @property
-    def doubt(self) -> str:
-        """Why values may not change (the PLC is in STOP); empty if there is no reason."""
-        return self._client.doubt
-
-    def connect(self) -> None:
-        """Open a session."""
-        self._client.connect()
-
-    def read(self) -> bytes:
-        """Read the whole block."""
-        return self._client.read()
-
-    def submit(self) -> None:
-        """Request the whole block."""
-        self._client.submit()
-
-    def collect(self, until_ns: int) -> bytes | None:
-        """Wait for the block of the oldest ``submit``."""
-        return self._client.collect(until_ns)
-
-    def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write bytes and single bits, in this order."""
-        return self._client.write(writes)
-
-    def close(self) -> None:
-        """Drop the session."""
-        self._client.close()
+        super().__init__(options, number, layout.size)
 
     def describe(self) -> str:
         """Return peer and session parameters as granted."""
-        client = self._client
-        granted = f"pdu={client.pdu_size} jobs={client.jobs} depth={client.depth}"
-        return f"to {client.options.peer} DB{client.db_number} {granted}"
+        return f"to {self.options.peer} DB{self.db_number} pdu={self.pdu_size} jobs={self.jobs} depth={self.depth}"
+
+
+# -- errors of the connection ------------------------------------------------------------------------------------------
+
+
+def _named(error: BaseException, options: S7Options, *, opening: bool = False) -> ConnectorError | None:
+    """Return a ConnectorError that explains a connection's error; None for other errors."""
+    peer = options.peer
+    if isinstance(error, TimeoutError):
+        return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
+    if isinstance(error, ConnectionRefusedError):
+        return ConnectorError(f"connection refused by {peer}")
+    if isinstance(error, (EOFError, ConnectionError)):
+        text = f"{peer} closed the connection"
+        if opening:
+            text += (
+                f" during set-up: rack {options.rack}, slot {options.cpu_slot} may be wrong, all its connections in "
+                "use, or it is not an S7 controller"
+            )
+        return ConnectorError(text)
+    if isinstance(error, socket.gaierror):
+        return ConnectorError(f"host name {options.host!r} cannot be resolved: {error.strerror}")
+    if isinstance(error, OSError):
+        return ConnectorError(f"{peer} cannot be reached: {error.strerror or error}")
+    return None
+
+
+class _CloseOnError:
+    """Context manager that closes a connection on any error, and explains the error."""
+
+    def __init__(self, close: Callable[[], None], options: S7Options, *, opening: bool = False) -> None:
+        self._close = close
+        self._options = options
+        self._opening = opening
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if error is not None:
+            self._close()
+            if (clear := _named(error, self._options, opening=self._opening)) is not None:
+                raise clear from None

@@ -1,16 +1,20 @@
-"""The TCP connection to a controller: whole frames, every wait bounded by a deadline."""
+"""The TCP connection to a controller, and the window of requests in flight on it.
+
+Every wait is bounded by a deadline. Reads of the block, writes and the mode query share the
+connection and the jobs that the controller granted. Every request has its own reference, and each
+answer is taken once by the operation that asked, or not at all.
+"""
 
 from __future__ import annotations
 
 import select
 import socket
 import time
-from collections.abc import Callable
+from collections import deque
 from contextlib import suppress
-from types import TracebackType
+from typing import Protocol
 
 from shmio.connectors.s7 import pdu
-from shmio.connectors.s7.options import S7Options
 from shmio.errors import ConnectorError
 
 
@@ -122,43 +126,89 @@ def _left_s(until_ns: int) -> float:
     return max(0, until_ns - time.monotonic_ns()) / 1e9
 
 
-def named(error: BaseException, options: S7Options, *, opening: bool = False) -> ConnectorError | None:
-    """Return a ConnectorError that explains a connection's error; None for other errors."""
-    peer = options.peer
-    if isinstance(error, TimeoutError):
-        return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
-    if isinstance(error, ConnectionRefusedError):
-        return ConnectorError(f"connection refused by {peer}")
-    if isinstance(error, (EOFError, ConnectionError)):
-        text = f"{peer} closed the connection"
-        if opening:
-            text += (
-                f" during set-up: rack {options.rack}, slot {options.cpu_slot} may be wrong, all its connections in "
-                "use, or it is not an S7 controller"
-            )
-        return ConnectorError(text)
-    if isinstance(error, socket.gaierror):
-        return ConnectorError(f"host name {options.host!r} cannot be resolved: {error.strerror}")
-    if isinstance(error, OSError):
-        return ConnectorError(f"{peer} cannot be reached: {error.strerror or error}")
-    return None
+class Operation(Protocol):
+    """A group of requests with a common result."""
+
+    @property
+    def count(self) -> int:
+        """Number of requests in all."""
+
+    sent: int
+    """Number of requests that ``take`` has returned."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether no more answers are expected."""
+
+    def take(self, count: int, first: int) -> bytes | memoryview:
+        """Return the next ``count`` requests as frames, with references from ``first`` on.
+
+        References have 16 bits and wrap.
+        """
+
+    def accept(self, index: int, frame: memoryview) -> None:
+        """Take the answer to request ``index``; ConnectorError if it does not match."""
 
 
-class CloseOnError:
-    """Context manager that closes a connection on any error, and explains the error."""
+class Window:
+    """Keeps at most ``jobs`` requests in flight, and matches answers to them. No I/O.
 
-    def __init__(self, close: Callable[[], None], options: S7Options, *, opening: bool = False) -> None:
-        self._close = close
-        self._options = options
-        self._opening = opening
+    References count from ``reference`` and wrap after 65535.
+    """
 
-    def __enter__(self) -> None:
-        pass
+    def __init__(self, jobs: int, reference: int) -> None:
+        self.jobs = jobs
+        self.reference = reference
+        self._queue: deque[Operation] = deque()
+        self._under_way: dict[int, tuple[Operation, int]] = {}
+        self._given: list[tuple[Operation, int]] = []  # from the last ``due``: operations, each with its first request
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if error is not None:
-            self._close()
-            if (clear := named(error, self._options, opening=self._opening)) is not None:
-                raise clear from None
+    @property
+    def idle(self) -> bool:
+        """Whether no answer is outstanding."""
+        return not self._under_way
+
+    @property
+    def waiting(self) -> bool:
+        """Whether requests wait to be sent."""
+        return bool(self._queue)
+
+    def add(self, operation: Operation, *, urgent: bool = False) -> None:
+        """Queue the requests of an operation, before all others if ``urgent``."""
+        if urgent:
+            self._queue.appendleft(operation)
+        else:
+            self._queue.append(operation)
+
+    def due(self) -> bytes | memoryview:
+        """Return the requests that may be sent now; empty if there are none."""
+        parts: list[bytes | memoryview] = []
+        self._given.clear()
+        while self._queue and (free := self.jobs - len(self._under_way)) > 0:
+            operation = self._queue[0]
+            begin = operation.sent
+            self._given.append((operation, begin))
+            parts.append(operation.take(min(free, operation.count - begin), self.reference))
+            for index in range(begin, operation.sent):
+                self._under_way[self.reference] = operation, index
+                self.reference = (self.reference + 1) & 0xFFFF
+            if operation.sent == operation.count:
+                self._queue.popleft()
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def take_back(self) -> None:
+        """Mark the requests that ``due`` returned last as unsent.
+
+        Call it when the connection was lost.
+        """
+        for operation, begin in self._given:
+            operation.sent = begin
+
+    def accept(self, frame: memoryview) -> None:
+        """Pass an answer to the operation that asked; ConnectorError if none did."""
+        reference = pdu.reference_of(frame)
+        owner = self._under_way.pop(reference, None)
+        if owner is None:
+            pdu.check_answer(frame)  # a clearer reason, if it is not even an answer
+            raise ConnectorError(f"answer to a request that is not under way (reference {reference})")
+        owner[0].accept(owner[1], frame)

@@ -10,9 +10,7 @@ import time
 import pytest
 
 from shmio.connectors.base import Lost, WriteLostError
-from shmio.connectors.s7.client import S7Client
-from shmio.connectors.s7.connector import S7Connector
-from shmio.connectors.s7.options import S7Options
+from shmio.connectors.s7.connector import S7Client, S7Connector, S7Options
 from shmio.emulators.s7_jobs import Fault, Traits
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
@@ -46,7 +44,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr("shmio.connectors.s7.client.time", made)
+    monkeypatch.setattr("shmio.connectors.s7.connector.time", made)
     monkeypatch.setattr("shmio.connectors.s7.transport.time", made)
     return made
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.s7 import pdu
-from shmio.connectors.s7.block_read import BlockRead
+from shmio.connectors.s7.blocks import BlockRead
 from shmio.errors import ConnectorError
 
 

@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from shmio.connectors.s7.window import Window
+from shmio.connectors.s7.transport import Window
 from shmio.errors import ConnectorError
 
 

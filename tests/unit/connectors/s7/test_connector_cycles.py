@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from shmio.connectors.s7.client import S7Client
+from shmio.connectors.s7.connector import S7Client
 from shmio.emulators.s7_jobs import Traits
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write

@@ -1,0 +1,339 @@
+"""Reads and writes a whole block by several requests in flight, or finds how long it is. No I/O.
+
+Each operation makes its requests (``take``), and checks the answers (``accept``). ``transport``
+sends and receives them. Round trips take nearly all the time of a cycle, so it keeps as many
+requests in flight as the controller granted.
+"""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_right, insort
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+from shmio.connectors.base import Lost
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_read, explain_write
+from shmio.errors import ConnectorError
+from shmio.layout.values.write import Write
+
+MAX_ITEMS = 20  # per job; all known controllers take as many
+JOB_OVERHEAD = 12  # of a request within its PDU: header 10, parameters 2
+ITEM_OVERHEAD = 16  # address 12, head of the value 4
+_MOST_PROBED = 19  # items per job; request and answer fit the smallest known PDU, 240 bytes
+_REFERENCE = struct.Struct(">H")
+_ITEM_HEAD = struct.Struct(">BBH")  # return code (in a request reserved), transport size, length
+_SIZE_BIT, _SIZE_BITS = 0x03, 0x04  # transport sizes: a single bit; bytes, whose length counts bits
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
+class BlockRead:
+    """The requests that read a block, and the image that the answers make.
+
+    It is reused for later reads.
+    """
+
+    def __init__(self, db_number: int, size: int, chunk: int) -> None:
+        """Plan reads of at most ``chunk`` bytes."""
+        self._db_number = db_number
+        self._size = size
+        self._chunk = chunk
+        starts = range(0, size, chunk)
+        self._requests = bytearray().join(
+            pdu.read_request(0, [pdu.address(db_number, 8 * start, min(chunk, size - start))]) for start in starts
+        )
+        self._requests_view = memoryview(self._requests)
+        self._block = bytearray(size)
+        self._block_view = memoryview(self._block)
+        self.count = len(starts)
+        self.begin(0)
+
+    def begin(self, deadline_ns: int) -> None:
+        """Start a read that must be complete by ``deadline_ns``."""
+        self.deadline_ns = deadline_ns
+        self.refusal: RefusedError | None = None
+        """Why the controller refused the block; there is no image then."""
+        self.sent = self._answered = 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether every part of the block has come, or the block was refused."""
+        return self._answered == self.count or self.refusal is not None
+
+    @property
+    def data(self) -> bytes:
+        """A copy of the block.
+
+        It is consistent only if the read is complete and was not refused.
+        """
+        return bytes(self._block)
+
+    def take(self, count: int, first: int) -> memoryview:
+        """Return the next requests, with references from ``first`` on (16 bits, wrapping)."""
+        size = pdu.READ_REQUEST_SIZE
+        begin, self.sent = self.sent, self.sent + count
+        for place in range(count):
+            offset = (begin + place) * size + pdu.REFERENCE_OFFSET
+            _REFERENCE.pack_into(self._requests, offset, (first + place) & 0xFFFF)
+        return self._requests_view[begin * size : self.sent * size]
+
+    def accept(self, index: int, frame: memoryview) -> None:
+        """Take the answer to request ``index``, in any order.
+
+        ConnectorError if it does not match.
+        """
+        try:
+            answer = pdu.parse_read_answer(frame)
+            if answer.code != ITEM_OK:
+                raise RefusedError(explain_read(answer.code, self._db_number, self._size), answer.code)
+        except RefusedError as refusal:
+            self.refusal = refusal
+            return
+        start = index * self._chunk
+        due = min(self._chunk, self._size - start)
+        if len(answer.data) != due:
+            raise ConnectorError(f"answer has {len(answer.data)} bytes of data, {due} were asked for")
+        self._block_view[start : start + due] = answer.data
+        self._answered += 1
+
+
+# -- writing -----------------------------------------------------------------------------------------------------------
+
+
+def byte_item(db_number: int, start: int, data: bytes) -> tuple[bytes, bytes]:
+    """Encode the address and value of bytes."""
+    return pdu.address(db_number, 8 * start, len(data)), _ITEM_HEAD.pack(0, _SIZE_BITS, 8 * len(data)) + data
+
+
+def bit_item(db_number: int, start: int, bit: int, value: bool) -> tuple[bytes, bytes]:
+    """Encode the address and value of a single bit.
+
+    The write leaves the other bits of its byte alone.
+    """
+    return pdu.address(db_number, 8 * start + bit, 1, pdu.TYPE_BIT), _ITEM_HEAD.pack(0, _SIZE_BIT, 1) + bytes((value,))
+
+
+def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes:
+    """Build a job that writes these items from ``byte_item`` and ``bit_item``."""
+    parameters = bytes((pdu.WRITE, len(items))) + b"".join(address for address, _ in items)
+    values = b"".join(value + b"\0" * (len(value) & 1) for _, value in items[:-1]) + items[-1][1]
+    return pdu.request(reference, parameters, values)
+
+
+def parse_write_answer(frame: memoryview, count: int) -> bytes:
+    """Return the codes of ``count`` written items; RefusedError if the whole job was refused."""
+    data_length = pdu.check_answer(frame)
+    codes = frame[pdu.HEADER_END + 2 :]
+    if len(frame) < pdu.HEADER_END + 2 or len(codes) != data_length or frame[pdu.HEADER_END] != pdu.WRITE:
+        raise ConnectorError("not an answer to a write")
+    if frame[pdu.HEADER_END + 1] != count or data_length != count:
+        raise ConnectorError(f"answer with {data_length} return codes, {count} items were written")
+    return bytes(codes)
+
+
+class _Item(NamedTuple):
+    write: int
+    """Index of the write that it belongs to."""
+    last: int
+    """The last byte that it touches."""
+    encoded: tuple[bytes, bytes]
+
+
+class BlockWrite:
+    """One wave of writes: jobs that may all be in flight. It puts refusals into ``outcomes``.
+
+    Items fill the jobs in the order of the writes, and the jobs are sent in that order.
+    """
+
+    def __init__(self, db_number: int, pdu_size: int, items: Sequence[_Item], outcomes: list[str]) -> None:
+        self._db_number = db_number
+        self._outcomes = outcomes
+        self._jobs = list(_fill(items, pdu_size))
+        self.count = len(self._jobs)
+        self.sent = 0
+        self._answered: set[int] = set()
+
+    @property
+    def complete(self) -> bool:
+        """Whether every job was answered."""
+        return len(self._answered) == self.count
+
+    def take(self, count: int, first: int) -> bytes:
+        """Return the next requests, with references from ``first`` on (16 bits, wrapping)."""
+        begin, self.sent = self.sent, self.sent + count
+        return b"".join(
+            write_request((first + place) & 0xFFFF, [item.encoded for item in job])
+            for place, job in enumerate(self._jobs[begin : self.sent])
+        )
+
+    def accept(self, index: int, frame: memoryview) -> None:
+        """Take the answer to request ``index``; ConnectorError if it does not match."""
+        job = self._jobs[index]
+        try:
+            codes = parse_write_answer(frame, len(job))
+        except RefusedError as refusal:
+            for item in job:
+                self._refuse(item, str(refusal))
+        else:
+            for item, code in zip(job, codes, strict=True):
+                if code != ITEM_OK:
+                    self._refuse(item, explain_write(code, self._db_number, item.last))
+        self._answered.add(index)
+
+    def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
+        """Yield the write's index for each item, and what is known of it without an answer."""
+        for index, job in enumerate(self._jobs):
+            known = None if index in self._answered else Lost.UNKNOWN if index < self.sent else Lost.UNSENT
+            for item in job:
+                yield item.write, known
+
+    def _refuse(self, item: _Item, reason: str) -> None:
+        self._outcomes[item.write] = self._outcomes[item.write] or reason
+
+
+def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
+    """Cut a batch into waves, in order. Refusals go into ``outcomes``, one text per write.
+
+    The controller may serve jobs in flight in any order. So writes that touch the same bits are in
+    different waves, and each wave is confirmed before the next is sent.
+    """
+    wave: list[_Item] = []
+    spans: list[tuple[int, int]] = []  # of bits of the block that the wave touches, in order
+    for place, write in enumerate(writes):
+        span = _span(write)
+        if wave and _touches(spans, span):
+            yield BlockWrite(db_number, pdu_size, wave, outcomes)
+            wave, spans = [], []
+        insort(spans, span)
+        wave += _items(db_number, pdu_size, place, write)
+    if wave:
+        yield BlockWrite(db_number, pdu_size, wave, outcomes)
+
+
+def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
+    """Return what is known of each write after the session was lost in a wave of ``begun``."""
+    parts: list[set[Lost | None]] = [set() for _ in outcomes]
+    for wave in begun:
+        for write, known in wave.unanswered():
+            parts[write].add(known)
+    return [_end(text, known) for text, known in zip(outcomes, parts, strict=True)]
+
+
+def _end(text: str, parts: set[Lost | None]) -> str | Lost:
+    if Lost.UNKNOWN in parts:
+        return Lost.UNKNOWN
+    if not text and None in parts and Lost.UNSENT in parts:  # partly written
+        return Lost.UNKNOWN
+    return text if None in parts else Lost.UNSENT
+
+
+def _span(write: Write) -> tuple[int, int]:
+    if write.mask:
+        bit = 8 * write.offset + write.mask.bit_length() - 1
+        return bit, bit + 1
+    return 8 * write.offset, 8 * (write.offset + len(write.data))
+
+
+def _touches(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
+    """Return whether a span overlaps any of these, which are disjoint and sorted."""
+    after = bisect_right(spans, span)
+    return (after > 0 and spans[after - 1][1] > span[0]) or (after < len(spans) and spans[after][0] < span[1])
+
+
+def _items(db_number: int, pdu_size: int, place: int, write: Write) -> Iterator[_Item]:
+    if write.mask:
+        bit = write.mask.bit_length() - 1
+        value = bool(write.data[0] & write.mask)
+        yield _Item(place, write.offset, bit_item(db_number, write.offset, bit, value))
+        return
+    most = pdu_size - JOB_OVERHEAD - ITEM_OVERHEAD
+    for start in range(0, len(write.data), most):
+        data = write.data[start : start + most]
+        offset = write.offset + start
+        yield _Item(place, offset + len(data) - 1, byte_item(db_number, offset, data))
+
+
+def _fill(items: Sequence[_Item], pdu_size: int) -> Iterator[list[_Item]]:
+    """Put as many items into each job as its PDU holds, in order."""
+    job: list[_Item] = []
+    size = JOB_OVERHEAD
+    for item in items:
+        address, value = item.encoded
+        size += size & 1  # values begin at even places
+        if job and (size + len(address) + len(value) > pdu_size or len(job) == MAX_ITEMS):
+            yield job
+            job, size = [], JOB_OVERHEAD
+        job.append(item)
+        size += len(address) + len(value)
+    if job:
+        yield job
+
+
+# -- measuring ---------------------------------------------------------------------------------------------------------
+
+
+class SizeProbe:
+    """Finds the real length of a block whose end cannot be read.
+
+    Each job narrows the range by a factor of twenty.
+    """
+
+    count = 1
+
+    def __init__(self, db_number: int, size: int, pdu_size: int) -> None:
+        """Search below ``size``, whose last byte is known to be missing."""
+        self._db_number = db_number
+        self._most = max(1, min(_MOST_PROBED, (pdu_size - 14) // 12))
+        self._low, self._high = 0, size - 1  # the range of the first missing byte, both ends included
+
+    def begin(self) -> None:
+        """Plan the next job."""
+        step = -(-(self._high - self._low + 1) // (self._most + 1))
+        self._tried = list(range(self._low + step - 1, self._high, step))[: self._most]
+        self.sent = 0
+        self.complete = False
+
+    @property
+    def found(self) -> int | None:
+        """Number of bytes that can be read; None while another job is needed."""
+        return self._low if self._low == self._high else None
+
+    def take(self, count: int, first: int) -> bytes:
+        """Return the request."""
+        self.sent = count
+        return pdu.read_request(first & 0xFFFF, [pdu.address(self._db_number, 8 * at, 1) for at in self._tried])
+
+    def accept(self, index: int, frame: memoryview) -> None:  # noqa: ARG002 - there is one request
+        """Take the answer; ConnectorError if it does not match these items."""
+        readable = parse_readable(frame, len(self._tried))
+        for at, good in zip(self._tried, readable, strict=True):
+            if not good:
+                self._high = at
+                break
+            self._low = at + 1
+        self.complete = True
+
+
+def parse_readable(frame: memoryview, count: int) -> list[bool]:
+    """Return which of ``count`` single bytes could be read.
+
+    RefusedError if the whole job was refused.
+    """
+    pdu.check_answer(frame)
+    if bytes(frame[pdu.HEADER_END : pdu.HEADER_END + 2]) != bytes((pdu.READ, count)):
+        raise ConnectorError(f"not an answer to a read of {count} items")
+    readable = []
+    at = pdu.HEADER_END + 2
+    for place in range(count):
+        if at + 4 > len(frame):
+            raise ConnectorError(f"answer that ends before item {place + 1} of {count}")
+        code, _, _ = _ITEM_HEAD.unpack_from(frame, at)
+        good = code == ITEM_OK
+        readable.append(good)
+        at += 6 if good else 4  # one byte, and one that makes it even
+    if at - len(frame) not in {0, 1}:  # after the last item, none is needed
+        raise ConnectorError(f"answer of {len(frame)} bytes, {at} belong to its items")
+    return readable
