@@ -14,8 +14,8 @@
     factor = "-" factor | number | "true" | "false" | register | "(" expression ")"
            | ("abs" | "rising" | "falling" | "changed") "(" expression ")"
 
-A register is a path, in quotes where it has other characters than letters, digits and ``_ . / % :``; as a path may hold
-``/``, a division has blanks around its own. Numbers are as in S7: ``16#FF``, ``2#1010``, ``1.5e3``.
+A register is a path. Put it in quotes if it has other characters than letters, digits and ``_ . / % :``. A path may
+contain ``/``, so put blanks around the ``/`` of a division. Numbers are as in S7: ``16#FF``, ``2#1010``, ``1.5e3``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ _TOKEN: Final = re.compile(
     re.VERBOSE,
 )
 _KEYWORDS: Final = frozenset({"and", "or", "not", "mod", "true", "false", "abs", "rising", "falling", "changed"})
-_COMPARISONS: Final[dict[str, Callable[[Number, Number], Number]]] = {
+_Operators = dict[str, Callable[[Number, Number], Number]]
+_DISJUNCTION: Final[_Operators] = {"or": lambda left, right: bool(left) or bool(right)}
+_CONJUNCTION: Final[_Operators] = {"and": lambda left, right: bool(left) and bool(right)}
+_COMPARISONS: Final[_Operators] = {
     "==": operator.eq,
     "=": operator.eq,
     "!=": operator.ne,
@@ -53,8 +56,8 @@ _COMPARISONS: Final[dict[str, Callable[[Number, Number], Number]]] = {
     ">": operator.gt,
     ">=": operator.ge,
 }
-_SUMS: Final[dict[str, Callable[[Number, Number], Number]]] = {"+": operator.add, "-": operator.sub}
-_PRODUCTS: Final[dict[str, Callable[[Number, Number], Number]]] = {
+_SUMS: Final[_Operators] = {"+": operator.add, "-": operator.sub}
+_PRODUCTS: Final[_Operators] = {
     "*": operator.mul,
     "/": operator.truediv,
     "mod": operator.mod,
@@ -167,19 +170,20 @@ class _Parser:
             raise ConfigError(f"a condition has at most {MAX_NODES} parts")
         self._steps.append(step)
 
-    def _either(self) -> None:
-        self._both()
-        while self._is("or"):
+    def _chain(self, operand: Callable[[], None], operators: _Operators) -> None:
+        """Read operands and the operators between them, which bind to the left."""
+        operand()
+        while self._is(*operators):
+            function = operators[self._word]
             self._advance()
-            self._both()
-            self._emit(_two(_or))
+            operand()
+            self._emit(_two(function))
+
+    def _either(self) -> None:
+        self._chain(self._both, _DISJUNCTION)
 
     def _both(self) -> None:
-        self._negation()
-        while self._is("and"):
-            self._advance()
-            self._negation()
-            self._emit(_two(_and))
+        self._chain(self._negation, _CONJUNCTION)
 
     def _negation(self) -> None:
         if not self._is("not"):
@@ -198,20 +202,10 @@ class _Parser:
             self._emit(_two(compare))
 
     def _sum(self) -> None:
-        self._product()
-        while self._is(*_SUMS):
-            step = _SUMS[self._word]
-            self._advance()
-            self._product()
-            self._emit(_two(step))
+        self._chain(self._product, _SUMS)
 
     def _product(self) -> None:
-        self._factor()
-        while self._is(*_PRODUCTS):
-            step = _PRODUCTS[self._word]
-            self._advance()
-            self._factor()
-            self._emit(_two(step))
+        self._chain(self._factor, _PRODUCTS)
 
     def _nested(self, read: Callable[[], None]) -> None:
         if self._depth == MAX_DEPTH:
@@ -299,11 +293,3 @@ def _edge(function: Callable[[Number, Number], bool], place: int) -> _Step:
         seen[place] = now
 
     return step
-
-
-def _or(left: Number, right: Number) -> bool:
-    return bool(left) or bool(right)
-
-
-def _and(left: Number, right: Number) -> bool:
-    return bool(left) and bool(right)

@@ -1,24 +1,143 @@
 """The operations of declared injections: the table in docs/reference/injections.md.
 
-An operation works on images of the whole block, (size,) of uint8. Its state starts anew with each
-activation, and applying it twice in a cycle gives the same result.
+An operation works on images of the whole block, (size,) of uint8, in which a ``ValueGroup`` reads
+and writes all values of one type at once. Its state starts anew with each activation, and applying
+it twice in a cycle gives the same result.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from shmio.injection.draw import SeededRandom
-from shmio.injection.numbers import Bytes, Change, ValueGroup
+from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
+from shmio.layout.values.codec import REAL_MAX, scalar_codec
 
+Bytes = npt.NDArray[np.uint8]
+Values = npt.NDArray[Any]
+_MAX_ELEMENTS: Final = 4096
+"""Most single values of one injection; more would slow the poll loop."""
 MAX_DELAY_CYCLES: Final = 10_000
 MAX_DELAY_BYTES: Final = 16_000_000
 """Most memory for the images that one delay holds."""
+_REAL_LIMIT: Final = float(np.float32(REAL_MAX))
+_NUMPY: Final = {
+    "b": "i1", "B": "u1", "h": "i2", "H": "u2", "i": "i4", "I": "u4", "q": "i8", "Q": "u8", "f": "f4", "d": "f8",
+}  # fmt: skip
+
+
+# -- values --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ValueGroup:
+    """All single values of one type.
+
+    ``first`` is the number of the first among those of the injection.
+    """
+
+    element: ElementType
+    first: int
+    index: npt.NDArray[np.intp]
+    """Offsets of the values' bytes in the block, (n, size); for bits (n,)."""
+    shifts: Bytes
+    """For bits, the bit number within the byte, (n,)."""
+    dtype: np.dtype[Any]
+    """The type as in the controller; of kind V if it is not a number."""
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @cached_property
+    def limits(self) -> tuple[Any, Any]:
+        """The least and the greatest number, in the type used for calculations."""
+        if self.dtype.kind == "f":
+            most = _REAL_LIMIT if self.dtype.itemsize == 4 else float(np.finfo(np.float64).max)
+            return -most, most
+        bounds, exact = np.iinfo(self.dtype), np.longdouble if self.dtype.itemsize == 8 else np.float64
+        return exact(bounds.min), exact(bounds.max)
+
+    def numbers(self, image: Bytes) -> Values:
+        """Return the values, 64-bit ones as long doubles because a double would lose digits."""
+        exact = np.longdouble if self.dtype.kind in "iu" and self.dtype.itemsize == 8 else np.float64
+        return np.ascontiguousarray(image[self.index]).view(self.dtype)[:, 0].astype(exact)
+
+    def put_numbers(self, image: Bytes, values: Values) -> None:
+        """Put numbers into an image, rounded for integers and clamped to the range of the type."""
+        least, most = self.limits
+        if self.dtype.kind != "f":
+            values = np.rint(values)
+            if self.dtype.itemsize == 8:  # its limits are not exact as doubles
+                values = values.astype(np.longdouble)
+        fitting = np.minimum(np.maximum(values, least), most).astype(self.dtype)
+        image[self.index] = fitting.view(np.uint8).reshape(self.index.shape)
+
+    def put(self, image: Bytes, table: Bytes, choice: npt.NDArray[np.intp]) -> None:
+        """Put values of a table (k, size) into an image; ``choice`` (n,) selects a row for each element.
+
+        Bits are 0 or 1.
+        """
+        if self.element.base != "BOOL":
+            image[self.index] = table[choice]
+            return
+        on, off = self._masks(table[choice, 0] != 0)
+        np.bitwise_or.at(image, self.index, on)
+        np.bitwise_and.at(image, self.index, ~off)
+
+    def _masks(self, set_bits: npt.NDArray[np.bool_]) -> tuple[Bytes, Bytes]:
+        bits = (np.uint8(1) << self.shifts).astype(np.uint8)
+        return np.where(set_bits, bits, np.uint8(0)), np.where(set_bits, np.uint8(0), bits)
+
+
+_Change = Callable[[ValueGroup, Values], Values]
+"""Computes new values from the old ones."""
+
+
+def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGroup]:
+    """Return the single values of registers and arrays, grouped by type.
+
+    Raises:
+        ValueError: There are more than _MAX_ELEMENTS.
+
+    """
+    found: dict[ElementType, list[tuple[int, int]]] = {}
+    count = 0
+    for register in registers:
+        count += register.count
+        if count > _MAX_ELEMENTS:
+            raise ValueError(f"more than {_MAX_ELEMENTS} single values: name fewer")
+        element, into = register.element, found.setdefault(register.element, [])
+        if element.base == "BOOL":
+            into += [(register.offset + byte, bit) for byte, bit in bit_positions(register)]
+        else:
+            into += [(register.offset + flat * element.stride, 0) for flat in range(register.count)]
+    groups = []
+    first = 0
+    for element, at in found.items():
+        starts = np.array([byte for byte, _ in at], dtype=np.intp)
+        shifts = np.array([bit for _, bit in at], dtype=np.uint8)
+        index = starts if element.base == "BOOL" else starts[:, None] + np.arange(element.size)
+        groups.append(ValueGroup(element, first, index, shifts, _number_type(element, byte_order)))
+        first += len(at)
+    return groups
+
+
+def _number_type(element: ElementType, byte_order: ByteOrder) -> np.dtype[Any]:
+    """Return the numpy type of a number as in the controller; of kind V if it is not a number."""
+    plain = "" if element.base == "BOOL" else scalar_codec(element, byte_order).plain
+    kind = _NUMPY.get(plain, f"V{element.size}")
+    return np.dtype(("<" if byte_order == "little" else ">") + kind)
+
+
+# -- operations ----------------------------------------------------------------------------------------------
 
 
 class OperationContext(NamedTuple):
@@ -41,7 +160,7 @@ class Operation(ABC):
 
     @abstractmethod
     def apply(self, image: Bytes, at: OperationContext) -> None:
-        """Change the image in place. The caller keeps only the covered bits."""
+        """_Change the image in place. The caller keeps only the covered bits."""
 
     def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most need not know
         """Called instead of :meth:`apply` if by chance this image stays unchanged."""
@@ -63,7 +182,7 @@ class Fixed(Operation):
 class Arithmetic(Operation):
     """``offset``, ``scale``, ``clamp``: new numbers from the old ones."""
 
-    def __init__(self, places: Sequence[ValueGroup], change: Change) -> None:
+    def __init__(self, places: Sequence[ValueGroup], change: _Change) -> None:
         self._places = places
         self._change = change
 

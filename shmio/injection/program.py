@@ -1,11 +1,11 @@
-"""Compiles declarations: finds registers, encodes values and parses conditions."""
+"""Compiles declarations: finds the registers of targets and conditions, and encodes values."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -14,11 +14,11 @@ from shmio.errors import ConfigError, PathError, ValueRangeError
 from shmio.injection.activation import Window
 from shmio.injection.draw import SeededRandom
 from shmio.injection.expression import Expression, parse
-from shmio.injection.numbers import Bytes, ValueGroup, Values, places
 from shmio.injection.operations import (
     MAX_DELAY_BYTES,
     MAX_DELAY_CYCLES,
     Arithmetic,
+    Bytes,
     Delay,
     Drop,
     Fixed,
@@ -28,19 +28,33 @@ from shmio.injection.operations import (
     Operation,
     RandomChoice,
     RandomRange,
+    ValueGroup,
+    Values,
+    places,
 )
-from shmio.injection.target import Target, resolve, single
 from shmio.layout.model import INTEGERS, ElementType, Layout, Register
-from shmio.layout.topic import Direction
+from shmio.layout.topic import Direction, look_up, parse_topic
 from shmio.layout.values.codec import RegisterCodec, codec, scalar_codec
 from shmio.layout.values.literal import parse_literal
 from shmio.layout.values.text import from_text, wire_type
+from shmio.layout.values.write import bits_of, chosen
 
-NS: Final = 1_000_000_000
-MAX_REFERENCES: Final = 64
+_NS: Final = 1_000_000_000
+MAX_REGISTERS: Final = 4096
+"""Most registers and elements in one target."""
+_MAX_REFERENCES: Final = 64
 
-Operate = Callable[[SeededRandom], Operation]
+_Operate = Callable[[SeededRandom], Operation]
 """Creates the operation with its source of random numbers."""
+
+
+class Target(NamedTuple):
+    """Distinct registers of one source in one direction. ``cover`` has their bits in the block."""
+
+    source: str
+    direction: Direction
+    registers: tuple[Register, ...]
+    cover: bytes
 
 
 @dataclass(frozen=True)
@@ -64,7 +78,7 @@ class Program:
     cover: Bytes
     window: Window
     condition: Condition | None
-    operate: Operate
+    operate: _Operate
 
     @property
     def foreign(self) -> frozenset[str]:
@@ -111,8 +125,8 @@ def compile_condition(text: str, layouts: Mapping[str, Layout]) -> Condition:
     """
     try:
         expression = parse(text)
-        if len(expression.references) > MAX_REFERENCES:
-            raise ConfigError(f"a condition reads at most {MAX_REFERENCES} registers")
+        if len(expression.references) > _MAX_REFERENCES:
+            raise ConfigError(f"a condition reads at most {_MAX_REFERENCES} registers")
         return Condition(expression, tuple(_read(path, layouts) for path in expression.references))
     except (ConfigError, PathError) as error:
         raise ConfigError(f"when: {error}") from None
@@ -130,17 +144,93 @@ def _read(path: str, layouts: Mapping[str, Layout]) -> tuple[str, RegisterCodec]
 def _window(declaration: Declaration) -> Window:
     once = declaration.when is None and declaration.for_s is not None
     return Window(
-        round((declaration.start_s or 0) * NS),
-        None if declaration.end_s is None else round(declaration.end_s * NS),
-        None if declaration.for_s is None else round(declaration.for_s * NS),
+        round((declaration.start_s or 0) * _NS),
+        None if declaration.end_s is None else round(declaration.end_s * _NS),
+        None if declaration.for_s is None else round(declaration.for_s * _NS),
         1 if once else declaration.times,
     )
+
+
+# -- targets -------------------------------------------------------------------------------------------------
+
+
+def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
+    """Return the target that several texts name together.
+
+    A text is the path of a topic or a part of a register, a pattern, a structure or a whole source.
+
+    Raises:
+        PathError: There is no such register, more than one source or direction, an overlap, or too
+            many registers.
+
+    """
+    found: list[tuple[str, Direction, Register]] = []
+    for text in texts:
+        found += _registers(text, layouts)
+        if len(found) > MAX_REGISTERS:
+            raise PathError(
+                f"{text}: more than {MAX_REGISTERS} registers and elements: lay several injections over parts of it"
+            )
+    places = {(source, direction) for source, direction, _ in found}
+    if len(places) != 1:
+        named = ", ".join(sorted(f"{source} /{direction}" for source, direction in places))
+        raise PathError(f"an injection covers one direction of one source, but this covers {named}")
+    source, direction = places.pop()
+    cover = bytearray(layouts[source].size)
+    registers = []
+    for _, _, register in found:
+        bits = bits_of(register)
+        span = slice(register.offset, register.offset + register.size)
+        taken = [there & own for there, own in zip(cover[span], bits, strict=True)]
+        if taken == list(bits):
+            continue
+        if any(taken):
+            raise PathError(f"{source}/{register.path}: part of it is named twice")
+        cover[span] = bytes(there | own for there, own in zip(cover[span], bits, strict=True))
+        registers.append(register)
+    return Target(source, direction, tuple(registers), bytes(cover))
+
+
+def single(text: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
+    """Return the source and the single register, element or part that a text names.
+
+    PathError if there is none.
+    """
+    topic = parse_topic(text, layouts, _default(layouts))
+    if topic.direction == "in":
+        raise PathError(f"{text}: a condition reads outputs of a source; leave out /in")
+    return topic.source, look_up(_layout(topic.source, text, layouts), topic)
+
+
+def _registers(text: str, layouts: Mapping[str, Layout]) -> Iterator[tuple[str, Direction, Register]]:
+    topic = parse_topic(text, layouts, _default(layouts))
+    layout = _layout(topic.source, text, layouts)
+    direction: Direction = topic.direction or "out"
+    count = 0
+    for register in chosen(layout, topic.path or "**"):
+        yield topic.source, direction, register
+        count += 1
+        if count > MAX_REGISTERS:  # resolve() reports it
+            return
+    if not count:
+        look_up(layout, topic)  # its error suggests similar names
+        raise PathError(f"{text} names no register")
+
+
+def _default(layouts: Collection[str]) -> str | None:
+    return next(iter(layouts)) if len(layouts) == 1 else None
+
+
+def _layout(source: str, text: str, layouts: Mapping[str, Layout]) -> Layout:
+    if source not in layouts:
+        raise PathError(f"{text}: unknown source {source}")
+    return layouts[source]
 
 
 # -- operations --------------------------------------------------------------------------------------------------------
 
 
-def _set(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> Operate:
+def _set(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     image = bytearray(layout.size)
     for register in target.registers:
         _encode(declaration.value, "value", register, layout, image)
@@ -164,17 +254,17 @@ def _encode(value: Any, key: str, register: Register, layout: Layout, image: byt
         raise ConfigError(f"{key}: {register.path}: {str(error).removeprefix(f'{register.path}: ')}") from None
 
 
-def _offset(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> Operate:
+def _offset(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, by = _numbers(declaration, target, layout), _number(declaration.value, "value")
     return lambda _draw: Arithmetic(groups, lambda _places, values: values + by)
 
 
-def _scale(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> Operate:
+def _scale(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, by = _numbers(declaration, target, layout), _number(declaration.value, "value")
     return lambda _draw: Arithmetic(groups, lambda _places, values: values * by)
 
 
-def _clamp(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> Operate:
+def _clamp(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups = _numbers(declaration, target, layout)
     least = -math.inf if declaration.min is None else declaration.min
     most = math.inf if declaration.max is None else declaration.max
@@ -186,13 +276,13 @@ def _clamp(declaration: Declaration, target: Target, layout: Layout, _period_ns:
     return lambda _draw: Arithmetic(groups, clamp)
 
 
-def _noise(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> Operate:
+def _noise(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, amplitude = _numbers(declaration, target, layout), declaration.amplitude or 0.0
     gaussian = declaration.distribution == "gaussian"
     return lambda draw: Noise(groups, draw, amplitude, gaussian=gaussian)
 
 
-def _random(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> Operate:
+def _random(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     if declaration.values is not None:
         tables = [(group, _table(declaration.values, group.element, layout)) for group in _places(target, layout)]
         return lambda draw: RandomChoice(tables, draw)
@@ -217,15 +307,15 @@ def _table(values: list[Any], element: ElementType, layout: Layout) -> Bytes:
     return np.frombuffer(b"".join(rows), np.uint8).reshape(len(rows), element.size)
 
 
-def _freeze(_declaration: Declaration, _target: Target, _layout: Layout, _period_ns: int) -> Operate:
+def _freeze(_declaration: Declaration, _target: Target, _layout: Layout, _period_ns: int) -> _Operate:
     return lambda _draw: Freeze()
 
 
-def _drop(_declaration: Declaration, _target: Target, _layout: Layout, _period_ns: int) -> Operate:
+def _drop(_declaration: Declaration, _target: Target, _layout: Layout, _period_ns: int) -> _Operate:
     return lambda _draw: Drop()
 
 
-def _delay(declaration: Declaration, _target: Target, layout: Layout, period_ns: int) -> Operate:
+def _delay(declaration: Declaration, _target: Target, layout: Layout, period_ns: int) -> _Operate:
     key = "delay_ms" if declaration.delay_cycles is None else "delay_cycles"
     delay_ns, cycles = round((declaration.delay_ms or 0) * 1e6), declaration.delay_cycles or 0
     held = cycles or -(-delay_ns // period_ns)
@@ -235,7 +325,7 @@ def _delay(declaration: Declaration, _target: Target, layout: Layout, period_ns:
     return lambda _draw: Delay(layout.size, delay_ns, cycles)
 
 
-def _flip(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> Operate:
+def _flip(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     cover = np.frombuffer(target.cover, np.uint8)
     mask = None
     if declaration.bits is not None:
@@ -255,7 +345,7 @@ def _flip(declaration: Declaration, target: Target, layout: Layout, _period_ns: 
     return lambda draw: Flip(mask, cover, draw)
 
 
-_OPERATIONS: Final[Mapping[str, Callable[[Declaration, Target, Layout, int], Operate]]] = {
+_OPERATIONS: Final[Mapping[str, Callable[[Declaration, Target, Layout, int], _Operate]]] = {
     "set": _set,
     "offset": _offset,
     "scale": _scale,

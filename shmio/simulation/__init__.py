@@ -5,12 +5,9 @@ docs/how-to/write-a-model.md. ``ModelRunner`` runs it on the image of a block, `
 an instance elsewhere.
 """
 
-from shmio.simulation.declarations import InOut, Input, Output, Parameter
-from shmio.simulation.loading import load
-from shmio.simulation.model import Model, layout_of
-from shmio.simulation.ports import Ends
-from shmio.simulation.runner import ModelRunner
-from shmio.simulation.served import ServedModel
+from shmio.simulation.images import Ends
+from shmio.simulation.model import InOut, Input, Model, Output, Parameter, layout_of, load
+from shmio.simulation.runner import ModelRunner, ServedModel
 
 __all__ = [
     "Ends",

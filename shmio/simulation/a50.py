@@ -46,8 +46,7 @@ from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from typing import Final, NamedTuple
 
-from shmio.simulation.declarations import InOut, Output
-from shmio.simulation.model import Model
+from shmio.simulation.model import InOut, Model, Output
 
 Pose = tuple[float, ...]
 

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from shmio.simulation.declarations import InOut
-from shmio.simulation.model import Model
+from shmio.simulation.model import InOut, Model
 
 POSITION: Final = "LREAL"
 

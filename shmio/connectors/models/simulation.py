@@ -12,8 +12,7 @@ from shmio.errors import ConfigError, ModelError
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
-from shmio.simulation.loading import load
-from shmio.simulation.model import layout_of
+from shmio.simulation.model import layout_of, load
 from shmio.simulation.runner import ModelRunner
 
 

@@ -7,7 +7,7 @@ import pytest
 from shmio.errors import ModelError
 from shmio.layout.topic import find
 from shmio.simulation import InOut, Input, Model, Output, Parameter, layout_of
-from shmio.simulation.declarations import Declaration
+from shmio.simulation.model import Declaration
 from tests.unit.simulation.plant import Belt
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.errors import PathError
-from shmio.injection.target import MAX_REGISTERS, resolve, single
+from shmio.injection.program import MAX_REGISTERS, resolve, single
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout, Register
 

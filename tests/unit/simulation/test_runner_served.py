@@ -132,7 +132,7 @@ def test_what_is_no_value_is_not_given_and_what_fails_is_given_again() -> None:
     served = ServedModel(Fragile)
     served.start(Joined({"number": 0}, {"shown": 0}))
     assert served.step(1.0, 1.0, Given({"number": None}, ("number",))) == {"shown": 1}
-    with pytest.raises(ModelError, match=r"ZeroDivisionError: no \(test_served.py, line"):
+    with pytest.raises(ModelError, match=r"ZeroDivisionError: no \(test_runner_served.py, line"):
         served.step(2.0, 1.0, Given({"number": 7}, ("number",)))
     assert served.step(3.0, 1.0, Given({"number": 7})) == {"shown": 7}
 
