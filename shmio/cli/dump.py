@@ -12,8 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shmio.cli.interrupt import ended_by_interrupt, exit_on_signals
-from shmio.cli.run import add_full, add_json, complete, run
+from shmio.cli.run import add_full, add_json, complete, ended_by_interrupt, exit_on_signals, run
 from shmio.version import __version__
 
 PROGRAM = "shmio-dump"

@@ -14,8 +14,6 @@ from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.replay import Playing, Wish
 
-HELP = "Show how recordings play, and control them: pause, play, seek, and more."
-
 _VERBS: Final = {
     "status": "show how they play (default)",
     "pause": "stand",
@@ -34,7 +32,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     lines = "\n".join(f"  {verb:<10} {text}" for verb, text in _VERBS.items())
-    parser.description = f"{HELP}\n\nACTION is one of\n{lines}\n\nTIME: seconds from the start, or a date and time."
+    parser.description = (
+        f"{parser.description}\n\nACTION is one of\n{lines}\n\nTIME: seconds from the start, or a date and time."
+    )
     parser.add_argument("action", choices=_VERBS, nargs="?", default="status", metavar="ACTION")
     parser.add_argument("value", nargs="?", metavar="VALUE")
     parser.add_argument("--speed", type=float, metavar="X", help="with play: how fast")

@@ -21,7 +21,6 @@ from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.outcome import Outcome, OutcomeKind
 
-HELP = "Write values of registers, and print the result of each."
 MATCHES = 3
 """Number of matching registers that the error about a pattern names."""
 

@@ -9,14 +9,12 @@ import sys
 import msgspec
 
 from shmio.cli.instance.status import clock_line
-from shmio.cli.interrupt import stop_on_signals
-from shmio.cli.run import at_least, dumps
+from shmio.cli.run import at_least, dumps, stop_on_signals
 from shmio.errors import CommandError, ValueRangeError
 from shmio.local.status import clock_status
 from shmio.local.time_control import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
 from shmio.model.cell import Cell
 
-HELP = "Step the instance's time: after the first step only steps move it, until it is released."
 LOOK_S = 0.2
 
 

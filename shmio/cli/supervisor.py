@@ -8,8 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.interrupt import ended_by_interrupt
-from shmio.cli.run import add_json, at_least, complete, run
+from shmio.cli.run import add_json, at_least, complete, ended_by_interrupt, run
 from shmio.plan.replay import add_arguments
 from shmio.version import __version__
 

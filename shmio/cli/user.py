@@ -8,11 +8,11 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
-from shmio.cli import completion, get, inject, registers, replay, step, watch
+from shmio.cli import completion, inject, read, replay, step
 from shmio.cli import set as set_verb
-from shmio.cli.interrupt import ended_by_interrupt
-from shmio.cli.run import add_json, complete, run
+from shmio.cli.run import add_json, complete, ended_by_interrupt, run
 from shmio.cli.target import target
 from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, UnknownClientError
@@ -25,7 +25,40 @@ PROGRAM = "shmio"
 
 SHELL_HELP = "Print the code with which a shell completes command lines: see docs/reference/cli-shmio.md."
 
-Verb = Callable[[Cell, argparse.Namespace], int]
+
+class Verb(NamedTuple):
+    """A verb that acts on an instance: its help, what adds its arguments, and what carries it out."""
+
+    help: str
+    arguments: Callable[[argparse.ArgumentParser], None]
+    execute: Callable[[Cell, argparse.Namespace], int]
+    writable: bool = True
+
+
+VERBS = {
+    "list": Verb("List registers with their types.", read.list_arguments, read.list_registers, writable=False),
+    "get": Verb(
+        "Print the present values of registers, with quality and age.", read.get_arguments, read.get, writable=False
+    ),
+    "watch": Verb(
+        "Print registers whenever they change, the present values first; on a terminal, as a table.",
+        read.watch_arguments,
+        read.watch,
+        writable=False,
+    ),
+    "set": Verb("Write values of registers, and print the result of each.", set_verb.arguments, set_verb.execute),
+    "inject": Verb(
+        "Give consumers, or with /in the device, other values until Ctrl-C.", inject.arguments, inject.execute
+    ),
+    "step": Verb(
+        "Step the instance's time: after the first step only steps move it, until it is released.",
+        step.arguments,
+        step.execute,
+    ),
+    "replay": Verb(
+        "Show how recordings play, and control them: pause, play, seek, and more.", replay.arguments, replay.execute
+    ),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,12 +69,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(set_verb.shield(words) if words[:1] in (["set"], ["inject"]) else words)
 
     def command() -> int:
-        verb: Verb | None = arguments.verb
+        verb: Verb | None = VERBS.get(arguments.verb)
         if verb is None:
             print(completion.script(arguments.shell))
             return 0
-        with _opened(arguments, writable=arguments.writable) as cell:
-            return verb(cell, _spelled(cell, arguments))
+        with _opened(arguments, writable=verb.writable) as cell:
+            return verb.execute(cell, _spelled(cell, arguments))
 
     return run(PROGRAM, command, arguments)
 
@@ -116,21 +149,10 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument(
         "--token-in-plain-text", action="store_true", help="send the token to another host even without TLS"
     )
-    verbs = parser.add_subparsers(required=True, metavar="VERB")
-    modules = {
-        "list": registers,
-        "get": get,
-        "watch": watch,
-        "set": set_verb,
-        "inject": inject,
-        "step": step,
-        "replay": replay,
-    }
-    for name, module in modules.items():
-        sub = verbs.add_parser(name, parents=[common], help=module.HELP, description=module.HELP)
-        module.arguments(sub)
-        sub.set_defaults(verb=module.execute, writable=module in (set_verb, inject, step, replay))
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    for name, verb in VERBS.items():
+        sub = verbs.add_parser(name, parents=[common], help=verb.help, description=verb.help)
+        verb.arguments(sub)
     shell = verbs.add_parser("completion", help=SHELL_HELP, description=SHELL_HELP)
     shell.add_argument("shell", choices=completion.SHELLS, metavar="SHELL", help=", ".join(completion.SHELLS))
-    shell.set_defaults(verb=None)
     return parser

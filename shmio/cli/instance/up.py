@@ -18,8 +18,7 @@ from pathlib import Path
 import msgspec
 
 from shmio.cli.instance.start_messages import Failed, Started, StartMessage, headline
-from shmio.cli.interrupt import ended_by_interrupt
-from shmio.cli.run import say
+from shmio.cli.run import ended_by_interrupt, say
 from shmio.cli.target import config_file, option_for
 from shmio.errors import ControlError
 from shmio.local.status import InstanceStatus, SourceStatus, read_status

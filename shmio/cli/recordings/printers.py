@@ -10,7 +10,7 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
-from shmio.cli.readings import shown
+from shmio.cli.read import shown
 from shmio.cli.run import dumps
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import codec

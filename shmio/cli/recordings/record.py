@@ -10,8 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from shmio.cli.interrupt import stop_on_signals
-from shmio.cli.run import say, say_json
+from shmio.cli.run import say, say_json, stop_on_signals
 from shmio.cli.target import target
 from shmio.config import Recorder as Settings
 from shmio.config import Trigger

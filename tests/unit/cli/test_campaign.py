@@ -10,7 +10,7 @@ from typing import cast
 
 import pytest
 
-from shmio.cli.campaign import run_campaign
+from shmio.cli.inject import run_campaign
 from shmio.cli.user import main
 from shmio.config import Declaration
 from shmio.layout.model import Layout, Register

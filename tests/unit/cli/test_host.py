@@ -139,7 +139,7 @@ start_s = 1e6
 @pytest.fixture
 def unstopped(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody presses Ctrl-C: verbs run in a thread here, which hears of no signals."""
-    monkeypatch.setattr("shmio.cli.campaign.stop_on_signals", lambda: nullcontext(threading.Event()))
+    monkeypatch.setattr("shmio.cli.inject.stop_on_signals", lambda: nullcontext(threading.Event()))
 
 
 def lines(out: str) -> list[tuple[str, ...]]:
