@@ -16,9 +16,8 @@ from functools import partial
 from common import Child, begin, db201, interleave, table
 
 from shmio.config.address import Address
-from shmio.connectors.loop import SourceLoop, WallClock
+from shmio.connectors.loop import Schedule, SourceLoop, WallClock
 from shmio.connectors.s7.connector import S7Connector, S7Options
-from shmio.connectors.schedule import Schedule
 from shmio.segment import BlockSpec, ProcessSpec, Segment
 
 PERIOD_NS = 1_000_000

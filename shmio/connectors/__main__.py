@@ -12,14 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmio import worker
 from shmio.connectors import registry
-from shmio.connectors.base import Connector
+from shmio.connectors.base import Computed, Connector, Replayed
 from shmio.connectors.injection.layers import Owner
-from shmio.connectors.loop import SourceLoop, WallClock
-from shmio.connectors.models.computed import Computed
-from shmio.connectors.models.inputs import Inputs
-from shmio.connectors.models.stepped import PageClock, SteppedLoop
-from shmio.connectors.replay.replayed import Replayed
-from shmio.connectors.schedule import Schedule
+from shmio.connectors.loop import Schedule, SourceLoop, WallClock
+from shmio.connectors.models.stepped import Inputs, PageClock, SteppedLoop
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.topic import parse_topic
 from shmio.segment import Block, BlockWriter, Segment

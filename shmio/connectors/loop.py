@@ -1,4 +1,4 @@
-"""The loop that runs a connector.
+"""The loop that polls a device: connector to segment, cycle by cycle.
 
 It owns time, quality and recovery, so that every connector behaves alike: an absolute schedule,
 counted overruns, one bad frame when quality changes, the connection closed after any error,
@@ -7,10 +7,13 @@ back-off, and recovery without a restart.
 
 from __future__ import annotations
 
+import logging
+import re
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol, TypeVar
 
 from shmio.backoff import Backoff
@@ -19,17 +22,127 @@ from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.declared_injections import Blocks
 from shmio.connectors.injection.output import Image, Output
 from shmio.connectors.injection.processor import OwnerOf
-from shmio.connectors.schedule import Schedule
-from shmio.connectors.source_status import Counters, QualityLog
 from shmio.errors import ConnectorError
+from shmio.logs import fields
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
 RECONNECT: Final = Backoff(0.1, 2.0)
 """Waits before the next attempt to connect."""
 STABLE_NS: Final = 1_000_000_000
 """A connection that has lasted longer than this resets the back-off."""
+_MEASURES: Final = re.compile(r"\b[0-9]+(?= (?:ms|s|bytes)\b)")
+"""What varies in a reason; codes and addresses do not."""
 
 _Result = TypeVar("_Result")
+
+log = logging.getLogger("shmio.source")
+
+
+class Due(NamedTuple):
+    """The next cycle.
+
+    ``due_ns`` is when it is due and may be past; ``skipped`` counts the cycles skipped to reach it.
+    """
+
+    cycle: int
+    due_ns: int
+    skipped: int
+
+
+class Schedule:
+    """Counts cycles from the start of the instance, so that cycles lost by a restart show as a gap.
+
+    A cycle that begins late still runs. A cycle whose whole period has passed is an overrun and is
+    skipped.
+    """
+
+    def __init__(self, start_ns: int, period_ns: int) -> None:
+        self._start_ns = start_ns
+        self._period_ns = period_ns
+        self._last: int | None = None
+
+    def moved(self, ahead_ns: int, lead: int) -> Schedule:
+        """Return a schedule for a clock that is ``ahead_ns`` ahead, with ``lead`` cycles added."""
+        return Schedule(self._start_ns - ahead_ns - lead * self._period_ns, self._period_ns)
+
+    def next(self, now_ns: int) -> Due:
+        """Return the next cycle, skipping those whose whole period has passed."""
+        current = self.at(now_ns)
+        if self._last is None:
+            cycle, skipped = current + 1, 0
+        else:
+            cycle = max(self._last + 1, current)
+            skipped = cycle - self._last - 1
+        self._last = cycle
+        return Due(cycle, self.due_ns(cycle), skipped)
+
+    def due_ns(self, cycle: int) -> int:
+        """Return when a cycle is due, in ns."""
+        return self._start_ns + cycle * self._period_ns
+
+    def at(self, now_ns: int) -> int:
+        """Return the cycle that was due last. No later process begins with an earlier cycle."""
+        return (now_ns - self._start_ns) // self._period_ns
+
+    def restart(self) -> None:
+        """Forget the last cycle: the time until the next one is an outage and not an overrun."""
+        self._last = None
+
+
+@dataclass(slots=True)
+class Counters:
+    """The counters that ``status`` shows of a source. Only the loop writes them."""
+
+    polls: int = 0
+    overruns: int = 0
+    failures: int = 0
+    connects: int = 0
+    round_trip_us: int = 0
+    busy_since_ns: int = 0
+    """When the running hook was called, ns; 0 between hooks."""
+
+    def watch(self, now_ns: Callable[[], int], hook: Callable[[], _Result]) -> _Result:
+        """Call a hook, and record for the main thread when the call began."""
+        self.busy_since_ns = now_ns()
+        try:
+            return hook()
+        finally:
+            self.busy_since_ns = 0
+
+
+class QualityLog:
+    """Reports each change of a source's quality once, in the log and as an event."""
+
+    def __init__(self, writer: BlockWriter) -> None:
+        self._writer = writer
+        self._state: tuple[Quality, str] | None = None  # the reason without its numbers
+        self.note = ""
+        """Why quality is not good, for the process table; empty if it is good."""
+
+    def update(self, quality: Quality, reason: str, cycle: int, well: str = "") -> bool:
+        """Report the quality if it or its reason has changed; numbers in the reason do not count.
+
+        Args:
+            quality: The present quality.
+            reason: Why it is not good; empty if it is.
+            cycle: The present cycle, for the log.
+            well: Text for the log line if quality is good.
+
+        Returns:
+            Whether there was a change.
+
+        """
+        self.note = reason
+        state = quality, _MEASURES.sub("#", reason)
+        if state == self._state:
+            return False
+        self._state = state
+        self._writer.event(Record(EventKind.QUALITY, reason), quality=quality)
+        if quality is Quality.GOOD:
+            log.info("quality good%s", well, extra=fields(cycle=cycle))
+        else:
+            log.warning("quality %s: %s", quality, reason, extra=fields(cycle=cycle))
+        return True
 
 
 class Clock(Protocol):

@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from shmio.config.wording import explain, meant
-from shmio.connectors.base import Connector
-from shmio.connectors.models.computed import Computed
-from shmio.connectors.replay.replayed import Replayed
+from shmio.connectors.base import Computed, Connector, Replayed
 from shmio.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
 GROUP = "shmio.connectors"
 
 BUILT_IN = {
-    "memory": "shmio.connectors.memory:Memory",
+    "memory": "shmio.connectors.models.memory:Memory",
     "remote": "shmio.connectors.models.remote:Remote",
     "replay": "shmio.connectors.replay.source:Replay",
     "simulation": "shmio.connectors.models.simulation:Simulation",

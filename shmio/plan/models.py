@@ -9,8 +9,7 @@ from typing import Final
 
 import msgspec
 
-from shmio.connectors.models.describe import Answer, Request
-from shmio.connectors.models.simulation import Simulation
+from shmio.connectors.models.simulation import Answer, Request, Simulation
 from shmio.errors import ConfigError, PathError, ShmioError, ValueRangeError
 from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame
@@ -31,7 +30,7 @@ def describe(key: str, options: Simulation.Options, layout: Layout | None) -> tu
 
     """
     request = Request(options, None if layout is None else layout.to_json().decode())
-    command = [sys.executable, "-m", "shmio.connectors.models.describe"]
+    command = [sys.executable, "-m", "shmio.connectors.models.simulation"]
     try:
         done = subprocess.run(
             command, input=msgspec.json.encode(request), capture_output=True, timeout=PATIENCE_S, check=False

@@ -64,8 +64,7 @@ def _check_source(
     faults: Faults,
 ) -> None:
     from shmio.connectors import registry  # noqa: PLC0415
-    from shmio.connectors.models.computed import Computed  # noqa: PLC0415
-    from shmio.connectors.replay.replayed import Replayed  # noqa: PLC0415
+    from shmio.connectors.base import Computed, Replayed  # noqa: PLC0415
 
     key = f"source[{index}]"
     options = _options(key, source, faults)

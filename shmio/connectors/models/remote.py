@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 import msgspec
 
-from shmio.connectors.models.computed import Computed
+from shmio.connectors.base import Computed
 from shmio.errors import ConfigError, ConnectorError, ModelError, PathError, SegmentError, ValueRangeError
 from shmio.layout.model import Layout
 from shmio.layout.topic import find

@@ -1,14 +1,21 @@
-"""A source whose registers a model computes."""
+"""A source whose registers a model computes in its process.
+
+As a program (``python -m``) it describes a model for the supervisor, because a model is foreign code
+and may have changed. It reads a ``Request`` from standard input and writes an ``Answer``, both JSON.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import msgspec
 
-from shmio.connectors.models.computed import Computed
-from shmio.errors import ConfigError, ModelError
+from shmio.connectors.base import Computed
+from shmio.errors import ConfigError, ModelError, ShmioError
+from shmio.layout.document import load_layout
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
@@ -85,3 +92,43 @@ def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
     except (ConfigError, ModelError) as error:
         raise ConfigError(f"model: {error}") from None
     return ModelRunner(model, own, options.parameters, options.seed)
+
+
+# -- as a program ------------------------------------------------------------------------------------------------------
+
+
+class Request(msgspec.Struct):
+    """The model to describe.
+
+    ``layout`` is the JSON document of a layout, if the model is to run on one.
+    """
+
+    options: Simulation.Options
+    layout: str | None
+
+
+class Answer(msgspec.Struct):
+    """The block's layout as a document and the inputs that can be connected, or an error."""
+
+    layout: str = ""
+    inputs: tuple[str, ...] = ()
+    error: str = ""
+
+
+def main() -> int:
+    """Answer one request; return the exit status."""
+    answer_fd = os.dup(1)
+    os.dup2(2, 1)  # what a model prints is no answer
+    request = msgspec.json.decode(sys.stdin.buffer.read(), type=Request)
+    try:
+        runner = make(request.options, None if request.layout is None else load_layout(request.layout.encode()))
+        answer = Answer(runner.layout.to_json().decode(), runner.inputs)
+    except ShmioError as error:
+        answer = Answer(error=str(error))
+    with os.fdopen(answer_fd, "wb") as stream:
+        stream.write(msgspec.json.encode(answer))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,26 +1,100 @@
-"""The loop that runs computed sources: on schedule in wall time, step by step in virtual time."""
+"""The loop that runs computed sources, and the inputs that they read from other sources.
+
+In wall time it follows the schedule, in virtual time it computes step by step.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Protocol
 
+from shmio.connectors.base import Computed
 from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.declared_injections import Blocks
 from shmio.connectors.injection.output import Image, Output
 from shmio.connectors.injection.processor import OwnerOf
-from shmio.connectors.models.computed import Computed
-from shmio.connectors.models.inputs import Inputs
-from shmio.connectors.schedule import Schedule
-from shmio.connectors.source_status import Counters, QualityLog
-from shmio.errors import ShmioError
+from shmio.connectors.loop import Counters, QualityLog, Schedule
+from shmio.errors import PathError, SegmentError, ShmioError
+from shmio.layout.topic import Topic, find
+from shmio.layout.values.codec import RegisterCodec, Value, codec
 from shmio.layout.values.write import Write
+from shmio.local.reading import holds_none
 from shmio.model.clock import Clock
-from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
+from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Quality, Record, Segment
 from shmio.segment.clock import ClockPage
 
+NO_DATA: Final = "no data yet"
 RESTARTED: Final = "its process was restarted during this step; it continues with the next one"
+
+
+class Inputs:
+    """Reads the connected inputs of one source: registers of other sources. For one thread.
+
+    From a block that takes part in steps it reads the frame before the present step, whichever
+    source is faster (the Jacobi method). From any other block it reads the newest frame.
+    """
+
+    def __init__(self, segment: Segment, connections: Mapping[str, Topic]) -> None:
+        """Create the inputs.
+
+        Args:
+            segment: A segment for this object alone, because it follows reloads.
+            connections: The topic of each input, by the input's path.
+
+        """
+        self._segment = segment
+        self._connections = connections
+        self._found: dict[str, tuple[Block, RegisterCodec]] = {}
+
+    def read(self, step: int | None) -> tuple[dict[str, Value], str]:
+        """Return the good values by input, and why others are missing.
+
+        ``step`` is None in wall time.
+        """
+        if self._segment.refresh():
+            self._found = {}
+        values: dict[str, Value] = {}
+        missing: list[str] = []
+        frames: dict[str, tuple[Frame | None, str]] = {}
+        for path, topic in self._connections.items():
+            try:
+                block, decoder = self._find(path, topic)
+                if block.source not in frames:
+                    frames[block.source] = _frame(block, step)
+            except (PathError, SegmentError) as error:
+                missing.append(f"input {path}: {error}")
+                continue
+            frame, reason = frames[block.source]
+            value = None if frame is None else decoder.decode(frame.image)
+            if holds_none(value):
+                missing.append(
+                    f"input {path} keeps its value: {block.source}: {reason or 'the bytes are not a valid value'}"
+                )
+            else:
+                values[path] = value
+        return values, "; ".join(missing)
+
+    def _find(self, path: str, topic: Topic) -> tuple[Block, RegisterCodec]:
+        if path not in self._found:
+            block = self._segment.blocks.get(topic.source)
+            if block is None:
+                raise PathError(f"there is no source {topic.source!r} any more")
+            self._found[path] = block, codec(find(block.layout, topic.path), block.layout.byte_order)
+        return self._found[path]
+
+
+def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
+    """Return the frame to read, or None and why it cannot be trusted."""
+    frame = block.latest()
+    while frame is not None and step is not None and block.came_with(frame, step):
+        frame = block.read(frame.number - 1)
+    if frame is None:
+        return None, NO_DATA
+    quality, reason = block.assess(frame)
+    if quality is Quality.BAD:
+        return None, reason if frame.quality is Quality.BAD else "stale"
+    return frame, ""
 
 
 class StepClock(Protocol):

@@ -11,13 +11,13 @@ from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.declared_injections import Blocks
 from shmio.connectors.injection.output import Output
 from shmio.connectors.injection.processor import OwnerOf
+from shmio.connectors.loop import Counters
 from shmio.connectors.models.stepped import StepClock
 from shmio.connectors.replay.player import OVER, STOPPED, Player, is_replayed
 from shmio.connectors.replay.recorded_source import Entry, RecordedSource
 from shmio.connectors.replay.recording import MAX_NS
 from shmio.connectors.replay.source import Replay
 from shmio.connectors.replay.start import ReplayStart, as_others, stamp
-from shmio.connectors.source_status import Counters
 from shmio.errors import PathError, SegmentError, ValueRangeError
 from shmio.layout.topic import find, shorten
 from shmio.layout.values.write import Write, bits_of

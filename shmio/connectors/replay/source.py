@@ -8,9 +8,9 @@ from typing import Annotated
 import msgspec
 
 from shmio.config.model import ReplayedInjections
+from shmio.connectors.base import Replayed
 from shmio.connectors.replay.recorded_source import RecordedSource
 from shmio.connectors.replay.recording import Recording, Span
-from shmio.connectors.replay.replayed import Replayed
 from shmio.errors import ConfigError, RecordingError
 from shmio.layout.model import Layout
 from shmio.segment.playhead import MAX_SPEED, MIN_SPEED

@@ -11,11 +11,10 @@ from itertools import pairwise
 import msgspec
 import pytest
 
-from shmio.connectors.memory import Memory
-from shmio.connectors.models.computed import Computed
-from shmio.connectors.models.inputs import Inputs
-from shmio.connectors.models.stepped import RESTARTED, PageClock, SteppedLoop
-from shmio.connectors.schedule import Schedule
+from shmio.connectors.base import Computed
+from shmio.connectors.loop import Schedule
+from shmio.connectors.models.memory import Memory
+from shmio.connectors.models.stepped import RESTARTED, Inputs, PageClock, SteppedLoop
 from shmio.errors import ConnectorError, TimeError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import parse_topic

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from shmio.connectors.models.computed import Computed
+from shmio.connectors.base import Computed
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write, apply
