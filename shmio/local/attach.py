@@ -41,10 +41,8 @@ from shmio.model.injection import Injection, Lifted, Running
 from shmio.model.outcome import Outcome
 from shmio.model.reading import Reading
 from shmio.model.values import Quality
-from shmio.segment.block import Block
+from shmio.segment.block import Block, Cursor, Entry, Frame
 from shmio.segment.commands import Direction
-from shmio.segment.cursor import Cursor, Entry
-from shmio.segment.frame import Frame
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
 from shmio.segment.standing_injections import StandingInjection

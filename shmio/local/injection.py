@@ -15,9 +15,8 @@ from shmio.layout.values.codec import Value
 from shmio.layout.values.write import cover, merge
 from shmio.local.writer import PendingCommand, SourceWriter
 from shmio.model.outcome import Outcome
-from shmio.segment.block import Block
+from shmio.segment.block import Block, Cursor
 from shmio.segment.commands import Direction
-from shmio.segment.cursor import Cursor
 from shmio.segment.events import Event, EventKind
 from shmio.segment.pending_commands import CommandAssembler, CommandWrites, apply, values
 

@@ -13,8 +13,7 @@ from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import Value, codec
 from shmio.model.reading import Reading
 from shmio.model.values import Provenance, Quality
-from shmio.segment.block import Block
-from shmio.segment.frame import Frame
+from shmio.segment.block import Block, Frame
 
 if TYPE_CHECKING:
     import numpy as np

@@ -16,10 +16,8 @@ from shmio.local.following import Following
 from shmio.local.reading import reading
 from shmio.model.reading import Reading
 from shmio.model.values import Provenance, Quality
-from shmio.segment.block import Block
+from shmio.segment.block import Block, Frame, FrameFollower
 from shmio.segment.changed_registers import ChangeScan
-from shmio.segment.follower import FrameFollower
-from shmio.segment.frame import Frame
 
 
 @dataclass(frozen=True, slots=True)

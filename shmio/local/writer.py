@@ -25,8 +25,7 @@ from shmio.segment.events import Event, EventKind
 from shmio.segment.pending_commands import CommandOutcomes, End
 
 if TYPE_CHECKING:
-    from shmio.segment.block import Block
-    from shmio.segment.cursor import Cursor
+    from shmio.segment.block import Block, Cursor
 
 TIMEOUT_S: Final = 2.0
 MIN_PERIODS: Final = 3

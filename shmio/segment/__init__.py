@@ -5,13 +5,19 @@ The byte format is docs/reference/segment-format.md; a local program starts with
 
 from shmio.layout.values.write import Write
 from shmio.model.values import Provenance, Quality
-from shmio.segment.block import Attributes, Block, BlockWriter, Stamp
+from shmio.segment.block import (
+    Attributes,
+    Block,
+    BlockWriter,
+    Cursor,
+    Frame,
+    FrameFollower,
+    QualityChange,
+    Stamp,
+)
 from shmio.segment.build import BlockSpec, Origin, segment_size
 from shmio.segment.commands import Command, CommandKind, Direction
-from shmio.segment.cursor import Cursor
-from shmio.segment.events import DONE, ENDS, NO_WRITER, Event, EventKind, EventRing, Record
-from shmio.segment.follower import FrameFollower, QualityChange
-from shmio.segment.frame import Frame
+from shmio.segment.events import DONE, ENDS, NO_WRITER, Event, EventKind, Record
 from shmio.segment.header import State
 from shmio.segment.processes import Activity, Phase, ProcessSlot, ProcessSpec, Report, Supervised
 from shmio.segment.segment import PREFIX, Segment, instances, running_instances
@@ -32,7 +38,6 @@ __all__ = [
     "Direction",
     "Event",
     "EventKind",
-    "EventRing",
     "Frame",
     "FrameFollower",
     "Origin",

@@ -1,20 +1,24 @@
-"""The block of a source: its layout and its rings of frames, events and commands."""
+"""The block of a source: the source's process publishes frames and events, and readers copy and follow them.
+
+A frame is published by :meth:`BlockWriter.publish`. Readers copy the newest one (:meth:`Block.latest`), read
+each one in order (:class:`Cursor`), or also learn when the quality changes (:class:`FrameFollower`).
+The ring itself is ``ring.h``, in C.
+"""
 
 from __future__ import annotations
 
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from enum import Enum
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 from shmio.errors import SegmentError
 from shmio.model.values import Provenance, Quality
 from shmio.segment._atomics import REASON_SIZE, Ring
-from shmio.segment.cursor import Cursor
-from shmio.segment.events import EventKind, EventRing, Record
-from shmio.segment.frame import Frame
+from shmio.segment.events import Event, EventKind, Record, decode_event
 from shmio.segment.header import cut
 
 if TYPE_CHECKING:
@@ -26,35 +30,173 @@ if TYPE_CHECKING:
     from shmio.segment.playhead import Playhead
     from shmio.segment.standing_injections import DeclaredCell, StandingCell
 
-Bytes = bytes | bytearray | memoryview
+
+class Frame(NamedTuple):
+    """A validated copy of one frame of a block. All times are in ns.
+
+    Attributes:
+        number: Number of the frame in its ring, from 1.
+        cycle: Period of the source's schedule; in virtual time the number of the step.
+        publish_ns: CLOCK_MONOTONIC at publication, or a comparable time in virtual time.
+        clock_ns: The instance's clock at publication.
+        source_ns: The source's time stamp, UTC. A bad frame has that of the image it repeats; 0: the
+            source never had an image, and the bytes are zeros.
+        incarnation: Number of the source's process.
+        quality: Quality of the image when it was published.
+        provenance: Where the raw image comes from.
+        event: Number of the last event before the frame.
+        delay_us: Maximum age of the image when it was published: the time that the device took to answer.
+        reason: Why the quality is not good.
+        raw: The image that the source delivered, in its own byte order.
+        effective: The image that consumers see; None while nothing is injected.
+    """
+
+    number: int
+    cycle: int
+    publish_ns: int
+    clock_ns: int
+    source_ns: int
+    incarnation: int
+    quality: Quality
+    provenance: Provenance
+    event: int
+    delay_us: int
+    reason: str
+    raw: bytes
+    effective: bytes | None
+
+    @property
+    def image(self) -> bytes:
+        """The image that consumers see: the effective one if there is one, else the raw one."""
+        return self.raw if self.effective is None else self.effective
+
+    def age_ns(self, now_ns: int) -> int:
+        """Return the maximum age of the image: the time since the device was asked for it.
+
+        Args:
+            now_ns: The present time by the block's clock, :meth:`Block.now_ns`.
+        """
+        return now_ns - self.publish_ns + 1000 * self.delay_us
+
+    def assess(self, stale_ns: int, now_ns: int) -> tuple[Quality, str]:
+        """Return quality and reason at ``now_ns``: a frame older than ``stale_ns`` is bad."""
+        if self.quality is not Quality.BAD:
+            age_ns = self.age_ns(now_ns)
+            if age_ns > stale_ns:
+                return Quality.BAD, f"stale: no newer frame, this one is {age_ns / 1e9:.1f} s old"
+        return self.quality, self.reason
 
 
-MAX_DELAY_US = 2**32 - 1
-
-_QUALITIES = tuple(Quality)
-_PROVENANCES = tuple(Provenance)
+_QUALITIES: Final = tuple(Quality)
+_PROVENANCES: Final = tuple(Provenance)
 
 
 def decode_frame(fields: FrameTuple) -> Frame:
     """Make a frame of what the ring returns."""
-    number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance = fields[:8]
-    event, delay_us, reason, raw, effective = fields[8:]
+    (number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, reason,
+     raw, effective) = fields  # fmt: skip
     return Frame(
-        number,
-        cycle,
-        publish_ns,
-        clock_ns,
-        source_ns,
-        incarnation,
+        number, cycle, publish_ns, clock_ns, source_ns, incarnation,
         # The bytes come from another process: an unknown quality counts as bad.
         _QUALITIES[quality] if quality < len(_QUALITIES) else Quality.BAD,
         _PROVENANCES[provenance] if provenance < len(_PROVENANCES) else Provenance.SIMULATED,
-        event,
-        delay_us,
-        reason,
-        raw,
-        effective,
-    )
+        event, delay_us, reason, raw, effective,
+    )  # fmt: skip
+
+
+Entry = TypeVar("Entry")
+
+_POLL_NS: Final = 1_000_000_000
+"""How often a waiting reader polls: if the supervisor dies, the doorbell for a block's end is never rung."""
+
+
+class Cursor(Generic[Entry]):
+    """A reader's position in a ring of frames or events. Use it from one thread.
+
+    >>> cursor = block.cursor()
+    >>> while (frame := cursor.next(timeout_s=1.0)) is not None:
+    ...     print(frame.number, cursor.missed)
+    """
+
+    def __init__(
+        self, ring: Ring, decode: Callable[[FrameTuple], Entry], after: int, retired: Callable[[], bool]
+    ) -> None:
+        self._ring = ring
+        self._decode = decode
+        self._retired = retired
+        self._last = after
+        self.missed = 0
+        """Total number of entries that were overwritten or skipped before this cursor read them."""
+        self._reported = 0
+
+    @property
+    def last(self) -> int:
+        """Number of the last entry read, or counted as missed."""
+        return self._last
+
+    @property
+    def behind(self) -> int:
+        """Number of entries that are not read yet."""
+        return max(0, self._ring.head() - self._last)
+
+    @property
+    def ended(self) -> bool:
+        """Whether a reload has retired the block, and all its entries have been read."""
+        return self._retired() and not self.behind  # in this order: nothing is published after the end
+
+    def take_missed(self) -> int:
+        """Return how many entries were missed since the last call."""
+        missed, self._reported = self.missed - self._reported, self.missed
+        return missed
+
+    def resume(self, *, after: int) -> None:
+        """Continue with the entry behind this number; those in between do not count as missed."""
+        self._last = after
+
+    def poll(self) -> Entry | None:
+        """Return the next entry if there is one, without waiting."""
+        ring = self._ring
+        margin = 0
+        while ring.head() > self._last:
+            fields = ring.read(self._last + 1)
+            if fields is not None:
+                self._last += 1
+                return self._decode(fields)
+            # Lapped: resume with the oldest entry, and further ahead each time the writer is faster.
+            resume = max(self._last + 1, ring.head() - ring.slot_count + margin)
+            margin = min(2 * margin + 1, ring.slot_count // 2)
+            self.missed += resume - self._last
+            self._last = resume
+        return None
+
+    def next(self, timeout_s: float | None = None) -> Entry | None:
+        """Return the next entry, waiting at most ``timeout_s`` (None: forever).
+
+        Returns:
+            The entry. None if none came in time, or if a reload has retired the block and all of it
+            has been read.
+        """
+        ring = self._ring
+        deadline_ns = None if timeout_s is None else time.monotonic_ns() + round(timeout_s * 1e9)
+        while True:
+            seen = ring.doorbell()  # before polling, so that no ring is lost
+            retired = self._retired()  # also before polling: what was published before the end is still read
+            entry = self.poll()
+            if entry is not None or retired:
+                return entry
+            rest_ns = _POLL_NS if deadline_ns is None else min(_POLL_NS, deadline_ns - time.monotonic_ns())
+            if rest_ns <= 0:
+                return None
+            ring.wait(seen, rest_ns)
+
+    def __iter__(self) -> Iterator[Entry]:
+        """Iterate over all entries to come, until the block is retired."""
+        while True:
+            entry = self.next()
+            if entry is not None:
+                yield entry
+            elif self._retired():
+                return
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +223,25 @@ class Attributes:
         return bool(self.outputs or self.inouts)
 
 
-class Stamp(NamedTuple):
-    """Times of a publication: comparable to CLOCK_MONOTONIC, by the instance's clock, and, for an event, in UTC."""
+class EventRing:
+    """Reading side of a block's events."""
 
-    publish_ns: int
-    clock_ns: int
-    utc_ns: int = 0
+    def __init__(self, ring: Ring, retired: Callable[[], bool]) -> None:
+        self.ring = ring
+        self._retired = retired
+
+    def head(self) -> int:
+        """Return the number of the newest event; 0: there is none yet."""
+        return self.ring.head()
+
+    def read(self, number: int) -> Event | None:
+        """Return a copy of the event with this number; None if the ring does not hold it."""
+        fields = self.ring.read(number)
+        return None if fields is None else decode_event(fields)
+
+    def cursor(self, *, after: int | None = None) -> Cursor[Event]:
+        """Return a cursor that starts behind event ``after`` (default: the newest one)."""
+        return Cursor(self.ring, decode_event, self.head() if after is None else after, self._retired)
 
 
 class Block:
@@ -194,6 +349,19 @@ class Block:
         return Cursor(self.ring, decode_frame, self.ring.head() if after is None else after, self._retired)
 
 
+Bytes = bytes | bytearray | memoryview
+
+_MAX_DELAY_US: Final = 2**32 - 1
+
+
+class Stamp(NamedTuple):
+    """Times of a publication: comparable to CLOCK_MONOTONIC, by the instance's clock, and, for an event, in UTC."""
+
+    publish_ns: int
+    clock_ns: int
+    utc_ns: int = 0
+
+
 class BlockWriter:
     """Writing side of a block. There is one, in the source's process; several threads may use it."""
 
@@ -265,7 +433,7 @@ class BlockWriter:
                 quality,
                 provenance,
                 self.block.events.head(),
-                0 if asked_ns is None else min(-(-max(0, now_ns - asked_ns) // 1000), MAX_DELAY_US),
+                0 if asked_ns is None else min(-(-max(0, now_ns - asked_ns) // 1000), _MAX_DELAY_US),
                 cut(reason, REASON_SIZE) if reason else b"",
             )
 
@@ -303,3 +471,120 @@ class BlockWriter:
             )
             self.block.ring.wake()
             return number
+
+
+class QualityChange(Enum):
+    """How a block's quality has changed since the frame before."""
+
+    NONE = "none"
+    DETAIL = "detail"
+    """Another quality or reason, but bad as before, or not bad as before."""
+    RECOVERED = "recovered"
+    """No longer bad, or not bad from the first frame on."""
+    BAD = "bad"
+    GAP = "gap"
+    """Not bad, but the frame before was stale when this one came."""
+
+
+_BAD: Final = Quality.BAD  # members of an enum are slow to look up, and these are for each frame
+_NONE: Final = QualityChange.NONE
+
+
+class FrameFollower(Cursor[Frame]):
+    """Reads a block's frames from the newest one on, and assesses the last one. For one thread.
+
+    The caller reads a frame with :meth:`poll`, :meth:`read` or :meth:`newest`, and then calls :meth:`take`.
+    If there is no new frame, it asks whether the last one :meth:`became_stale`.
+    """
+
+    def __init__(self, block: Block, *, catch_up_s: float | None = None, notice_gaps: bool = False) -> None:
+        """Start to follow a block.
+
+        Args:
+            block: The block.
+            catch_up_s: When :meth:`read` is further behind than this time, or than half the ring,
+                it skips to the newest frame, and counts the others as missed. None: it does not.
+            notice_gaps: Whether :meth:`take` reports :attr:`QualityChange.GAP`.
+        """
+        super().__init__(block.ring, decode_frame, max(0, block.ring.head() - 1), lambda: block.retired)
+        self.block = block
+        self.frame: Frame | None = None
+        """The last frame taken; None before the first."""
+        self.quality = Quality.BAD
+        """Quality when the last frame was taken or its age checked."""
+        self.reason = "no data yet"
+        """Why the quality is not good; empty if it is."""
+        self._notice_gaps = notice_gaps
+        self._most_behind = None
+        if catch_up_s is not None:
+            self._most_behind = max(1, min(round(catch_up_s * 1e9 / block.period_ns), block.ring.slot_count // 2))
+
+    @property
+    def stale(self) -> bool:
+        """Whether the last frame is bad only because of its age."""
+        return self.quality is _BAD and self.frame is not None and self.frame.quality is not _BAD
+
+    def read(self, limit: int) -> Iterator[Frame]:
+        """Yield new frames, at most ``limit``; when too far behind, skip to the newest first."""
+        if self._most_behind is not None and self.behind > self._most_behind:
+            newest = self._ring.head()
+            self.missed += newest - 1 - self._last
+            self._last = newest - 1
+        for _ in range(limit):
+            if (frame := self.poll()) is None:
+                return
+            yield frame
+
+    def newest(self) -> Frame | None:
+        """Return the newest frame, and continue behind it; None: there is none yet.
+
+        Raises:
+            SegmentError: The writer overtook the reader at every attempt to copy.
+        """
+        frame = self.block.latest()
+        if frame is not None:
+            self._last = frame.number
+        return frame
+
+    def take(self, frame: Frame, *, aged: bool = True) -> QualityChange:
+        """Make a frame the last one, and return how it changes the quality.
+
+        Args:
+            frame: The frame.
+            aged: Whether its quality is that of now, which depends on its age; otherwise it is the
+                one that the frame was published with.
+        """
+        last, before = self.frame, self.quality
+        self.frame = frame
+        quality, reason = self.block.assess(frame) if aged else (frame.quality, frame.reason)
+        change = _NONE
+        if quality is not before or reason != self.reason:
+            self.quality, self.reason = quality, reason
+            change = QualityChange.DETAIL
+        if quality is _BAD:
+            return change if before is _BAD else QualityChange.BAD
+        if before is _BAD:
+            return QualityChange.RECOVERED
+        if (
+            self._notice_gaps
+            and last is not None
+            and frame.number == last.number + 1  # else the frames between may have come in time
+            and last.age_ns(frame.publish_ns) > self.block.stale_ns
+        ):
+            return QualityChange.GAP
+        return change
+
+    def became_stale(self) -> bool:
+        """Return whether the last frame has become stale since it was taken, once."""
+        if self.frame is None or self.quality is _BAD:
+            return False
+        quality, reason = self.block.assess(self.frame)
+        if quality is not _BAD:
+            return False
+        self.quality, self.reason = quality, reason
+        return True
+
+    def restart(self) -> None:
+        """Forget the last frame, and begin with the newest one again."""
+        self._last = max(0, self._ring.head() - 1)
+        self.frame, self.quality, self.reason = None, Quality.BAD, "no data yet"

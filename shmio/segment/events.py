@@ -11,12 +11,9 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from shmio.model.values import Quality
-from shmio.segment.cursor import Cursor
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from shmio.segment._atomics import FrameTuple, Ring
+    from shmio.segment._atomics import FrameTuple
 
 EVENT_DATA_SIZE: Final = 256
 """Maximum number of data bytes in an event; a longer write becomes several consecutive events."""
@@ -161,7 +158,7 @@ class Record(NamedTuple):
         return packed + self.data.ljust(EVENT_DATA_SIZE, b"\0")
 
 
-def decode(fields: FrameTuple) -> Event:
+def decode_event(fields: FrameTuple) -> Event:
     """Decode an event. Bounds are checked, because another process wrote the bytes."""
     number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, _, text, raw, _ = fields
     kind, data_size, writer, command, item, offset, mask, items, size, injection = _RECORD.unpack_from(raw)
@@ -171,24 +168,3 @@ def decode(fields: FrameTuple) -> Event:
         number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
         writer, command, item, items, offset, mask, size, data, text, injection,
     )  # fmt: skip
-
-
-class EventRing:
-    """Reading side of a block's events."""
-
-    def __init__(self, ring: Ring, retired: Callable[[], bool]) -> None:
-        self.ring = ring
-        self._retired = retired
-
-    def head(self) -> int:
-        """Return the number of the newest event; 0: there is none yet."""
-        return self.ring.head()
-
-    def read(self, number: int) -> Event | None:
-        """Return a copy of the event with this number; None if the ring does not hold it."""
-        fields = self.ring.read(number)
-        return None if fields is None else decode(fields)
-
-    def cursor(self, *, after: int | None = None) -> Cursor[Event]:
-        """Return a cursor that starts behind event ``after`` (default: the newest one)."""
-        return Cursor(self.ring, decode, self.head() if after is None else after, self._retired)

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple, TypeVar
 import msgspec
 
 from shmio.model.values import Provenance, Quality
+from shmio.segment.block import Frame
 from shmio.segment.events import EVENT_DATA_SIZE, Event
-from shmio.segment.frame import Frame
 
 MAX_JSON_BYTES: Final = 4096
 

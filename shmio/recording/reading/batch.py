@@ -15,7 +15,7 @@ from shmio.errors import RecordingError
 from shmio.model.values import Provenance
 from shmio.recording.format.channels import Channel
 from shmio.recording.format.encoding import decode_frame, restore
-from shmio.segment.frame import Frame
+from shmio.segment.block import Frame
 
 HEAD: Final = np.dtype(
     [

@@ -18,7 +18,7 @@ from shmio.recording.format.records import Record
 from shmio.recording.reading.batch import Batch, batch, frames
 from shmio.recording.reading.reader import Message, Reader
 from shmio.recording.reading.survey import Survey, Track, read_index, survey
-from shmio.segment.frame import Frame
+from shmio.segment.block import Frame
 
 MAX_SUMMARY_BYTES: Final = 64 << 20
 """A chunk takes about 90 bytes of the summary, so that this is enough for a week."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, BlockWriter, EventKind, ProcessSpec, Quality, Record, Segment
-from shmio.segment.events import EVENT_DATA_SIZE, EVENT_SIZE, EVENT_SLOTS, decode
+from shmio.segment.events import EVENT_DATA_SIZE, EVENT_SIZE, EVENT_SLOTS, decode_event
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
 
@@ -97,7 +97,7 @@ def test_most_data_of_one_event(writer: BlockWriter) -> None:
 @given(st.binary(min_size=EVENT_SIZE, max_size=EVENT_SIZE), st.integers(0, 255))
 def test_any_bytes_are_some_event(raw: bytes, quality: int) -> None:
     """The bytes are another process's; a wrong one must not lead outside."""
-    event = decode((5, 1, 2, 3, 4, 1, quality, 0, 9, 0, "", raw, None))
+    event = decode_event((5, 1, 2, 3, 4, 1, quality, 0, 9, 0, "", raw, None))
     assert len(event.data) <= EVENT_DATA_SIZE
     assert event.quality in Quality
 

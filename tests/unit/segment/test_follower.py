@@ -18,7 +18,7 @@ from shmio.segment import (
     Segment,
     Stamp,
 )
-from shmio.segment.cursor import Cursor
+from shmio.segment.block import Cursor
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("speed", "REAL", (), 0, None, 4, 1),))
 PERIOD_NS = 20_000_000

@@ -35,7 +35,7 @@ from shmio.segment import (
     segment_size,
 )
 from shmio.segment._atomics import RAW_OFFSET
-from shmio.segment.cursor import Cursor
+from shmio.segment.block import Cursor
 from shmio.segment.header import GENERATION_OFFSET, HEADER_SIZE
 from shmio.segment.processes import SUPERVISOR_LOCK
 from shmio.segment.segment import PREFIX
