@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 
 from shmio.local.writer import PATIENCE_S, RESTARTED, SILENT, PendingCommand
 from shmio.segment import Event, EventKind
+from shmio.segment.commands import CommandOutcomes, End
 from shmio.segment.events import EVENT_DATA_SIZE
-from shmio.segment.pending_commands import CommandOutcomes, End
 
 MAX_OPEN: Final = 512
 """Bound of outstanding events: a quarter of the ring, so that none is overwritten unread."""

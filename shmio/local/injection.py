@@ -16,9 +16,8 @@ from shmio.layout.values.write import cover, merge
 from shmio.local.writer import PendingCommand, SourceWriter
 from shmio.model.outcome import Outcome
 from shmio.segment.block import Block, Cursor
-from shmio.segment.commands import Direction
+from shmio.segment.commands import CommandAssembler, CommandWrites, Direction, apply, decode_writes
 from shmio.segment.events import Event, EventKind
-from shmio.segment.pending_commands import CommandAssembler, CommandWrites, apply, values
 
 Next = Callable[[Cursor[Event], float | None], Event | None]
 """Waits at most so many seconds for a cursor's next event. None: no event came, or none will come.
@@ -122,7 +121,7 @@ class Shadow:
     def _diversion(self, diverted: CommandWrites) -> Diversion:
         apply(self._image, diverted.writes)
         event = diverted.event
-        written = values(self._source_writer.block.layout, bytes(self._image), diverted.writes)
+        written = decode_writes(self._source_writer.block.layout, bytes(self._image), diverted.writes)
         return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, self._events.take_missed())
 
     def lift(self) -> None:
@@ -188,7 +187,7 @@ def _written(
             apply(image, accepted.writes)
             mask = bytearray(a & b for a, b in zip(mask, bits, strict=True))
             if any(mask):
-                found = values(layout, bytes(image), merge(image, mask, [(0, layout.size)]))
+                found = decode_writes(layout, bytes(image), merge(image, mask, [(0, layout.size)]))
                 told = accepted.event
                 yield Diversion(found, told.writer, told.command, told.clock_ns, told.utc_ns, events.take_missed())
                 until_s = _deadline(timeout_s)

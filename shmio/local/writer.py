@@ -20,9 +20,17 @@ from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge
 from shmio.model.outcome import Outcome, OutcomeKind
-from shmio.segment.commands import EMPTY, MAX_NAME_BYTES, MAX_WRITES, Command, CommandKind, InjectionOptions
+from shmio.segment.commands import (
+    EMPTY,
+    MAX_NAME_BYTES,
+    MAX_WRITES,
+    Command,
+    CommandKind,
+    CommandOutcomes,
+    End,
+    InjectionOptions,
+)
 from shmio.segment.events import Event, EventKind
-from shmio.segment.pending_commands import CommandOutcomes, End
 
 if TYPE_CHECKING:
     from shmio.segment.block import Block, Cursor

@@ -15,12 +15,11 @@ from shmio.segment.block import (
     QualityChange,
     Stamp,
 )
-from shmio.segment.build import BlockSpec, Origin, segment_size
 from shmio.segment.commands import Command, CommandKind, Direction
 from shmio.segment.events import DONE, ENDS, NO_WRITER, Event, EventKind, Record
 from shmio.segment.header import State
 from shmio.segment.processes import Activity, Phase, ProcessSlot, ProcessSpec, Report, Supervised
-from shmio.segment.segment import PREFIX, Segment, instances, running_instances
+from shmio.segment.segment import PREFIX, BlockSpec, Origin, Segment, instances, running_instances, segment_size
 
 __all__ = [
     "DONE",

@@ -34,7 +34,7 @@ MAX_SPEED: Final = 1000.0
 
 _COPIES_AT: Final = (64, 704)
 _ASK_AT: Final = 1344
-SECTION_SIZE: Final = 2560
+PLAYHEAD_SIZE: Final = 2560
 
 _STATE: Final = struct.Struct("<IIqqqqqqqdQQ256sQQ240x")
 _ASK: Final = struct.Struct("<QII1000s")
@@ -188,7 +188,7 @@ class Playhead:
         self, shared: SharedObject, memory: memoryview, offset: int, size: int, lock_byte: int, clock: ClockPage
     ) -> None:
         """Open the section. ValueError: it is too short."""
-        if size < SECTION_SIZE:
+        if size < PLAYHEAD_SIZE:
             raise ValueError("the playhead's section is too short")
         self._shared = shared
         self._memory = memory

@@ -1,11 +1,15 @@
-"""The segment as a whole: built by the supervisor, opened by workers and readers."""
+"""The segment as a whole: the supervisor builds and changes it; workers and readers open it."""
 
 from __future__ import annotations
 
+import os
+import secrets
+import struct
 import threading
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -21,37 +25,123 @@ from shmio.errors import (
     WrongInstanceError,
 )
 from shmio.layout.document import load_layout
-from shmio.segment import _atomics, header, shm
+from shmio.layout.model import Layout
+from shmio.segment import _atomics, commands, header, model_channel, shm
 from shmio.segment.block import Attributes, Block, BlockWriter, Stamp
-from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, Origin, align, build_segment, wake, write_blocks
-from shmio.segment.clock import ClockPage, time_lock
+from shmio.segment.clock import ClockPage, page_size, time_lock
 from shmio.segment.commands import CommandQueues
-from shmio.segment.events import EVENT_SIZE
-from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
+from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
+from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.model_channel import ModelChannel
-from shmio.segment.playhead import Playhead
-from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
+from shmio.segment.playhead import PLAYHEAD_SIZE, Playhead
+from shmio.segment.processes import GUEST_SLOTS, SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
-from shmio.segment.standing_injections import declared_cell, standing_cell
+from shmio.segment.standing_injections import CELL_SIZE, declared_cell, standing_cell
+from shmio.version import __version__
 
-FIRST_LINK = 2
+PREFIX = "shmio-"
+"""What the name of each segment begins with."""
+
+
+def _align(size: int, to: int) -> int:
+    """Round ``size`` up to a multiple of ``to``."""
+    return -(-size // to) * to
+
+
+_RING_SECONDS = 8
+_SECTIONS_PER_BLOCK = 8  # of a block that has every kind
+_SPARE_SECTIONS = 40 * _SECTIONS_PER_BLOCK
+_OWN_SECTIONS = 1  # of the instance: the clock page
+_SPARE_PROCESSES = 16 + GUEST_SLOTS
+_EVENT_STRIDE = _align(_atomics.RAW_OFFSET + EVENT_SIZE, 64)
+_FIRST_LINK = 2
 """Offset of the lock byte of a block's model channel or playhead: process slots + this + index of its layout."""
 
+_RING = struct.Struct("<8Iqq")
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 
 
-def read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntry]) -> ClockPage:
-    """Open the clock page. FormatError: there is none, or it is inconsistent."""
-    for entry in entries:
-        if entry.kind == SectionKind.CLOCK:
-            try:  # its own mapping, so that frames age even after the segment is closed
-                own = memoryview(shared.map())
-                return ClockPage(own, entry.offset, entry.size, head, partial(shared.taken, time_lock(head)))
-            except ValueError as error:
-                raise FormatError(f"{shared.name}: {error}") from None
-    raise FormatError(
-        f"{shared.name} has no clock page, so shmio {head.version} that made it is older: use one version for both"
-    )
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The time with which an instance starts that replays a recording.
+
+    ``clock_ns``: the clock at the start. ``started_utc_ns``: UTC of clock 0.
+    """
+
+    clock_ns: int
+    started_utc_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class BlockSpec:
+    """Specification of a source's block."""
+
+    source: str
+    layout: Layout
+    period_ns: int
+    stale_ns: int
+    ring_bytes: int
+    """Maximum size of the frame ring."""
+    attributes: Attributes = field(default_factory=Attributes)
+    declared: bytes = b""
+    """The declared injections, as a JSON document of at most STANDING_SIZE bytes."""
+
+    @property
+    def slot_bytes(self) -> int:
+        """Bytes of one slot: header, reason, raw image and effective image."""
+        return _align(_atomics.RAW_OFFSET + 2 * _align(self.layout.size, 8), 64)
+
+    @property
+    def slots(self) -> int:
+        """Number of frames in the ring: 8 s, rounded up to a power of two, within the memory limit; at least 8."""
+        wanted = max(8, _RING_SECONDS * 1_000_000_000 // self.period_ns)
+        slots: int = 1 << (wanted - 1).bit_length()
+        while slots > 8 and slots * self.slot_bytes > self.ring_bytes:
+            slots //= 2
+        return slots
+
+    @property
+    def size(self) -> int:
+        """Bytes of all sections of the block."""
+        return sum(_align(size, 64) for _, size, _ in self.sections())
+
+    def sections(self) -> list[tuple[SectionKind, int, bytes]]:
+        """Return kind, size in bytes and first bytes of each section; the rest is zeros."""
+        layout, attributes = self.layout.to_json(), msgspec.json.encode(self.attributes)
+        effective = _atomics.RAW_OFFSET + _align(self.layout.size, 8)
+        slot = self.slot_bytes, self.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0
+        frames = _RING.pack(self.slots, *slot, self.period_ns, self.stale_ns)
+        linked = _RING.pack(model_channel.SLOTS, *slot, 0, 0)
+        events = _RING.pack(EVENT_SLOTS, _EVENT_STRIDE, EVENT_SIZE, 0, _atomics.RAW_OFFSET, 0, 0, 0, 0, 0)
+        queues = commands.section_header(self.layout.size)
+        return [
+            (SectionKind.LAYOUT, len(layout), layout),
+            (SectionKind.FRAMES, _atomics.RING_HEADER_SIZE + self.slots * self.slot_bytes, frames),
+            (SectionKind.EVENTS, _atomics.RING_HEADER_SIZE + EVENT_SLOTS * _EVENT_STRIDE, events),
+            (SectionKind.COMMANDS, commands.section_size(self.layout.size), queues),
+            (SectionKind.SOURCE, len(attributes), attributes),
+            (SectionKind.STANDING, CELL_SIZE, b""),
+            (SectionKind.DECLARED, CELL_SIZE, bytes(8) + self.declared),
+            *([(SectionKind.LINK, *model_channel.section(linked, self.slot_bytes))] if self.attributes.remote else []),
+            *([(SectionKind.PLAYHEAD, PLAYHEAD_SIZE, b"")] if self.attributes.replay else []),
+        ]
+
+
+def _write_blocks(memory: memoryview, at: int, first: int, blocks: Sequence[BlockSpec]) -> list[SectionEntry]:
+    """Write the sections of blocks from offset ``at`` on; returns their table entries.
+
+    ``first`` is the table index of the first entry.
+    """
+    entries: list[SectionEntry] = []
+    for block in blocks:
+        layout = first + len(entries)
+        for kind, size, begin in block.sections():
+            memory[at : at + len(begin)] = begin
+            digest = block.layout.hash if kind is SectionKind.LAYOUT else bytes(32)
+            of = 0 if kind is SectionKind.LAYOUT else layout
+            entries.append(SectionEntry(kind, False, at, size, of, block.source, digest))
+            at += _align(size, 64)
+    return entries
 
 
 def read_block(
@@ -83,7 +173,7 @@ def read_block(
         queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
         standing = standing_cell(memory, *part(SectionKind.STANDING))
         declared = declared_cell(memory, *part(SectionKind.DECLARED))
-        lock_byte = head.process_capacity + FIRST_LINK + layout_at
+        lock_byte = head.process_capacity + _FIRST_LINK + layout_at
         channel = ModelChannel(shared, memory, *part(SectionKind.LINK), lock_byte) if attributes.remote else None
         playhead = (
             Playhead(shared, memory, *part(SectionKind.PLAYHEAD), lock_byte, clock) if attributes.replay else None
@@ -99,7 +189,93 @@ def read_block(
     )  # fmt: skip
 
 
-PREFIX = "shmio-"
+def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
+    """Wake everybody who waits at these sections. A needless wake-up is harmless."""
+    for entry in entries:
+        with suppress(ValueError):  # nobody waits at an inconsistent section
+            if entry.kind in (SectionKind.FRAMES, SectionKind.EVENTS):
+                _atomics.Ring(memory, entry.offset, entry.size).wake()
+            elif entry.kind == SectionKind.COMMANDS:
+                CommandQueues(memory, entry.offset, entry.size).wake()
+
+
+def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:
+    """Return the size in bytes of a segment with these blocks and processes; ``check`` prints it."""
+    tables = sum(_table_sizes(len(blocks), processes))
+    return HEADER_SIZE + tables + sum(block.size for block in blocks) + _clock_size(processes)
+
+
+def _clock_size(processes: int) -> int:
+    return _align(page_size(processes + _SPARE_PROCESSES), 64)
+
+
+def _table_sizes(blocks: int, processes: int) -> tuple[int, int]:
+    sections = _SECTIONS_PER_BLOCK * blocks + _SPARE_SECTIONS + _OWN_SECTIONS
+    return _align(sections * SECTION_SIZE, 64), (processes + _SPARE_PROCESSES) * SLOT_SIZE
+
+
+def _build_segment(
+    shared: SharedObject,
+    instance: str,
+    blocks: Sequence[BlockSpec],
+    processes: Sequence[ProcessSpec],
+    mode: str,
+    control: str,
+    *,
+    config: Path | None = None,
+    stepped: bool,
+    origin: Origin | None = None,
+) -> None:
+    """Allocate a new shared-memory object and write the whole segment, the magic last."""
+    now_ns, begin_ns = time.monotonic_ns(), origin.clock_ns if origin else 0
+    size = segment_size(blocks, len(processes))
+    sections_size, processes_size = _table_sizes(len(blocks), len(processes))
+    shared.allocate(size)
+    with memoryview(shared.map()) as memory:
+        head = Header(
+            epoch=secrets.randbits(64) | 1,
+            size=size,
+            started_utc_ns=origin.started_utc_ns if origin else time.time_ns(),
+            started_ns=now_ns - begin_ns,
+            sections_offset=HEADER_SIZE,
+            section_capacity=sections_size // SECTION_SIZE,
+            processes_offset=HEADER_SIZE + sections_size,
+            process_capacity=processes_size // SLOT_SIZE,
+            mode=mode,
+            instance=instance,
+            version=__version__,
+            control=control,
+        )
+        head.write(memory)
+        if config:
+            header.write_config(memory, config)
+        ProcessTable.write(memory, head, processes)
+        header.write_supervisor(memory, os.getpid(), State.STARTING)
+        if origin:
+            header.write_supervised_since(memory, now_ns)
+        supervisor_beat(memory)
+        entries = _write_blocks(memory, HEADER_SIZE + sections_size + processes_size, 0, blocks)
+        clock_size = _clock_size(len(processes))
+        clock_at = size - clock_size
+        ClockPage.write_new(memory, clock_at, head.process_capacity, virtual=stepped, time_ns=begin_ns)
+        own = len(entries)
+        entries.append(SectionEntry(SectionKind.CLOCK, False, clock_at, clock_size, own, "clock", bytes(32)))
+        header.change_sections(memory, head, entries)
+        header.finish(memory)
+
+
+def _read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntry]) -> ClockPage:
+    """Open the clock page. FormatError: there is none, or it is inconsistent."""
+    for entry in entries:
+        if entry.kind == SectionKind.CLOCK:
+            try:  # its own mapping, so that frames age even after the segment is closed
+                own = memoryview(shared.map())
+                return ClockPage(own, entry.offset, entry.size, head, partial(shared.taken, time_lock(head)))
+            except ValueError as error:
+                raise FormatError(f"{shared.name}: {error}") from None
+    raise FormatError(
+        f"{shared.name} has no clock page, so shmio {head.version} that made it is older: use one version for both"
+    )
 
 
 class Segment:
@@ -116,7 +292,7 @@ class Segment:
         self.processes = ProcessTable(shared, self.memory, self.header)
         self._turn = threading.RLock()
         """Held while ``blocks`` change, which several threads may check at once."""
-        self.clock = read_clock(shared, self.header, self._sections())
+        self.clock = _read_clock(shared, self.header, self._sections())
         self._known: dict[int, Block] = {}  # by the section of its layout
         self.blocks = self._find_blocks()
 
@@ -163,7 +339,7 @@ class Segment:
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
                 raise AlreadyRunningError(f"another supervisor is starting instance {instance}")
             try:
-                build_segment(
+                _build_segment(
                     shared, instance, blocks, processes, mode, control, config=config, stepped=stepped, origin=origin
                 )
                 return cls(shared, instance)
@@ -298,14 +474,14 @@ class Segment:
             SegmentError: There is no room in shared memory or in the section table.
         """
         entries = self._sections()
-        if len(add) > (vacant := (self.header.section_capacity - len(entries)) // SECTIONS_PER_BLOCK):
+        if len(add) > (vacant := (self.header.section_capacity - len(entries)) // _SECTIONS_PER_BLOCK):
             raise SegmentError(
                 f"segment {self.shared.name} has room for {vacant} more blocks, not for {len(add)} (each new or "
                 "changed source takes one, until the instance ends): restart the instance: shmio-supervisor down, up"
             )
         head = self.header
         tables = head.processes_offset + head.process_capacity * SLOT_SIZE
-        at = align(max([tables, *(entry.offset + entry.size for entry in entries)]), 64)
+        at = _align(max([tables, *(entry.offset + entry.size for entry in entries)]), 64)
         size = at + sum(block.size for block in add)
         before = self.shared.size
         self.shared.allocate(size)
@@ -323,7 +499,7 @@ class Segment:
         """
         at = self.reserve(add)
         first = len(self._sections())  # which maps what has been added, too
-        self._change(write_blocks(self.memory, at, first, add), {self.blocks[name].section for name in retire})
+        self._change(_write_blocks(self.memory, at, first, add), {self.blocks[name].section for name in retire})
 
     def end_replaced(self) -> None:
         """Finish a :meth:`change` whose supervisor died, and wake everybody who waits at retired blocks."""

@@ -55,7 +55,7 @@ GROUPS: Final = {
             "tests/unit/local/test_writer.py",
             "tests/unit/layout/values/test_write.py",
             "tests/unit/segment/test_command*.py",
-            "tests/unit/segment/test_change.py",
+            "tests/unit/segment/test_segment_change.py",
         ),
     ),
     "streams": Group(

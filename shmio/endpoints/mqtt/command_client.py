@@ -11,7 +11,7 @@ from shmio.layout.model import Register
 from shmio.layout.values.write import sizes
 from shmio.local.writer import REPLACED, RETIRED, SourceWriter
 from shmio.segment import DONE, Block, EventKind
-from shmio.segment.pending_commands import End, worst
+from shmio.segment.commands import End, worst
 
 Done = Callable[[EventKind, str], None]
 """Called once for each command, with its outcome and the reason."""

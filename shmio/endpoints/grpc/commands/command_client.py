@@ -22,8 +22,7 @@ from shmio.layout.topic import find
 from shmio.layout.values.write import Write, merge, sizes
 from shmio.local.writer import RETIRED, PendingCommand, SourceWriter
 from shmio.segment import Block, Event, EventKind
-from shmio.segment.commands import InjectionOptions
-from shmio.segment.pending_commands import End
+from shmio.segment.commands import End, InjectionOptions
 
 RETRY_S: Final = 0.25
 """Pause before a source that has not lifted an injection is asked again."""

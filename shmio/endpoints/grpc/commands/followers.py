@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, Protocol
 
 from shmio.segment import Event, EventKind
-from shmio.segment.pending_commands import CommandAssembler, CommandWrites
+from shmio.segment.commands import CommandAssembler, CommandWrites
 
 _STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.ACTIVATED, EventKind.DEACTIVATED})
 

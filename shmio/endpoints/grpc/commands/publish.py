@@ -19,7 +19,7 @@ from shmio.endpoints.in_flight import Done, in_words
 from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind
-from shmio.segment.pending_commands import End, worst
+from shmio.segment.commands import End, worst
 
 TURNS: Final = 3
 """Turns that are awaited, as one of gRPC's threads may be delayed with what it received."""

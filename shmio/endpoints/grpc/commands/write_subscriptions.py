@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from shmio.endpoints.grpc.streams.channel import Subject
 from shmio.layout.values.write import Write, covering
 from shmio.segment import Block, Event, EventKind
-from shmio.segment.pending_commands import NO_COMMAND, apply
+from shmio.segment.commands import NO_COMMAND, apply
 
 
 class PendingImage:

@@ -22,7 +22,7 @@ from shmio.layout.values.write import covering, encode
 from shmio.local.writer import RETIRED
 from shmio.segment import DONE, Direction, EventKind
 from shmio.segment.changed_registers import ChangeScan
-from shmio.segment.pending_commands import CommandWrites, End, apply, worst
+from shmio.segment.commands import CommandWrites, End, apply, worst
 
 Leave = Callable[[], None]
 

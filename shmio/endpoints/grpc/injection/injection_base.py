@@ -8,7 +8,7 @@ import numpy as np
 
 from shmio.layout.values.write import Write
 from shmio.segment import Block
-from shmio.segment.pending_commands import apply
+from shmio.segment.commands import apply
 
 
 class InjectionBase:

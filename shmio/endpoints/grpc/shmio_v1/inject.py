@@ -23,8 +23,7 @@ from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.layout.values.write import Write, covering, merge
 from shmio.segment import Direction, EventKind, Frame
-from shmio.segment.commands import MAX_NAME_BYTES
-from shmio.segment.pending_commands import CommandWrites, End, apply, worst
+from shmio.segment.commands import MAX_NAME_BYTES, CommandWrites, End, apply, worst
 from shmio.wire import shmio_v1_pb2 as wire
 
 _RANGES: Final = wire.Table.DESCRIPTOR.fields_by_name["ranges"].number

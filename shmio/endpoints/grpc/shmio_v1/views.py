@@ -16,8 +16,8 @@ from shmio.layout.model import Register
 from shmio.layout.values.write import covering
 from shmio.model.values import Column
 from shmio.segment import Block, Event, Frame
+from shmio.segment.commands import NO_COMMAND, apply
 from shmio.segment.events import EVENT_DATA_SIZE
-from shmio.segment.pending_commands import NO_COMMAND, apply
 from shmio.wire import shmio_v1_pb2 as wire
 
 VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, AGE_NS = (

@@ -13,7 +13,7 @@ import shmio
 from shmio.errors import NotRunningError, PathError, SegmentError
 from shmio.layout.model import Layout, Register
 from shmio.local.reading import View
-from shmio.segment import Block, BlockSpec, ProcessSpec, Quality, Segment, _atomics, build, header, shm
+from shmio.segment import Block, BlockSpec, ProcessSpec, Quality, Segment, _atomics, header, shm
 from shmio.segment import segment as sections
 
 OLD = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
@@ -154,7 +154,7 @@ def test_who_waits_is_woken_by_the_successor_wherever_the_supervisor_died(
             waiter.start()
         with monkeypatch.context() as patched:
             patched.setattr(header, "_set_table_state", dying(header._set_table_state))
-            patched.setattr("shmio.segment.segment.wake", dying(build.wake, before=True))
+            patched.setattr("shmio.segment.segment.wake", dying(sections.wake, before=True))
             with pytest.raises(SystemExit):
                 segment.change(add=[spec("cell", NEW)], retire=["cell"])
         assert all(waiter.is_alive() for waiter in waiters)
