@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Final, Generic, Self, TypeVar
 
 from shmio.segment.block import Block
-from shmio.segment.relay import Relay
+from shmio.segment.doorbell import Relay
 
 TURN_S: Final = 0.2
 """How often a waiting iterator checks that the instance still runs, and whether it was closed."""

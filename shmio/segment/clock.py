@@ -21,10 +21,14 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from shmio.errors import SegmentError
 from shmio.model.clock import Clock, ClockMode
 from shmio.segment import _atomics
-from shmio.segment.double_buffer import DoubleBuffer
+from shmio.segment.doorbell import Doorbell
 from shmio.segment.header import Header, cut, text
+
+SIMULATED_UTC_NS: Final = 946_684_800_000_000_000
+"""UTC of clock 0 for an instance whose time is virtual from the start: 2000-01-01."""
 
 _SLOTS_AT: Final = 8
 _STEPPED_AT: Final = 12
@@ -38,38 +42,33 @@ _TIME: Final = struct.Struct("<IIQqq")  # the first fields of _STATE
 _NOTE_SIZE: Final = 167
 _PLAYING: Final = 1
 _STEPPING: Final = 2
+_ATTEMPTS: Final = 4
 
 
-class Doorbell:
-    """A futex word in shared memory; ringing it wakes all who wait. Only ringing needs a writable mapping."""
+class DoubleBuffer:
+    """A value in shared memory, stored in two copies (docs/reference/segment-format.md).
 
-    def __init__(self, memory: memoryview, offset: int) -> None:
+    Several threads may read it.
+    """
+
+    def __init__(self, memory: memoryview, copies: tuple[int, int], complaint: str) -> None:
+        """``copies``: offsets of the copies. ``complaint``: message of the error if both are corrupt."""
         self._memory = memory
-        self._offset = offset
+        self._copies = copies
+        self._complaint = complaint
 
-    def value(self) -> int:
-        """Return the present value. Read it before you check for changes."""
-        return _atomics.bell(self._memory, self._offset)
+    def read(self, size: int) -> bytes:
+        """Return the first ``size`` bytes. SegmentError: both copies are corrupt."""
+        for at in self._copies * _ATTEMPTS:
+            data = _atomics.cell_read(self._memory, at, size)
+            if data is not None:
+                return data
+        raise SegmentError(self._complaint)
 
-    def ring(self) -> None:
-        """Wake all who wait."""
-        _atomics.bell_ring(self._memory, self._offset)
-
-    def wait(self, seen: int, timeout_ns: int = -1) -> int:
-        """Wait until the value differs from ``seen``, at most ``timeout_ns`` (negative: forever).
-
-        Returns:
-            The value after the wait.
-        """
-        return _atomics.bell_wait(self._memory, self._offset, seen, timeout_ns)
-
-    def relay(self, shared: bytearray, descriptor: int, turn_ns: int) -> None:
-        """Run the thread of a :class:`~shmio.segment.relay.Relay`."""
-        _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
-
-
-SIMULATED_UTC_NS: Final = 946_684_800_000_000_000
-"""UTC of clock 0 for an instance whose time is virtual from the start: 2000-01-01."""
+    def write(self, data: bytes) -> None:
+        """Write one copy, then the other. Only the owner may."""
+        for at in self._copies:
+            _atomics.cell_write(self._memory, at, data)
 
 
 class ClockPage:
@@ -79,7 +78,7 @@ class ClockPage:
         """``head``: the segment's header. ``owned``: whether anybody owns time. ValueError: wrong geometry."""
         slots = head.process_capacity
         if size < page_size(slots) or _word(memory, offset + _SLOTS_AT) != slots:
-            raise ValueError("the clock page is too short, or has not a place for each process")
+            raise ValueError("the clock page is too short, or does not have a place for each process")
         self._memory = memory
         self._offset = offset
         self._state = _cell(memory, offset)

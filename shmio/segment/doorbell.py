@@ -1,4 +1,4 @@
-"""Turn a doorbell in shared memory into a readable descriptor, for event loops, which cannot wait on a futex."""
+"""Doorbells in shared memory, which processes wait on, and their relay to event loops."""
 
 from __future__ import annotations
 
@@ -10,12 +10,40 @@ from shmio.segment import _atomics
 
 TURN_NS: Final = 200_000_000
 """Longest time between two notifications: listeners also check ages, and changes that ring no doorbell."""
-AGAIN_S: Final = 0.01
-"""How often a thread is told to stop until it has ended: one about to wait may miss the request."""
+_STOP_AGAIN_S: Final = 0.01
+"""How often :meth:`Relay.join` repeats its request: a thread that is about to wait may miss it."""
+
+
+class Doorbell:
+    """A futex word in shared memory; ringing it wakes all who wait. Only ringing needs a writable mapping."""
+
+    def __init__(self, memory: memoryview, offset: int) -> None:
+        self._memory = memory
+        self._offset = offset
+
+    def value(self) -> int:
+        """Return the present value. Read it before you check for changes."""
+        return _atomics.bell(self._memory, self._offset)
+
+    def ring(self) -> None:
+        """Wake all who wait."""
+        _atomics.bell_ring(self._memory, self._offset)
+
+    def wait(self, seen: int, timeout_ns: int = -1) -> int:
+        """Wait until the value differs from ``seen``, at most ``timeout_ns`` (negative: forever).
+
+        Returns:
+            The value after the wait.
+        """
+        return _atomics.bell_wait(self._memory, self._offset, seen, timeout_ns)
+
+    def relay(self, shared: bytearray, descriptor: int, turn_ns: int) -> None:
+        """Run the thread of a :class:`Relay`."""
+        _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
 
 
 class WakeSource(Protocol):
-    """A doorbell: :class:`~shmio.segment.clock.Doorbell`, or that of a ring."""
+    """A :class:`Doorbell`, or the ring of a block, which has one of its own."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
         """Wait for rings and signal the descriptor until stopped, without the interpreter's lock."""
@@ -57,7 +85,7 @@ class Relay:
         """Stop, and wait until the thread has ended, which takes less than ``turn_ns``."""
         while self._thread.is_alive():
             self.stop()
-            self._thread.join(AGAIN_S)
+            self._thread.join(_STOP_AGAIN_S)
 
     def _run(self) -> None:
         try:

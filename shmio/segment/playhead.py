@@ -14,18 +14,15 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 
 from shmio.errors import CommandError
 from shmio.segment import _atomics
-from shmio.segment.double_buffer import DoubleBuffer
+from shmio.segment.clock import ClockPage, DoubleBuffer
 from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
-
-if TYPE_CHECKING:
-    from shmio.segment.clock import ClockPage
 
 OWN_WORDS: Final = "replay: "
 """Prefix of a replay's own reasons and event texts; those without it were recorded."""

@@ -32,7 +32,7 @@ from shmio.endpoints.mqtt.topic_guard import MOST_WAITING, TopicGuard
 from shmio.endpoints.mqtt.topic_rules import TopicRules
 from shmio.layout.topic import shorten
 from shmio.segment import ProcessSlot, Quality, Segment
-from shmio.segment.relay import TURN_NS, Relay
+from shmio.segment.doorbell import TURN_NS, Relay
 
 OFFLINE: Final = b"offline"
 STOPPED: Final = "the bridge was stopped"

@@ -11,7 +11,7 @@ import pytest
 
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment, _atomics
-from shmio.segment.relay import Relay
+from shmio.segment.doorbell import Relay
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
 LONG_NS = 600_000_000_000

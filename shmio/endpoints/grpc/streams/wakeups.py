@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from shmio.segment import Block
-from shmio.segment.relay import TURN_NS, Relay, WakeSource
+from shmio.segment.doorbell import TURN_NS, Relay, WakeSource
 
 log = logging.getLogger("shmio.grpc")
 
