@@ -10,8 +10,8 @@ import msgspec
 
 from shmio.config import Declaration
 from shmio.recording.dump import Dump
-from shmio.recording.explain import Explained, Explainer, Place
 from shmio.segment.events import NO_WRITER, Event, EventKind
+from shmio.segment.explain import Explained, Explainer, Place
 
 NS = 1e9
 

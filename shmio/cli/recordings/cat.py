@@ -19,13 +19,13 @@ from shmio.layout.glob import named
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
-from shmio.recording.explain import Explainer
 from shmio.recording.format.channels import Channel
 from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
 from shmio.recording.reading.reader import Message, Reader
 from shmio.recording.reading.survey import Survey, survey
 from shmio.recording.times import span
 from shmio.segment import Event, Frame
+from shmio.segment.explain import Explainer
 
 
 def execute(arguments: argparse.Namespace) -> int:

@@ -17,12 +17,12 @@ from shmio.layout.values.codec import codec
 from shmio.layout.values.text import json_value, to_text
 from shmio.logs import printable
 from shmio.recording.columns import heading
-from shmio.recording.explain import ABOUT, Explained, cells_of, kind_of, object_of
 from shmio.recording.format.channels import Channel
 from shmio.recording.format.encoding import Gap, ProcessChange, StepMark
 from shmio.recording.times import iso, local
 from shmio.segment import Event, EventKind, Frame, Quality
 from shmio.segment.changed_registers import ChangeScan
+from shmio.segment.explain import ABOUT, Explained, cells_of, kind_of, object_of
 
 
 class View:

@@ -9,10 +9,10 @@ from itertools import islice
 from typing import IO, Any, Final
 
 from shmio.recording.dump import Dump
-from shmio.recording.explain import Explainer, cells_of, kind_of
 from shmio.recording.libraries import ANALYSIS, library
 from shmio.recording.reading.blocks import DumpBlock
 from shmio.recording.times import iso
+from shmio.segment.explain import Explainer, cells_of, kind_of
 
 NUMBERS: Final = ("frame", "cycle", "injection", "command", "item", "items", "offset", "mask", "size")
 COLUMNS: Final = (

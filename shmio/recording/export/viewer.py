@@ -15,10 +15,10 @@ from mcap.writer import Writer
 from shmio.layout.model import Register
 from shmio.recording.columns import Columns, heading
 from shmio.recording.dump import Dump
-from shmio.recording.explain import Explainer, kind_of, object_of
 from shmio.recording.names import Chosen
 from shmio.recording.pieces import pieces
 from shmio.recording.reading.blocks import DumpBlock
+from shmio.segment.explain import Explainer, kind_of, object_of
 from shmio.version import __version__
 
 FRAME: Final = "frame"

@@ -1,4 +1,4 @@
-"""Explain recorded events: name their registers, values, direction and writer."""
+"""Explain events: name their registers, values, direction and writer. Loads numpy, so import it late."""
 
 from __future__ import annotations
 
