@@ -121,8 +121,10 @@ class FrameCheck:
         if frame.clock_ns != frame.publish_ns - self._started_ns:
             self._say(frame, f"the clock says {frame.clock_ns}, the instance started at {self._started_ns}")
         late_ns = frame.publish_ns - self._started_ns - frame.cycle * self.source.period_ns
-        if frame.quality is Quality.GOOD and not 0 <= late_ns <= HELD_UP_NS:
-            self._say(frame, f"published {late_ns / 1e6:.1f} ms after its cycle was due")
+        # A change of what is injected repeats the last image with its age: after a restart, the predecessor's.
+        if frame.quality is Quality.GOOD and (late_ns < 0 or late_ns - 1000 * frame.delay_us > HELD_UP_NS):
+            age_ms = frame.delay_us / 1e3
+            self._say(frame, f"published {late_ns / 1e6:.1f} ms after its cycle was due, its image {age_ms:.1f} ms old")
 
     def _quality(self, frame: Frame) -> None:
         if (frame.quality is Quality.GOOD) == bool(frame.reason):

@@ -236,7 +236,7 @@ class Injecting:
 
 
 def standing(attachment: Attachment, source: str, initial: str) -> list[Injection[Mapping[str, Any]]]:
-    """The injections over a source whose names begin so; those of SimlogAPI v1 are named by the path of their shadow."""
+    """The injections over a source whose names begin so. SimlogAPI v1 names them by the path of their shadow."""
     return [one for one in attachment.injections(source) if one.name.rpartition("/")[2].startswith(initial)]
 
 

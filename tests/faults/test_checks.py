@@ -97,6 +97,16 @@ def feed(check: FrameCheck, *frames: tuple[Frame, int]) -> None:
         check.frame(one, missed, one.publish_ns + MS)
 
 
+def test_a_late_frame_passes_only_with_the_age_of_its_image(check: FrameCheck, found: list[str]) -> None:
+    late = good(1)
+    late = late._replace(publish_ns=late.publish_ns + 5000 * MS, clock_ns=late.clock_ns + 5000 * MS)
+    feed(check, (late._replace(delay_us=5_000_000), 0))
+    assert found == []
+    check.begin(STARTED_NS)
+    feed(check, (late, 0))
+    assert "after its cycle was due, its image 0.0 ms old" in found[0]
+
+
 def test_a_good_history_passes(check: FrameCheck, found: list[str]) -> None:
     lost = good(5, quality=Quality.BAD, reason="no answer")
     feed(check, (good(1), 0), (good(2), 0), (good(5), 2), (lost._replace(number=6, raw=good(5).raw), 0))
