@@ -19,6 +19,7 @@ import os
 import select
 import selectors
 import socket
+import stat
 import struct
 import time
 from collections.abc import Callable
@@ -29,8 +30,19 @@ from typing import Any, Final
 import msgspec
 
 from shmio.errors import ControlError, UnreachableError
-from shmio.supervisor.socketpath import remove_socket
 
+MAX_PATH_BYTES: Final = 107  # sun_path holds 108 with the final zero, unix(7)
+MAX_REQUEST_BYTES: Final = 4096
+MAX_ANSWER_BYTES: Final = 65536
+MAX_CLIENTS: Final = 8
+REQUEST_S: Final = 2.0
+"""Time in which a client must send its request."""
+TURN_S: Final = 0.5
+"""How often a waiting client checks that the supervisor is alive."""
+CONNECT_S: Final = 0.05
+"""How often to retry while the supervisor has too many clients."""
+_TOO_MANY: Final = "too many control connections at once"
+_CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 LINE_CHARS: Final = 2000
 _MORE: Final = {
     "warnings": "… and {} more warnings: shmio-supervisor check prints them",
@@ -44,58 +56,58 @@ room.
 """
 
 
-def cut(line: str) -> str:
-    """Return a line of at most ``LINE_CHARS`` characters."""
-    return line if len(line) <= LINE_CHARS else line[: LINE_CHARS - 1] + "…"
+def socket_path(instance: str) -> str:
+    """Return the path of an instance's control socket; create its folder with mode 0700.
+
+    It is in the first usable of ``$XDG_RUNTIME_DIR/shmio``, ``/run/user/<uid>/shmio`` and
+    ``/tmp/shmio-<uid>``.
+
+    Raises:
+        ControlError: No folder is usable: it belongs to another user, or the path is too long.
+
+    """
+    uid = os.getuid()
+    given = os.environ.get("XDG_RUNTIME_DIR")
+    folders = [Path(given) / "shmio"] if given and Path(given).is_absolute() else []
+    folders += [Path(f"/run/user/{uid}/shmio"), Path(f"/tmp/shmio-{uid}")]  # noqa: S108  made with care below
+    refused = []
+    for folder in folders:
+        path = folder / f"{instance}.sock"
+        if len(os.fsencode(path)) > MAX_PATH_BYTES:
+            refused.append(f"{folder}: the path is longer than {MAX_PATH_BYTES} bytes")
+            continue
+        reason = _prepare(folder, uid)
+        if reason is None:
+            return str(path)
+        refused.append(f"{folder}: {reason}")
+    raise ControlError(f"no folder for the control socket ({'; '.join(refused)})")
 
 
-def cut_lines(text: str, most_chars: int) -> str:
-    """Return a text with long lines cut; lines beyond ``most_chars`` are counted instead."""
-    lines = text.split("\n")
-    kept: list[str] = []
-    for line in map(cut, lines):
-        most_chars -= len(line) + 1
-        if most_chars < 0:
-            return "\n".join([*kept, f"{len(lines) - len(kept)} more lines"])
-        kept.append(line)
-    return "\n".join(kept)
+def _prepare(folder: Path, uid: int) -> str | None:
+    """Create a folder for this user alone; return why not, or None.
+
+    Symbolic links are not followed.
+    """
+    try:
+        with suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            if os.fstat(fd).st_uid != uid:
+                return "belongs to another user"
+            os.fchmod(fd, 0o700)
+        finally:
+            os.close(fd)
+    except OSError as error:
+        return error.strerror
+    return None
 
 
-def shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
-    """Return the answer shortened to fit as JSON; lines left out are counted."""
-    short = dict(answer)
-    shortened = {key: [cut(line) for line in lines] for key in _MORE if isinstance(lines := answer.get(key), list)}
-    short.update(shortened)
-    for key, lines in shortened.items():
-        excess = len(msgspec.json.encode(short)) - most_bytes
-        if excess <= 0:
-            break
-        if lines:
-            short[key] = _first(lines, excess, _MORE[key])
-    return short
-
-
-def _first(lines: list[str], excess: int, more: str) -> list[str]:
-    """Return the first lines, at least ``excess`` bytes shorter."""
-    excess += len(msgspec.json.encode(more)) + 8  # the number, and a comma
-    count = len(lines)
-    while count and excess > 0:
-        count -= 1
-        excess -= len(msgspec.json.encode(lines[count])) + 1
-    return [*lines[:count], more.format(len(lines) - count)]
-
-
-MAX_REQUEST_BYTES: Final = 4096
-MAX_ANSWER_BYTES: Final = 65536
-MAX_CLIENTS: Final = 8
-REQUEST_S: Final = 2.0
-"""Time in which a client must send its request."""
-TURN_S: Final = 0.5
-"""How often a waiting client checks that the supervisor is alive."""
-CONNECT_S: Final = 0.05
-"""How often to retry while the supervisor has too many clients."""
-_TOO_MANY: Final = "too many control connections at once"
-_CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
+def remove_socket(path: str) -> None:
+    """Remove a socket. Anything else of that name stays, and bind reports it."""
+    with suppress(FileNotFoundError):
+        if stat.S_ISSOCK(os.lstat(path).st_mode):
+            Path(path).unlink()
 
 
 class _Request(msgspec.Struct, tag_field="do", forbid_unknown_fields=True):
@@ -135,11 +147,11 @@ class Answer:
 
     def ok(self, **values: object) -> None:
         """Answer with success. Lists of lines are shortened to fit."""
-        self._server.answer(self._client, shorten({"ok": True, **values}, MAX_ANSWER_BYTES - 1))
+        self._server.answer(self._client, _shorten({"ok": True, **values}, MAX_ANSWER_BYTES - 1))
 
     def error(self, message: str) -> None:
         """Answer with an error."""
-        self._server.answer(self._client, {"error": cut_lines(message, MAX_ANSWER_BYTES // 8)})
+        self._server.answer(self._client, {"error": _cut_lines(message, MAX_ANSWER_BYTES // 8)})
 
 
 class ControlServer:
@@ -355,3 +367,44 @@ def _hung_up(client: socket.socket) -> bool:
 def _send(client: socket.socket, message: dict[str, object]) -> None:
     with suppress(OSError):
         client.send(msgspec.json.encode(message) + b"\n", socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT)
+
+
+def _cut(line: str) -> str:
+    """Return a line of at most ``LINE_CHARS`` characters."""
+    return line if len(line) <= LINE_CHARS else line[: LINE_CHARS - 1] + "…"
+
+
+def _cut_lines(text: str, most_chars: int) -> str:
+    """Return a text with long lines cut; lines beyond ``most_chars`` are counted instead."""
+    lines = text.split("\n")
+    kept: list[str] = []
+    for line in map(_cut, lines):
+        most_chars -= len(line) + 1
+        if most_chars < 0:
+            return "\n".join([*kept, f"{len(lines) - len(kept)} more lines"])
+        kept.append(line)
+    return "\n".join(kept)
+
+
+def _shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
+    """Return the answer shortened to fit as JSON; lines left out are counted."""
+    short = dict(answer)
+    shortened = {key: [_cut(line) for line in lines] for key in _MORE if isinstance(lines := answer.get(key), list)}
+    short.update(shortened)
+    for key, lines in shortened.items():
+        excess = len(msgspec.json.encode(short)) - most_bytes
+        if excess <= 0:
+            break
+        if lines:
+            short[key] = _first_lines(lines, excess, _MORE[key])
+    return short
+
+
+def _first_lines(lines: list[str], excess: int, more: str) -> list[str]:
+    """Return the first lines, at least ``excess`` bytes shorter."""
+    excess += len(msgspec.json.encode(more)) + 8  # the number, and a comma
+    count = len(lines)
+    while count and excess > 0:
+        count -= 1
+        excess -= len(msgspec.json.encode(lines[count])) + 1
+    return [*lines[:count], more.format(len(lines) - count)]

@@ -1,23 +1,115 @@
-"""The state of the instance, derived from its processes and sources, and its publication."""
+"""The state of the instance: assessed, and published to the segment, the service manager and the log."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
 from typing import Final
 
+from shmio.config.folder import unwritable
 from shmio.errors import SegmentError
 from shmio.local.status import assess
 from shmio.segment import Quality, Segment
 from shmio.segment import State as InstanceState
-from shmio.supervisor.fleet import Fleet
-from shmio.supervisor.log_folder import LogFolder
-from shmio.supervisor.managed import log
-from shmio.supervisor.notify import Notifier
-from shmio.supervisor.states import State
+from shmio.supervisor.fleet import Fleet, log
+from shmio.supervisor.policy import State
+from shmio.supervisor.process import NOTIFY_VARIABLES
 
 QUALITY_S: Final = 0.5
 """How often the sources' quality is checked after the start."""
+LOOK_S: Final = 5.0
+"""How often the folder of the log files is checked."""
+SILENT_S: Final = 15.0
+"""A disk that does not answer for this long is a problem."""
+
+_SOCKET, _WATCHDOG_USEC, _WATCHDOG_PID = NOTIFY_VARIABLES
+
+
+class LogFolder:
+    """Checks from time to time whether the folder of the log files is writable, in a thread because a disk may hang."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._looking: threading.Thread | None = None
+        self._begun_ns: int | None = None
+        self._found = ""
+
+    def problem(self, now_ns: int) -> str:
+        """Return the problem found last; empty if there is none."""
+        waited_s = 0.0 if self._begun_ns is None else (now_ns - self._begun_ns) / 1e9
+        if self._looking is not None and self._looking.is_alive():
+            return f"log_dir: {self._folder}: the disk does not answer" if waited_s > SILENT_S else self._found
+        if self._begun_ns is None or waited_s >= LOOK_S:
+            self._begun_ns = now_ns
+            self._looking = threading.Thread(target=self._look, name="log folder", daemon=True)
+            with suppress(RuntimeError):  # the host cannot start a thread now: try again later
+                self._looking.start()
+        return self._found
+
+    def _look(self) -> None:
+        obstacle = unwritable(self._folder)
+        self._found = f"log_dir: {obstacle.reason}; log lines are lost until that is fixed" if obstacle else ""
+
+
+class Notifier:
+    """Notifies the service manager that the environment names, if any (sd_notify(3)).
+
+    Nothing here fails or blocks: an instance runs with or without a service manager.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        self._path = _socket_address(environment.get(_SOCKET, ""))
+        self._period_ns = _watchdog_ns(environment) // 2  # twice as often as is asked for
+        self._beat_ns = 0
+
+    def ready(self) -> None:
+        """Report that the start or a reload is over."""
+        self._send("READY=1")
+
+    def reloading(self) -> None:
+        """Report that a reload has begun."""
+        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+
+    def stopping(self) -> None:
+        """Report that the stop has begun."""
+        self._send("STOPPING=1")
+
+    def status(self, text: str) -> None:
+        """Report a line of text for people."""
+        self._send("STATUS=" + text.replace("\n", " "))
+
+    def beat(self, now_ns: int) -> None:
+        """Trigger the watchdog, as often as the service manager asks."""
+        if self._period_ns and now_ns - self._beat_ns >= self._period_ns:
+            self._beat_ns = now_ns
+            self._send("WATCHDOG=1")
+
+    def _send(self, *lines: str) -> None:
+        if not self._path:
+            return
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+            client.setblocking(False)
+            client.sendto("\n".join(lines).encode(), self._path)
+
+
+def _socket_address(name: str) -> str:
+    """Return the address of the socket: a path, or an abstract name after ``@``; empty for others."""
+    if name.startswith("@"):
+        return "\0" + name[1:]
+    return name if name.startswith("/") else ""
+
+
+def _watchdog_ns(environment: Mapping[str, str]) -> int:
+    """Return the watchdog period in ns; 0 if there is none, or it is for another process."""
+    if environment.get(_WATCHDOG_PID, str(os.getpid())) != str(os.getpid()):
+        return 0
+    text = environment.get(_WATCHDOG_USEC, "")
+    return int(text) * 1000 if text.isascii() and text.isdigit() else 0
 
 
 class Health:

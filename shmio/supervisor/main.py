@@ -21,16 +21,11 @@ from shmio.plan.processes import MODULES, Plan
 from shmio.segment import Segment
 from shmio.segment import State as InstanceState
 from shmio.supervisor import policy
-from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop
-from shmio.supervisor.fleet import TICK_S, Fleet
-from shmio.supervisor.health import Health
-from shmio.supervisor.log_folder import LogFolder
-from shmio.supervisor.managed import brief, log
-from shmio.supervisor.notify import Notifier
-from shmio.supervisor.policy import Limits
+from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop, socket_path
+from shmio.supervisor.fleet import TICK_S, Fleet, brief, log
+from shmio.supervisor.health import Health, LogFolder, Notifier
+from shmio.supervisor.policy import Event, Limits, State
 from shmio.supervisor.reload import Reloader
-from shmio.supervisor.socketpath import socket_path
-from shmio.supervisor.states import Event, State
 from shmio.supervisor.takeover import take_over
 
 

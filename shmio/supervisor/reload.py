@@ -1,35 +1,110 @@
-"""Carries out reloads.
+"""Reloads and take-overs: compares an instance with its plan, and changes it to match.
 
-A thread makes the plan, so that supervision continues; the supervisor's loop applies it.
+Whatever matches the plan already is left alone. A thread makes the plan of a reload, so that supervision continues; the
+supervisor's loop applies it.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 from shmio.errors import ShmioError
 from shmio.logs import fields
 from shmio.plan.processes import Job, Plan
-from shmio.segment import Block, Segment
+from shmio.segment import Block, BlockSpec, Segment
 from shmio.supervisor import policy
 from shmio.supervisor.control import Answer
-from shmio.supervisor.fleet import Fleet
-from shmio.supervisor.managed import brief, log
-from shmio.supervisor.notify import Notifier
-from shmio.supervisor.policy import Limits
-from shmio.supervisor.reconcile import reconcile, refusal
-from shmio.supervisor.states import Event, State
+from shmio.supervisor.fleet import Fleet, brief, digest, log
+from shmio.supervisor.health import Notifier
+from shmio.supervisor.policy import Event, Limits, State
 
-SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
+
+@dataclass(frozen=True, slots=True)
+class _Changes:
+    """The differences between an instance and a plan, by name. ``replaced`` processes stop and start."""
+
+    kept: tuple[str, ...]
+    started: tuple[str, ...]
+    stopped: tuple[str, ...]
+    replaced: tuple[str, ...]
+    add: tuple[BlockSpec, ...]
+    retire: tuple[str, ...]
+
+
+def _reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> _Changes:
+    """Compare a plan with the present processes and blocks.
+
+    A source is replaced together with its block, because a source process writes to one block only.
+    """
+    present = {block.source: block for block in blocks}
+    add = tuple(spec for spec in plan.blocks if spec.source not in present or not _same(spec, present[spec.source]))
+    planned = {spec.source for spec in plan.blocks}
+    retire = (*(spec.source for spec in add if spec.source in present), *(n for n in present if n not in planned))
+    changed = {spec.source for spec in add}
+    kept, started, replaced = [], [], []
+    processes = {managed.name: managed for managed in fleet}
+    stopped = [name for name in processes if name not in {job.name for job in plan.jobs}]
+    for job in plan.jobs:
+        there = processes.get(job.name)
+        if there is None:
+            started.append(job.name)
+        elif there.slot.kind != job.kind:  # another process of the same name
+            stopped.append(job.name)
+            started.append(job.name)
+        elif (
+            there.well
+            and there.slot.digest == digest(job.identify(plan.instance, epoch))
+            and not (job.kind == "source" and job.name in changed)
+        ):
+            kept.append(job.name)
+        else:
+            replaced.append(job.name)
+    return _Changes(tuple(kept), tuple(started), tuple(stopped), tuple(replaced), add, retire)
+
+
+def _same(spec: BlockSpec, block: Block) -> bool:
+    """Return whether a block matches its specification."""
+    return (
+        block.layout.hash == spec.layout.hash
+        and block.ring.slot_count == spec.slots
+        and (block.period_ns, block.stale_ns) == (spec.period_ns, spec.stale_ns)
+        and block.attributes == spec.attributes
+    )
+
+
+def _refusal(plan: Plan, running: Plan) -> str | None:
+    """Return why a running instance cannot adopt the plan; None if it can."""
+    fixed = {
+        "instance.name": (running.instance, plan.instance),
+        "instance.group": (running.group, plan.group),
+        "instance.clock": (_clock(running), _clock(plan)),
+        "instance.log_dir": (running.log_dir, plan.log_dir),
+    }
+    for key, (old, new) in fixed.items():
+        if old != new:
+            return (
+                f"{key}: {_shown(new)} instead of {_shown(old)} cannot be taken while the instance runs; "
+                "nothing has changed: shmio-supervisor down and up take it"
+            )
+    return None
+
+
+def _clock(plan: Plan) -> str:
+    return "stepped" if plan.stepped else "wall"
+
+
+def _shown(value: object) -> str:
+    return "none" if value is None else repr(str(value))
+
+
+_SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
 class InstanceChange:
-    """Changes an instance to match a plan, in steps.
-
-    Whatever matches the plan already is left alone.
-    """
+    """Changes an instance to match a plan, in steps: stops processes, changes the blocks, starts processes."""
 
     def __init__(self, fleet: Fleet, segment: Segment, plan: Plan) -> None:
         """Begin the change.
@@ -39,9 +114,8 @@ class InstanceChange:
 
         """
         self.plan = plan
-        present = fleet.present()
-        self.changes = reconcile(plan, segment.header.epoch, present, segment.blocks.values())
-        self._unwell = {name for name, found in present.items() if not found.well}
+        self.changes = _reconcile(plan, segment.header.epoch, fleet, segment.blocks.values())
+        self._unwell = {managed.name for managed in fleet if not managed.well}
         self._fleet = fleet
         self._segment = segment
         self._jobs = {job.name: job for job in plan.jobs}
@@ -61,10 +135,7 @@ class InstanceChange:
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
-        """Do what is possible now; return whether the change is done.
-
-        It is over when each new process runs or has failed once.
-        """
+        """Continue as far as possible now; return whether each new process runs or has failed once."""
         if not self._stopped:
             self._stopped = self._stop()
             if self._stopped:
@@ -75,7 +146,7 @@ class InstanceChange:
 
     def _has_come(self, name: str) -> bool:
         life = self._fleet.named(name).life
-        return life.starts > 0 and life.state in SETTLED
+        return life.starts > 0 and life.state in _SETTLED
 
     @property
     def stuck(self) -> str:
@@ -119,7 +190,7 @@ class InstanceChange:
     def outcome(self) -> tuple[list[str], list[str]]:
         """Return what was done and which problems there are, one line each."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
-        done += [f"{name}: told to reload its tokens and roles" for name in self._signalled]
+        done += [f"{name}: asked to reload its tokens and roles" for name in self._signalled]
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)
@@ -162,11 +233,11 @@ class _PendingPlan:
         return not self.over and time.monotonic() >= self._deadline
 
     def result(self) -> Plan:
-        """Return the plan, or raise what went wrong."""
+        """Return the plan; raise the error that prevented it."""
         if not self.over:
             raise ShmioError(
-                f"what the configuration names could not be read within {self.limit_s:g} s, and nothing is changed: "
-                "see whether a file system hangs, and reload again"
+                f"the files that the configuration names could not be read within {self.limit_s:g} s; nothing has "
+                "changed: check whether a file system hangs, then reload again"
             )
         if self._plan is None:
             raise self._error or RuntimeError("there is no plan")
@@ -174,7 +245,7 @@ class _PendingPlan:
 
 
 class Reloader:
-    """Tracks the change that is in progress, if any, and the plan in force."""
+    """Has the plan in force, and carries out one change of the instance at a time."""
 
     def __init__(
         self,
@@ -211,7 +282,7 @@ class Reloader:
         return "another change of the instance is in progress: try again when it is done"
 
     def follow(self) -> None:
-        """Bring what was taken over to the plan; SegmentError if there is no room."""
+        """Change a taken-over instance to match the plan; SegmentError if there is no room."""
         self._change = InstanceChange(self._fleet, self._segment, self.plan)
 
     def reload(self, answer: Answer) -> None:
@@ -230,7 +301,7 @@ class Reloader:
         self._planning = self._change = self._answer = None
 
     def step(self) -> None:
-        """Do what is possible now."""
+        """Continue the reload as far as possible now."""
         if self._planning is not None and (self._planning.over or self._planning.late):
             planning, self._planning = self._planning, None
             self._begin(planning)
@@ -240,7 +311,7 @@ class Reloader:
     def _begin(self, planning: _PendingPlan) -> None:
         try:
             plan = planning.result()
-            if reason := refusal(plan, self.plan):
+            if reason := _refusal(plan, self.plan):
                 raise ShmioError(f"{plan.config_file}: {reason}")
             self._change = InstanceChange(self._fleet, self._segment, plan)
         except Exception as error:  # noqa: BLE001 - whatever a connector's own check raises, what runs goes on

@@ -69,7 +69,7 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
         before = file.read_text()
         file.write_text(before + MORE)
         reload = guarded.supervisor("reload")
-        assert (reload.returncode, "grpc: told to reload its tokens and roles" in reload.stdout) == (0, True)
+        assert (reload.returncode, "grpc: asked to reload its tokens and roles" in reload.stdout) == (0, True)
         until(lambda: subscribe(guarded, address, "--token-file", "other").returncode == 0, "the new token taken")
         assert next(stream).value, "the stream of a token that stays goes on"
         (guarded.folder / "other").chmod(0o644)

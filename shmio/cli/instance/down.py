@@ -11,7 +11,7 @@ from shmio.cli.target import ask, target
 from shmio.errors import FormatError, NotRunningError, UnfinishedError
 from shmio.segment import Segment, instances, stale_segment
 from shmio.supervisor import control
-from shmio.supervisor.socketpath import remove_socket, socket_path
+from shmio.supervisor.control import remove_socket, socket_path
 
 STOP_S = 30.0
 EXIT_S = 5.0

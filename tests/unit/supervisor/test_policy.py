@@ -10,8 +10,7 @@ from shmio.local.status import assess
 from shmio.segment import Quality
 from shmio.segment import State as InstanceState
 from shmio.supervisor import policy
-from shmio.supervisor.policy import Life, Limits
-from shmio.supervisor.states import GRAPH, Action, Event, State
+from shmio.supervisor.policy import GRAPH, Action, Event, Life, Limits, State
 
 LIMITS = Limits()
 S = 1_000_000_000

@@ -315,8 +315,8 @@ def test_a_plan_that_does_not_come_is_given_up_and_another_one_made(launch: Laun
     cell.wait_state("running")
     before = cell.pids()
     os.mkfifo(cell.folder / "slow")
-    why = "what the configuration names could not be read within 2 s, and nothing is changed"
-    with pytest.raises(ControlError, match=f"^{why}: see whether a file system hangs, and reload again$"):
+    why = "the files that the configuration names could not be read within 2 s; nothing has changed"
+    with pytest.raises(ControlError, match=f"^{why}: check whether a file system hangs, then reload again$"):
         cell.reload([*CELL, PRESS])
     assert cell.pids() == before
     (cell.folder / "slow").unlink()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.supervisor.notify import Notifier
+from shmio.supervisor.health import Notifier
 from tests.unit.supervisor.harness import CELL, DEADLINE_S, Launch
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from shmio.config.folder import Obstacle
-from shmio.supervisor import log_folder
-from shmio.supervisor.log_folder import LOOK_S, SILENT_S, LogFolder
+from shmio.supervisor import health
+from shmio.supervisor.health import LOOK_S, SILENT_S, LogFolder
 from tests.unit.supervisor.harness import Launch, until
 
 LOOK_NS, SILENT_NS = round(LOOK_S * 1e9), round(SILENT_S * 1e9)
@@ -23,7 +23,7 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path: Path, monkeypatch
         answering.wait()
         return Obstacle("it is full", full=True)
 
-    monkeypatch.setattr(log_folder, "unwritable", unwritable)
+    monkeypatch.setattr(health, "unwritable", unwritable)
     logs = LogFolder(tmp_path)
     assert logs.problem(0) == ""
     assert logs.problem(LOOK_NS + 1) == ""

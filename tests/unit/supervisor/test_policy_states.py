@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.supervisor.states import GRAPH, LIVING, PHASES, Action, Event, State
+from shmio.supervisor.policy import GRAPH, LIVING, PHASES, Action, Event, State
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "process-states.md"
 EDGE = re.compile(r"^ +(\w+) --> (\w+): (\w+)(?: / (\w+))?$", re.MULTILINE)
