@@ -2,9 +2,9 @@
 
 ``bridge`` runs everything in one thread:
 
-- ``feed`` follows one block and marks the topics that changed; ``channel`` makes a topic's payload.
-- ``outbox`` queues topics and results for the broker; ``backlog`` keeps changes during an outage.
+- ``feed`` follows one block and marks the topics that changed; ``topics`` has their rules and makes their payloads.
+- ``outbox`` queues topics and results for the broker, and keeps changes during an outage.
 - ``connection`` connects to the broker; ``topic_guard`` corrects what others publish on our topics.
-- ``commands`` receives commands from the broker; ``command_client`` sends them to a source.
+- ``commands`` receives commands from the broker, and sends them to their sources.
 - ``steps`` delivers the steps of virtual time; ``sparkplug`` publishes the same sources as Sparkplug B.
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 
@@ -10,40 +11,78 @@ import msgspec
 from shmio import worker
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.bridge import Bridge
-from shmio.endpoints.mqtt.broker import process
+from shmio.endpoints.mqtt.broker.directory import folder, prepare, remove
+from shmio.endpoints.mqtt.broker.mosquitto import Mosquitto
+from shmio.endpoints.mqtt.broker.program import choose_broker
 from shmio.log_rate_limit import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 BROKER = "broker"
 """The name of our own broker's process."""
 
+log = logging.getLogger("shmio.mqtt")
+
 
 def run(worker: Worker) -> None:
     """Run the process that the worker's name selects until the worker is stopped."""
-    log, ration = logging.getLogger("shmio.mqtt"), LogRateLimit()
-    log.addFilter(ration)
+    rate_limit = LogRateLimit()
+    log.addFilter(rate_limit)
     try:
         if worker.name == BROKER:
-            process.run(worker)
+            run_broker(worker)
         else:
-            _bridge(worker)
+            _run_bridge(worker)
     finally:
-        log.removeFilter(ration)
+        log.removeFilter(rate_limit)
 
 
-def _bridge(worker: Worker) -> None:
+def _run_bridge(worker: Worker) -> None:
     bridge = Bridge(worker.segment, worker.slot, msgspec.convert(worker.config, Mqtt))
     worker.on_stop(bridge.wake)
     worker.running()
-    told_s = 0.0
+    reported_s = 0.0
     while not worker.stopping.is_set():
         bridge.turn()
-        if time.monotonic() - told_s >= BEAT_S:
-            told_s = time.monotonic()
+        if time.monotonic() - reported_s >= BEAT_S:
+            reported_s = time.monotonic()
             worker.report(bridge.counters, note=bridge.problem)
     bridge.close()
     worker.report(bridge.counters, note="")
-    logging.getLogger("shmio.mqtt").info("%d messages", bridge.outbox.sent)
+    log.info("%d messages", bridge.outbox.sent)
+
+
+def run_broker(worker: Worker) -> None:
+    """Run our own broker until the worker is stopped: mosquitto if it is installed, else aMQTT."""
+    settings = msgspec.convert(worker.config, Mqtt)
+    program = choose_broker(settings)
+    place = folder(worker.segment)
+    prepare(place)
+    try:
+        if program is not None:
+            _run_mosquitto(worker, Mosquitto(program, settings, worker.segment.instance, place), settings)
+        else:
+            log.warning(
+                "mosquitto is not installed: aMQTT on %s, for development only: every program on this host may publish "
+                "everything, even values",
+                settings.listen,
+            )
+            from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  of the extra, and large
+
+            asyncio.run(amqtt.serve(worker, settings, place))
+    finally:
+        remove(place)
+
+
+def _run_mosquitto(worker: Worker, broker: Mosquitto, settings: Mqtt) -> None:
+    try:
+        broker.await_start(worker.report)
+        log.info("mosquitto on %s", settings.listen)
+        worker.running()
+        while not worker.stopping.wait(BEAT_S):
+            broker.check()
+            worker.report()
+    finally:
+        broker.stop()
 
 
 if __name__ == "__main__":

@@ -17,11 +17,15 @@ from paho.mqtt.client import MQTTMessage
 
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.broker.directory import own_socket
-from shmio.endpoints.mqtt.channel import BridgeStatusChannel, Channel, ClearedTopic, Message, status
-from shmio.endpoints.mqtt.commands import OUTPUTS, CommandReceiver, command_filters, output_filters, result_filters
-from shmio.endpoints.mqtt.connection.command_connection import CommandConnection
-from shmio.endpoints.mqtt.connection.connection import BrokerConnection, is_watched
-from shmio.endpoints.mqtt.connection.limits import MOST_IN_FLIGHT
+from shmio.endpoints.mqtt.commands import (
+    OUTPUTS,
+    CommandClient,
+    CommandReceiver,
+    command_filters,
+    output_filters,
+    result_filters,
+)
+from shmio.endpoints.mqtt.connection.connection import MOST_IN_FLIGHT, BrokerConnection, CommandConnection, is_watched
 from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.outbox import Outbox
@@ -29,7 +33,7 @@ from shmio.endpoints.mqtt.sparkplug.device import Device
 from shmio.endpoints.mqtt.sparkplug.session import Session
 from shmio.endpoints.mqtt.steps import StepDelivery
 from shmio.endpoints.mqtt.topic_guard import MOST_WAITING, TopicGuard
-from shmio.endpoints.mqtt.topic_rules import TopicRules
+from shmio.endpoints.mqtt.topics import BridgeStatusChannel, Channel, ClearedTopic, Message, TopicRules, status
 from shmio.layout.topic import shorten
 from shmio.segment import ProcessSlot, Quality, Segment
 from shmio.segment.doorbell import TURN_NS, Relay
@@ -37,7 +41,7 @@ from shmio.segment.doorbell import TURN_NS, Relay
 OFFLINE: Final = b"offline"
 STOPPED: Final = "the bridge was stopped"
 LEAVE_S: Final = 2.0
-"""Time limit for closing: the broker has to take the last messages in it."""
+"""Time limit for closing, in which the broker must accept the last messages."""
 TURN_S: Final = 0.2
 MAX_CLEARED: Final = 20_000
 """Maximum number of retained topics to delete at the broker."""
@@ -59,7 +63,7 @@ class Bridge:
 
         """
         self.prefix = settings.prefix or f"shmio/{segment.instance}"
-        self._segment, self._settings = segment, settings
+        self._segment = segment
         self._writer = slot.writer or 0
         self._rules = TopicRules(settings.topic)
         self._selector = selectors.DefaultSelector()
@@ -71,6 +75,7 @@ class Bridge:
         """Every topic that is published now, with its channel."""
         self._guard = TopicGuard(self)
         self._feeds: dict[str, Feed] = {}
+        self._clients: dict[str, CommandClient] = {}
         self._relays: dict[int, Relay] = {}
         self._cleared: dict[str, ClearedTopic] = {}
         there = targets(settings, own_socket(segment))
@@ -88,11 +93,11 @@ class Bridge:
             f"{client_id}-commands",
             self._selector,
             self.wake,
-            lambda: command_filters(self.prefix, self._feeds.values()),
-            lambda: result_filters(self.prefix, self._feeds.values()),
+            lambda: command_filters(self.prefix, self._clients.values()),
+            lambda: result_filters(self.prefix, self._clients.values()),
         )
         self.outbox = Outbox(self.connection, self.command_connection.connection, round(settings.backlog_mb * 1e6))
-        self._commands = CommandReceiver(self.prefix, self._rules, self._feeds, self.outbox.queue_result)
+        self._commands = CommandReceiver(self.prefix, self._rules, self._clients, self.outbox.queue_result)
         self.command_connection.connection.on_message = self._on_command
         self.connection.on_message = self._on_message
         self.connection.on_lost = self.outbox.lose
@@ -147,7 +152,7 @@ class Bridge:
     # ---- a turn ------------------------------------------------------------------------------------------------------
 
     def turn(self) -> None:
-        """Wait for events, at most about ``TURN_S``, and handle them."""
+        """Wait for events, at most for ``TURN_S``, and handle them."""
         for key, events in self._selector.select(self._rest_s):
             key.data(events)
         self._turn_connections()
@@ -193,7 +198,7 @@ class Bridge:
         self.connection.send(self._status.message())
         if self._recalled is None:
             self._recalled = frozenset(self._channels)
-            self.connection.recall(output_filters(self.prefix, self._feeds.values()))
+            self.connection.recall(output_filters(self.prefix, self._clients.values()))
         self._guard.begin()
         for feed in self._feeds.values():
             feed.resend()
@@ -213,9 +218,9 @@ class Bridge:
 
     @property
     def _own(self) -> list[str]:
-        feeds = self._feeds.values()
-        states = [self._status.topic, f"{self.prefix}/simlog/step", *(feed.status.topic for feed in feeds)]
-        return [*states, *output_filters(self.prefix, feeds)]
+        statuses = (feed.status.topic for feed in self._feeds.values())
+        states = [self._status.topic, f"{self.prefix}/simlog/step", *statuses]
+        return [*states, *output_filters(self.prefix, self._clients.values())]
 
     def correct(self, topic: str) -> None:
         """Publish our value on a topic again, or delete what another client has left there."""
@@ -316,6 +321,7 @@ class Bridge:
             if (before := self._feeds.get(feed.block.source)) is not None:
                 self._remove_feed(before, feed)
             self._feeds[feed.block.source] = feed
+            self._clients[feed.block.source] = feed.command_client
             for channel in feed.all():
                 self._channels[channel.topic] = channel
                 self._cleared.pop(channel.topic, None)
@@ -340,7 +346,7 @@ class Bridge:
         cleared = {channel.topic: ClearedTopic(channel.topic) for channel in feed.all() if channel.topic not in stay}
         self._cleared |= cleared  # deleted again after each connect: the broker may be away
         self.outbox.mark_all(cleared.values())
-        del self._feeds[feed.block.source]
+        del self._feeds[feed.block.source], self._clients[feed.block.source]
         self._missed += feed.missed
         if self._sparkplug is not None:
             self._sparkplug.remove_device(feed.block.source)

@@ -1,9 +1,10 @@
-"""Receives commands on the ``/in`` topics, and publishes a result for each."""
+"""Commands: receives them on the ``/in`` topics, sends them to their sources, and publishes the results."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import msgspec
@@ -11,14 +12,16 @@ from paho.mqtt.client import MQTTMessage
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.feed import Feed
-from shmio.endpoints.mqtt.topic_rules import TopicRules
+from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, InFlightTable
+from shmio.endpoints.mqtt.topics import Message, TopicRules
 from shmio.errors import CommandError, PathError, ValueRangeError
-from shmio.layout.model import Register
+from shmio.layout.model import Layout, Register
 from shmio.layout.topic import look_up, parse_topic, shorten
 from shmio.layout.values.text import MAX_TEXT, from_text
-from shmio.segment import DONE, EventKind
+from shmio.layout.values.write import sizes
+from shmio.local.writer import REPLACED, RETIRED, SourceWriter
+from shmio.segment import DONE, Block, EventKind
+from shmio.segment.commands import End, worst
 
 REPLIES: Final = "shmio/results"
 """Below the prefix, the topics that clients may choose for their results.
@@ -34,40 +37,110 @@ MAX_TOPIC_BYTES: Final = 65535 - len("/result")
 A topic has at most 65535 bytes (MQTT 5.0, section 1.5.4), and the result's topic is longer.
 """
 
+Done = Callable[[EventKind, str], None]
+"""Called once for each command, with its outcome and the reason."""
 Answer = Callable[[Message, Properties | None], None]
 
 log = logging.getLogger("shmio.mqtt")
 
 
-def command_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+class CommandClient:
+    """Sends commands to one source. Use it from the bridge's thread."""
+
+    def __init__(self, block: Block, writer: int) -> None:
+        """``writer``: number of this process's command queue.
+
+        For a large layout this takes seconds.
+        """
+        self.block = block
+        self.depths = _depths(block.layout)
+        """The numbers of segments that this source's paths have."""
+        self._source_writer = SourceWriter(block, writer)
+        self._source_writer.prepare()
+        self._pending = InFlightTable(writer)
+        self._events = block.events.cursor()
+
+    def check(self, register: Register) -> None:
+        """Check that a register is writable.
+
+        Raises:
+            CommandError: The register is not writable.
+
+        """
+        self._source_writer.check(register)
+
+    def send(self, register: Register, value: object, done: Done) -> None:
+        """Send a value for a register, an array or an element.
+
+        ``done`` is called once with the outcome.
+
+        Raises:
+            CommandError: The command was not sent.
+            ValueRangeError: The value does not fit; the command was not sent.
+
+        """
+        cost = CommandCost.of(sizes(register))
+        if self._pending and self._pending.open_events + cost.events > MAX_OPEN:
+            raise CommandError(f"{self.block.source}: too many commands are under way; wait for their results")
+        if self.block.retired:
+            raise CommandError(RETIRED)
+        self._pending.add(self._source_writer.submit({register.path: value}), cost, partial(_tell, done))
+
+    def poll(self) -> None:
+        """Read new events, and end the commands whose outcome is known or overdue."""
+        while (event := self._events.poll()) is not None:
+            self._pending.hear(event)
+        if self._events.take_missed():
+            self._pending.hurry()
+        self._pending.expire()
+        if self._events.ended:
+            self._pending.end(REPLACED)
+
+
+def _tell(done: Done, ends: Sequence[End]) -> None:
+    kind, reason = worst(ends)
+    done(kind, "" if kind in DONE else reason)
+
+
+def _depths(layout: Layout) -> Sequence[int]:
+    depths = set()
+    for register in layout.registers:
+        depth = register.path.count("/") + 1
+        depths |= {depth, depth + len(register.dims)}
+    return sorted(depths)
+
+
+def command_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
     """The filters for commands: one for each path depth of a source; none matches our own topics."""
-    return [f"{prefix}/{feed.block.source}/{'+/' * depth}in" for feed in feeds for depth in feed.depths]
+    return [f"{prefix}/{one.block.source}/{'+/' * depth}in" for one in clients for depth in one.depths]
 
 
-def output_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+def output_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
     """The filters for values that an earlier bridge may have published, for these sources."""
-    deep = [
-        f"{prefix}/{feed.block.source}/{'+/' * depth}out" for feed in feeds for depth in range(max(feed.depths) + 1)
-    ]
-    return deep + [f"{prefix}/{feed.block.source}/frames" for feed in feeds]
+    found = []
+    for one in clients:
+        base = f"{prefix}/{one.block.source}"
+        found += [*(f"{base}/{'+/' * depth}out" for depth in range(max(one.depths) + 1)), f"{base}/frames"]
+    return found
 
 
-def result_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+def result_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
     """The filters for the topics of results."""
-    return [f"{one}/result" for one in command_filters(prefix, feeds)] + [f"{prefix}/{REPLIES}/#"]
+    return [f"{one}/result" for one in command_filters(prefix, clients)] + [f"{prefix}/{REPLIES}/#"]
 
 
 class CommandReceiver:
     """Receives commands, and sends them to their sources. Use it from the bridge's thread."""
 
-    def __init__(self, prefix: str, rules: TopicRules, feeds: Mapping[str, Feed], answer: Answer) -> None:
+    def __init__(self, prefix: str, rules: TopicRules, clients: Mapping[str, CommandClient], answer: Answer) -> None:
+        """``clients``: of the current sources; ``answer``: called with each result."""
         self.received = 0
         self.refused = 0
         """Commands that were not sent to a source, such as retained ones."""
-        self._prefix, self._rules, self._feeds, self._answer = prefix, rules, feeds, answer
+        self._prefix, self._rules, self._clients, self._answer = prefix, rules, clients, answer
 
     def take(self, message: MQTTMessage) -> None:
-        """Handle a message: if its topic is a command's, send the value to the source."""
+        """Handle a message: if its topic is a command topic, send the value to the source."""
         try:
             topic = message.topic
         except UnicodeDecodeError:
@@ -85,23 +158,20 @@ class CommandReceiver:
             tell(EventKind.REJECTED, RETAINED)
             return
         try:
-            feed, register = self._find(topic.removeprefix(f"{self._prefix}/"))
-            feed.command_client.check(register)  # before decoding: no value would be accepted
-            value = _value(bytes(message.payload), register, json=self._is_json(feed, register))
-            feed.command_client.send(register, value, tell)
+            client, register = self._find(topic.removeprefix(f"{self._prefix}/"))
+            client.check(register)  # before decoding: no value would be accepted
+            json = self._rules.of(client.block.source, register.path).payload != "text"
+            client.send(register, _value(bytes(message.payload), register, json=json), tell)
         except (CommandError, PathError, ValueRangeError) as error:
             self.refused += 1
             tell(EventKind.REJECTED, str(error))
 
-    def _find(self, text: str) -> tuple[Feed, Register]:
-        topic = parse_topic(text, self._feeds, None)
-        feed = self._feeds.get(topic.source)
-        if feed is None:
+    def _find(self, text: str) -> tuple[CommandClient, Register]:
+        topic = parse_topic(text, self._clients, None)
+        client = self._clients.get(topic.source)
+        if client is None:
             raise PathError(f"{topic.source}: no such source")
-        return feed, look_up(feed.block.layout, topic)
-
-    def _is_json(self, feed: Feed, register: Register) -> bool:
-        return self._rules.of(feed.block.source, register.path).payload != "text"
+        return client, look_up(client.block.layout, topic)
 
 
 class _Reply:

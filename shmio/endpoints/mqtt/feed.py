@@ -3,95 +3,30 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
 from shmio.config import MqttTopic
-from shmio.endpoints.mqtt.channel import (
+from shmio.endpoints.mqtt.commands import CommandClient
+from shmio.endpoints.mqtt.outbox import Outbox
+from shmio.endpoints.mqtt.topics import (
     Channel,
     FramesChannel,
-    Message,
     RegisterChannel,
     StatusChannel,
-    json_payload,
+    StructureChannel,
+    TopicRules,
+    ValueChannel,
 )
-from shmio.endpoints.mqtt.command_client import CommandClient
-from shmio.endpoints.mqtt.outbox import Outbox
-from shmio.endpoints.mqtt.topic_rules import TopicRules
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
-from shmio.layout.topic import decode_segment, find
-from shmio.layout.values.codec import codec
-from shmio.layout.values.text import json_value
+from shmio.layout.topic import find
 from shmio.layout.values.write import elements
-from shmio.local.reading import injected
-from shmio.segment import Block, Frame, FrameFollower, Provenance, Quality, QualityChange
+from shmio.segment import Block, Frame, FrameFollower, Quality, QualityChange
 from shmio.segment.changed_registers import ChangeScan
 
-Value = Callable[[bytes], Any]
-"""Converts an image to a value for JSON."""
-
-
-class StructureChannel:
-    """The topic of a structure: its registers as one JSON object."""
-
-    json = True
-
-    def __init__(
-        self, follower: FrameFollower, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic
-    ) -> None:
-        """``path``: of the structure that contains the registers; empty: the whole source."""
-        self.registers = registers
-        self.topic = topic
-        self.limited = rule.max_rate_hz is not None
-        self._follower = follower
-        self._qos, self._retain = rule.qos, rule.retain
-        self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
-        depth = path.count("/") + 1 if path else 0
-        parts = [(register.path.split("/")[depth:], register) for register in registers]
-        self._value = _members(parts, follower.block.layout)
-        self.due_ns = 0
-
-    def moved(self, _image: bytes) -> bool:
-        """Return True: every change is published."""
-        return True
-
-    def message(self, *, late: bool = False) -> Message:
-        """Make the message; while the quality is bad, with the last known values."""
-        follower = self._follower
-        block, frame = follower.block, follower.frame
-        self.due_ns = block.now_ns() + self._pause_ns
-        value, provenance = None, Provenance.LIVE
-        if frame is not None:
-            provenance = Provenance.INJECTED if injected(block, self.registers, frame) else frame.provenance
-            value = self._value(frame.image) if frame.source_ns else None
-        payload = json_payload(value, follower.quality, follower.reason, str(provenance), frame, late=late)
-        return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
-
-
-def _members(parts: Sequence[tuple[list[str], Register]], layout: Layout) -> Value:
-    """Make the decoder of a JSON object.
-
-    ``parts``: each register with the names that lead to it from here.
-    """
-    groups: dict[str, list[tuple[list[str], Register]]] = {}
-    for (name, *rest), register in parts:
-        groups.setdefault(decode_segment(name), []).append((rest, register))
-    members = {
-        name: _members(inner, layout) if inner[0][0] else _member(inner[0][1], layout) for name, inner in groups.items()
-    }
-    return lambda image: {name: value(image) for name, value in members.items()}
-
-
-def _member(register: Register, layout: Layout) -> Value:
-    decode, element = codec(register, layout.byte_order).decode, register.element
-    return lambda image: json_value(decode(image), element)
-
-
 log = logging.getLogger("shmio.mqtt")
-
-ValueChannel = RegisterChannel | StructureChannel
 
 MAX_FRAMES_PER_TURN: Final = 8
 """Frames that are read before other work has its turn."""
@@ -128,8 +63,6 @@ class Feed:
         self.channels = list(dict.fromkeys(self._channel_of))
         frames = rules.frames(block.source)
         self.frames = FramesChannel(self.follower, f"{base}/frames", frames) if frames else None
-        self.depths = _depths(block.layout)
-        """The numbers of segments that this source's paths have."""
         self._json = [channel for channel in self.channels if channel.json]
         self._injected: frozenset[ValueChannel] = frozenset()
         """The channels that are published as injected."""
@@ -273,11 +206,3 @@ def _chosen(layout: Layout, rules: TopicRules, source: str) -> Iterator[tuple[Re
     for path in rules.parts(source):
         with suppress(PathError):  # a reload has brought another layout; `check` tells
             yield find(layout, path), rules.of(source, path)
-
-
-def _depths(layout: Layout) -> Sequence[int]:
-    depths = set()
-    for register in layout.registers:
-        depth = register.path.count("/") + 1
-        depths |= {depth, depth + len(register.dims)}
-    return sorted(depths)

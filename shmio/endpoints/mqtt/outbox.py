@@ -1,7 +1,7 @@
-"""Queues what is to be sent: topics in the order of their first change, each with its newest value.
+"""Queues topics for the broker in the order of their first change, each with its newest value.
 
-While the broker is away, each change goes to a bounded backlog instead, which is sent first when it
-is back.
+While the broker is away, each change goes to a bounded backlog instead, which is sent first when the
+broker is back.
 """
 
 from __future__ import annotations
@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
-from typing import Final, Protocol
+from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from shmio.endpoints.mqtt.backlog import Backlog
-from shmio.endpoints.mqtt.channel import Channel, Message
+from shmio.endpoints.mqtt.topics import Channel, Message
 
 OVERHEAD_BYTES: Final = 200
 """Approximate memory of one message beside its payload."""
@@ -23,6 +22,74 @@ TURN_MESSAGES: Final = 500
 """Messages that are sent before other work has its turn."""
 MAX_RESULTS: Final = 1024
 """Maximum number of queued results; beyond that, the oldest are dropped."""
+
+Item = TypeVar("Item")
+
+
+class _Entry(NamedTuple, Generic[Item]):
+    number: int
+    item: Item
+    size: int
+    changes: int
+
+
+class Backlog(Generic[Item]):
+    """A bounded memory with rows of items, first in, first out in each.
+
+    When it is full, the oldest item of all rows is dropped.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self.count = 0
+        """Number of changes that are kept."""
+        self.dropped = 0
+        """Number of changes that were dropped because there was no room."""
+        self.bytes = 0
+        self._most = most_bytes
+        self._rows: dict[str, deque[_Entry[Item]]] = {}
+        self._number = 0
+        """Sequence number of the newest item; older items have lower numbers."""
+
+    def put(self, item: Item, size: int, *, row: str = "", changes: int = 1) -> None:
+        """Append the newest item, and drop the oldest ones until everything fits.
+
+        ``size``: in bytes; ``changes``: how many changes the item holds.
+        """
+        self._number += 1
+        self._rows.setdefault(row, deque()).append(_Entry(self._number, item, size, changes))
+        self._add(changes, size)
+        while self.bytes > self._most:
+            oldest = min((kept for kept in self._rows.values() if kept), key=lambda kept: kept[0].number).popleft()
+            self._add(-oldest.changes, -oldest.size)
+            self.dropped += oldest.changes
+
+    def put_back(self, item: Item, size: int) -> None:
+        """Insert an item before all others; drop it if there is no room."""
+        if self.bytes + size > self._most:
+            self.dropped += 1
+            return
+        row = self._rows.setdefault("", deque())
+        row.appendleft(_Entry(row[0].number - 1 if row else self._number, item, size, 1))
+        self._add(1, size)
+
+    def pop(self, row: str = "") -> Item | None:
+        """Remove and return the oldest item of a row; None: the row is empty."""
+        kept = self._rows.get(row)
+        if not kept:
+            return None
+        oldest = kept.popleft()
+        self._add(-oldest.changes, -oldest.size)
+        return oldest.item
+
+    def clear(self) -> None:
+        """Drop all items, and count them as dropped."""
+        self.dropped += self.count
+        self.count = self.bytes = 0
+        self._rows.clear()
+
+    def _add(self, changes: int, size: int) -> None:
+        self.count += changes
+        self.bytes += size
 
 
 class Sender(Protocol):

@@ -9,10 +9,10 @@ from typing import Final
 
 import msgspec
 
-from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.connection.connection import BrokerConnection
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.outbox import Outbox
+from shmio.endpoints.mqtt.topics import Message
 from shmio.model.clock import Clock
 from shmio.segment.clock import ClockPage
 

@@ -17,8 +17,7 @@ from amqtt.adapters import StreamReaderAdapter, StreamWriterAdapter
 from amqtt.broker import Broker
 
 from shmio.config import Address, Mqtt
-from shmio.endpoints.mqtt.broker.access import new_secret
-from shmio.endpoints.mqtt.broker.directory import SOCKET
+from shmio.endpoints.mqtt.broker.directory import SOCKET, new_secret
 from shmio.errors import EndpointError
 from shmio.worker import BEAT_S, Worker
 

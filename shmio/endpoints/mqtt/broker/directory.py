@@ -1,22 +1,30 @@
-"""The directory of our own broker: beside the supervisor's socket, readable by this user only."""
+"""The directory of our own broker, with its socket and the bridge's password.
+
+It is beside the supervisor's socket, and only this user can read it. The password is new at each
+start of the broker, and only the UNIX socket accepts it.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
+import secrets
 from pathlib import Path
 from typing import Final
 
+from shmio.config.mqtt.accounts import hashed
 from shmio.errors import EndpointError
 from shmio.segment import Segment
 
 SOCKET: Final = "s"
-"""Name of the socket.
-
-Its path must be no longer than that of the supervisor's socket.
-"""
-
+"""Name of the socket; its path must be no longer than that of the supervisor's socket."""
 SECRET: Final = "key"  # noqa: S105  a name
 """Name of the file with the bridge's password."""
+BRIDGE: Final = "bridge"
+"""Name of the bridge's account."""
+ID: Final = re.compile(r"(?<=-)[0-9a-f]{32}\b")
+"""Matches the secret part of a client id; see :func:`secret_id`."""
 
 
 def folder(segment: Segment) -> Path:
@@ -27,16 +35,6 @@ def folder(segment: Segment) -> Path:
 def own_socket(segment: Segment) -> str:
     """Return the path of the broker's UNIX socket, which only this user can reach."""
     return str(folder(segment) / SOCKET)
-
-
-def secret_of(socket: str) -> str:
-    """Read the bridge's password for the broker of a socket.
-
-    Raises:
-        FileNotFoundError: The broker does not run.
-
-    """
-    return Path(socket).with_name(SECRET).read_text(encoding="utf-8")
 
 
 def write_private(file: Path, text: str) -> None:
@@ -64,7 +62,7 @@ def prepare(place: Path) -> None:
             os.close(fd)
         clear(place)
     except OSError as error:
-        raise EndpointError(f"the broker's folder {place}: {error.strerror}") from None
+        raise EndpointError(f"the broker's directory {place}: {error.strerror}") from None
 
 
 def clear(place: Path) -> None:
@@ -78,3 +76,25 @@ def remove(place: Path) -> None:
     """Remove the directory and its files."""
     clear(place)
     place.rmdir()
+
+
+def new_secret(place: Path) -> str:
+    """Make the bridge's password, write it to its file, and return its hash for mosquitto."""
+    secret = secrets.token_hex(32)
+    write_private(place / SECRET, secret)
+    return hashed(secret)
+
+
+def secret_of(socket: str) -> str:
+    """Read the bridge's password for the broker of a socket.
+
+    Raises:
+        FileNotFoundError: The broker does not run.
+
+    """
+    return Path(socket).with_name(SECRET).read_text(encoding="utf-8")
+
+
+def secret_id(client_id: str, secret: str) -> str:
+    """Return a client id that others cannot guess: whoever knows it can disconnect the client."""
+    return f"{client_id}-{hashlib.sha256(f'{secret} {client_id}'.encode()).hexdigest()[:32]}"

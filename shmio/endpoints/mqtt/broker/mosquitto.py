@@ -1,4 +1,7 @@
-"""Eclipse Mosquitto as our own broker: its configuration, and the process itself."""
+"""Eclipse Mosquitto as our own broker: its configuration, its access rules, and the process itself.
+
+Only the bridge publishes values, status and results.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from shmio.config import Address, Mqtt
+from shmio.config import Address, Mqtt, MqttAccount
 from shmio.config.mqtt.accounts import read_accounts
-from shmio.endpoints.mqtt.broker.access import BRIDGE, ID, Rights, new_secret, rights
-from shmio.endpoints.mqtt.broker.directory import SOCKET, write_private
+from shmio.endpoints.mqtt.broker.directory import BRIDGE, ID, SOCKET, new_secret, write_private
 from shmio.errors import EndpointError
 
 START_S: Final = 10.0
@@ -26,6 +28,10 @@ MAX_PACKET_BYTES: Final = 1 << 21
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
 """Maximum queue for one slow client; newer messages are dropped for it alone."""
+MAX_LEVELS: Final = 64
+"""Maximum number of levels of a register's path that can be written by MQTT."""
+READERS: Final = MqttAccount(roles=["read"])
+"""The account of clients that have no ``[[mqtt.account]]``."""
 _STAMP: Final = re.compile(r"^\d+: ")
 
 log = logging.getLogger("shmio.mqtt")
@@ -62,8 +68,42 @@ def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
     return "".join(f"{line}\n" for line in lines)
 
 
+class Rights(NamedTuple):
+    """What an account may do.
+
+    ``filters``: the topics on which it may publish.
+    """
+
+    read: bool
+    filters: Sequence[str]
+
+
+def rights(settings: Mqtt, instance: str, accounts: Iterable[str] | None) -> dict[str | None, Rights]:
+    """Return each account's rights by name; None: clients without an account.
+
+    ``accounts``: names of the accounts that have a password; None: passwords are not used.
+    """
+    given = {account.name: account for account in settings.account}
+    for name in [None] if accounts is None else accounts:
+        given.setdefault(name, READERS)
+    commands = list(_commands(settings, instance))
+    return {
+        name: Rights("read" in account.roles, [*account.publish, *commands] if "write" in account.roles else [])
+        for name, account in given.items()
+    }
+
+
+def _commands(settings: Mqtt, instance: str) -> Iterator[str]:
+    prefix = settings.prefix or f"shmio/{instance}"
+    for levels in range(1, MAX_LEVELS + 1):
+        yield f"{prefix}/+/{'+/' * levels}in"
+    if node := settings.sparkplug:
+        name = node.node or instance
+        yield from (f"spBv1.0/{node.group}/NCMD/{name}", f"spBv1.0/{node.group}/DCMD/{name}/+", "spBv1.0/STATE/+")
+
+
 def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
-    """Make an ACL file; what it does not allow is denied, wills too.
+    """Make an ACL file; mosquitto denies what it does not allow, wills too.
 
     ``accounts``: there are accounts; else the user name that a client gives is ignored.
     """

@@ -1,4 +1,7 @@
-"""One attempt to connect, in a thread of its own, since files, DNS, TCP and TLS may block."""
+"""One attempt to connect, and why it failed.
+
+It runs in a thread of its own, because files, DNS, TCP and TLS may block.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,13 @@ from paho.mqtt.client import Client, MQTTv5
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
 
 from shmio.config.mqtt.accounts import read_password
 from shmio.config.mqtt.tls import client_context
-from shmio.endpoints.mqtt.broker.access import BRIDGE, secret_id
-from shmio.endpoints.mqtt.broker.directory import secret_of
-from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.connection.failure import ended, why
-from shmio.endpoints.mqtt.connection.target import ReconnectPolicy
+from shmio.endpoints.mqtt.broker.directory import BRIDGE, secret_id, secret_of
+from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
+from shmio.endpoints.mqtt.topics import Message
 from shmio.errors import ConfigError
 
 CONNECT_S: Final = 4.0
@@ -30,6 +32,10 @@ SLOW_S: Final = 15.0
 SLOW: Final = "no answer yet: the broker, the name server, or the file system of mqtt.tls or mqtt.password_file is slow"
 MAX_PACKET_BYTES: Final = 1 << 21
 """Maximum packet size that we accept; only MQTT 5 brokers are told."""
+# MQTT 5.0, section 2.4; paho gives those of 3.1.1 the same numbers.
+_WHO: Final = frozenset({0x86, 0x87})
+_BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
+_TAKEN_OVER: Final = 0x8E
 
 
 class BrokerClient(Client):
@@ -100,7 +106,7 @@ class ConnectAttempt:
             self.problem = str(error)
         except (OSError, ValueError) as error:  # ValueError: a name with an empty part
             tls = self._policy.settings.tls is not None
-            self.problem = f"broker {self.target}: {why(error, self.target, tls=tls)}"
+            self.problem = f"broker {self.target}: {_why(error, self.target, tls=tls)}"
         if self.problem:
             self._close()
         with self._lock:
@@ -166,3 +172,54 @@ def close_socket(client: Client) -> None:
     if made is not None:
         with suppress(OSError):
             made.close()
+
+
+def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
+    """Describe a broker's reason code."""
+    if code.value in _WHO:
+        return f"it refuses our login ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
+    if code.value in _BUSY:
+        return f"it accepts no more connections at present ({code})"
+    if code.value == _TAKEN_OVER:
+        return f"another client has connected as {policy.client_id}: give one of them another mqtt.client_id"
+    return f"it refuses: {code}"
+
+
+def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
+    """Describe why a connection ended.
+
+    ``error``: the TLS error, if any; ``up``: the broker had accepted us; ``tls``: TLS is in use.
+    """
+    if error is not None:
+        return _tls(error)
+    lost = "the connection was lost"
+    missing = "needs a client certificate (mqtt.tls.certificate and key)" if tls else "expects TLS there (mqtt.tls)"
+    return lost if up else f"{lost} before the login: it is full, or {missing}, or is not a broker"
+
+
+def _why(error: Exception, target: Target, *, tls: bool) -> str:
+    """Describe why no connection could be made.
+
+    ``tls``: TLS is in use.
+    """
+    if isinstance(error, ssl.SSLError):
+        return _tls(error)
+    if isinstance(error, socket.gaierror):
+        return f"unknown host name ({error.strerror})"
+    if isinstance(error, TimeoutError):
+        return "it does not answer"
+    if isinstance(error, ConnectionRefusedError | FileNotFoundError):
+        if target.transport == "unix":
+            return "it does not run at present; shmio-supervisor logs broker says why"
+        return "nothing listens there"
+    if isinstance(error, ConnectionError):
+        return "it closed the connection" + (": it may not use TLS there (mqtt.tls, and the port)" if tls else "")
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+def _tls(error: ssl.SSLError) -> str:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is not trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
+    if "_ALERT_" in (error.reason or ""):
+        return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key, which it may require"
+    return f"the TLS handshake failed ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"

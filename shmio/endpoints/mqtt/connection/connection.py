@@ -1,37 +1,152 @@
-"""A connection to the broker that reconnects with growing waits and never blocks."""
+"""Connections to the broker: they reconnect with growing waits, and never block.
+
+Commands and their results have a connection of their own. On the connection for values, the broker's
+acknowledgements would queue behind all commands, and a flood of commands with QoS 0, which no limit
+holds back (MQTT 5.0, section 4.9), would delay values.
+"""
 
 from __future__ import annotations
 
 import logging
 import selectors
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv5, MQTTv311
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.connection.attempt import CONNECT_S, SLOW, BrokerClient, ConnectAttempt
-from shmio.endpoints.mqtt.connection.failure import ConnectionProblems, ended, refusal
-from shmio.endpoints.mqtt.connection.limits import Limits, subscription
-from shmio.endpoints.mqtt.connection.socket_io import SocketIo
+from shmio.config import Mqtt
+from shmio.endpoints.mqtt.connection.attempt import (
+    CONNECT_S,
+    SLOW,
+    BrokerClient,
+    ConnectAttempt,
+    ended,
+    refusal,
+)
+from shmio.endpoints.mqtt.connection.socket_io import BATCH, SocketIo
 from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
-from shmio.endpoints.mqtt.connection.write_batches import BATCH
+from shmio.endpoints.mqtt.topics import Message
 from shmio.layout.topic import shorten
 
 STABLE_S: Final = 5.0
 """A connection that lasted this long resets the back-off."""
 MOST_TOLD: Final = 300
-"""Maximum length of the text that joins the problems of all brokers."""
+"""Maximum length of the text with the problems of all brokers."""
+SUBSCRIBE_S: Final = CONNECT_S
+"""Time limit for the SUBACK of the subscription to commands."""
+MOST_IN_FLIGHT: Final = 1000
+"""Maximum number of unacknowledged messages."""
+FEW_IN_FLIGHT: Final = 4
+"""The maximum where commands arrive: so many may be read in one turn, and each takes time."""
+HEAD_BYTES: Final = 128
+"""Maximum size of a packet beside topic and payload."""
+OFTEN: Final = 4
+OFTEN_S: Final = 60.0
+"""After so many lost connections in this time, the problem names a likely cause."""
+REFUSED_S: Final = 10.0
+"""How long a refusal stays the current problem though the broker accepts other messages."""
 WITH_WILL: Final = "Disconnect with will message"
-
 _WATCHED: Final = 1
 """Identifier of the subscription to our own topics."""
 
 log = logging.getLogger("shmio.mqtt")
+
+
+class Limits(NamedTuple):
+    """The limits that a broker states in its CONNACK (MQTT 5.0, section 3.2.2.3); MQTT 3.1.1 has none.
+
+    ``in_flight``: unacknowledged messages; ``packet_bytes``: None: unlimited.
+    """
+
+    in_flight: int = MOST_IN_FLIGHT
+    packet_bytes: int | None = None
+    qos: int = 1
+    retain: bool = True
+    identifiers: bool = True
+    """Whether subscriptions may have an identifier, which the broker adds to their messages."""
+
+    @classmethod
+    def from_connack(cls, properties: Properties | None, most: int) -> Limits:
+        """Read the limits of a CONNACK.
+
+        ``most``: number of unacknowledged messages that we want.
+        """
+        given = vars(properties) if properties is not None else {}
+        return cls(
+            min(most, given.get("ReceiveMaximum", most)),
+            given.get("MaximumPacketSize"),
+            min(1, given.get("MaximumQoS", 1)),
+            bool(given.get("RetainAvailable", 1)),
+            bool(given.get("SubscriptionIdentifierAvailable", 1)),
+        )
+
+    def fit(self, message: Message) -> bool:
+        """Return whether a message is small enough."""
+        if self.packet_bytes is None:
+            return True
+        return HEAD_BYTES + len(message.topic.encode()) + len(message.payload) <= self.packet_bytes
+
+
+def _subscription(*, retained: bool) -> SubscribeOptions:
+    """Make the options of a subscription to other clients' messages, each with its own retain flag.
+
+    ``retained``: the broker sends retained messages, too.
+    """
+    before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
+    return SubscribeOptions(1, noLocal=True, retainAsPublished=True, retainHandling=before)
+
+
+class ConnectionProblems:
+    """The current problem of a connection; each is logged once."""
+
+    def __init__(self) -> None:
+        self.problem = ""
+        """The current problem; empty: none."""
+        self.refused = 0
+        """Number of messages that the broker refused."""
+        self._refused_s = 0.0
+        self._subscription_problem = ""
+        self._lost_s: deque[float] = deque(maxlen=OFTEN)
+
+    def report(self, problem: str) -> None:
+        """Set the current problem, and log it if it is new."""
+        if problem != self.problem:
+            log.warning("%s", problem)
+        self.problem = problem
+
+    def connection_lost(self, problem: str, client_id: str) -> str:
+        """Count a lost connection, and return the text of the problem."""
+        self._lost_s.append(time.monotonic())
+        if len(self._lost_s) < OFTEN or self._lost_s[-1] - self._lost_s[0] > OFTEN_S:
+            return problem
+        return f"{problem}, again and again; does another client connect as {client_id} (mqtt.client_id)?"
+
+    def clear(self) -> None:
+        """Forget the problem: the connection is up."""
+        self.problem = self._subscription_problem = ""
+
+    def subscription_refused(self, problem: str) -> None:
+        """Report that the broker refuses the subscription to commands."""
+        self._subscription_problem = problem
+        self.report(problem)
+
+    def message_refused(self, problem: str) -> None:
+        """Count a message that was refused, and report it if there is no other problem."""
+        self.refused += 1
+        self._refused_s = time.monotonic()
+        if not self.problem:  # the first stands for all that follow
+            self.report(problem)
+
+    def message_accepted(self) -> None:
+        """End the problem of refused messages if the last refusal is long enough ago."""
+        if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
+            self.problem = self._subscription_problem
 
 
 def is_watched(message: MQTTMessage) -> bool:
@@ -214,7 +329,7 @@ class BrokerConnection:
     # ---- dropping it -------------------------------------------------------------------------------------------------
 
     def drop(self, problem: str, *, politely: bool = False) -> None:
-        """Drop a connection, or an attempt that waits for CONNACK, and say why.
+        """Drop the connection, or the attempt that waits for CONNACK, for this reason.
 
         ``politely``: send DISCONNECT, so that the will is not published. Do not call it so from a
         callback.
@@ -267,7 +382,7 @@ class BrokerConnection:
         client, limits = self._client, self._limits
         if client is None or not self.up:
             return
-        if limits.packet_bytes is not None and not limits.fit(message):
+        if not limits.fit(message):
             self.problems.message_refused(
                 f"broker {self._target} takes {limits.packet_bytes} bytes: {message.topic} has more"
             )
@@ -299,17 +414,17 @@ class BrokerConnection:
         if client is None or not filters:
             return
         new = self._protocol == MQTTv5
-        options: Any = subscription(retained=retained) if new else 1
+        options: Any = _subscription(retained=retained) if new else 1
         _, mid = client.subscribe([(one, options) for one in filters])
         self._subscription = self._subscription if retained or mid is None else mid
 
     def watch(self, filters: Sequence[str]) -> None:
-        """Subscribe to what others publish on our own topics; see :func:`is_watched`. MQTT 5 only."""
+        """Subscribe to other clients' messages on our own topics; see :func:`is_watched`. MQTT 5 only."""
         if self._client is None or not (filters and self.mqtt5 and self._limits.identifiers):
             return  # we would receive our own messages, and could not tell them from retained ones
         properties = Properties(PacketTypes.SUBSCRIBE)  # type: ignore[no-untyped-call]
         properties.SubscriptionIdentifier = _WATCHED
-        options: Any = subscription(retained=False)
+        options: Any = _subscription(retained=False)
         self._client.subscribe([(one, options) for one in filters], properties=properties)
 
     def unwatch(self, filters: Sequence[str]) -> None:
@@ -345,3 +460,73 @@ class BrokerConnection:
         if self._attempt is not None:
             self._attempt.abandon()
             self._attempt = None
+
+
+class CommandConnection:
+    """The connection for commands and results. Use it from the bridge's thread."""
+
+    def __init__(
+        self,
+        settings: Mqtt,
+        client_id: str,
+        selector: selectors.BaseSelector,
+        wake: Callable[[], object],
+        filters: Callable[[], Sequence[str]],
+        answers: Callable[[], Sequence[str]],
+    ) -> None:
+        """``selector``, ``wake``: see :class:`BrokerConnection`.
+
+        ``filters``: returns the topics of commands; ``answers``: the topics of results.
+        """
+        self._policy = ReconnectPolicy(settings, client_id, ())
+        self.connection = BrokerConnection(self._policy, selector, wake, lambda: None, FEW_IN_FLIGHT)
+        self.connection.close()
+        self._filters, self._answers = filters, answers
+        self._at: Target | None = None
+        self._deadline_s = 0.0
+        """Deadline for the broker's SUBACK."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether commands can arrive, or it is known why not."""
+        return self.connection.subscribed or bool(self.connection.problem)
+
+    @property
+    def problem(self) -> str:
+        """Why no commands arrive or no results are sent; empty: no problem."""
+        return f"commands: {self.connection.problem}" if self.connection.problem else ""
+
+    def turn(self, at: Target | None) -> float:
+        """Connect to the broker that has the values, and return in how many seconds to call again."""
+        if at is not self._at:
+            self._at = at
+            self.connection.close()
+            if at is not None:
+                self._policy.use_only(at)
+                self.connection.open()
+        rest_s = self.connection.turn()
+        if self.connection.came_up:
+            self.connection.came_up = False
+            self.subscribe()
+        if not self.connection.up or self.connection.subscribed:
+            return rest_s
+        left_s = self._deadline_s - time.monotonic()
+        if left_s <= 0:  # the connection for values waits for this one
+            self.connection.drop("it does not answer to SUBSCRIBE")
+        return max(0.0, min(rest_s, left_s))
+
+    def subscribe(self) -> None:
+        """Subscribe to the commands of all current sources."""
+        if self.connection.up:
+            self.connection.subscribe(self._filters())
+            self.watch()
+            self.connection.push()
+            self._deadline_s = time.monotonic() + SUBSCRIBE_S
+
+    def watch(self) -> None:
+        """Subscribe to other clients' messages on the topics of results."""
+        self.connection.watch(self._answers())
+
+    def unwatch(self) -> None:
+        """Unsubscribe from the topics of results."""
+        self.connection.unwatch(self._answers())

@@ -1,4 +1,4 @@
-"""Reads and writes the socket of a connection when it is ready, a few packets at a time."""
+"""Reads and writes the socket of a connection when it is ready: reads a few packets at a time, writes in batches."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import MQTTErrorCode
 
 from shmio.endpoints.mqtt.connection.attempt import close_socket
-from shmio.endpoints.mqtt.connection.write_batches import take_over, write
 
+BATCH: Final = 32
+"""Messages in a batch, which share TCP segments; the first is not sent before the last is made."""
 PACKETS: Final = 4
 """Packets that are read before other work has its turn.
 
@@ -42,7 +43,8 @@ class SocketIo:
         """Whether data waits for room in the socket."""
         self._packets = 0
         """Number of packets read that called one of the client's callbacks."""
-        take_over(client)
+        client.on_socket_register_write = lambda *_: None  # only we write from now on
+        _set(made, socket.TCP_NODELAY, 1)  # a batch does not wait for the acknowledgement of the one before
         selector.register(made, selectors.EVENT_READ, self._serve)
 
     def counting(self, callback: Callable[..., None]) -> Callable[..., None]:
@@ -78,7 +80,7 @@ class SocketIo:
         """Read and write a socket that is ready."""
         code = self._read() if events & selectors.EVENT_READ else MQTTErrorCode.MQTT_ERR_SUCCESS
         if not code and self._socket is not None and (events & selectors.EVENT_WRITE or not self.writing):
-            code = write(self._client)
+            code = self._write(self._socket)
         if code and self._socket is not None:
             self._on_failure(str(MQTTErrorCode(code).name).removeprefix("MQTT_ERR_").replace("_", " ").lower())
         if self._socket is not None and self.writing != self._client.want_write():
@@ -95,6 +97,27 @@ class SocketIo:
             code = self._client.loop_read()
         return code
 
+    def _write(self, made: socket.socket) -> MQTTErrorCode:
+        """Write the client's queued messages, as many as the socket takes.
+
+        Do not use it for a DISCONNECT, after which paho closes the socket: corked data may be lost.
+        """
+        client = self._client
+        # Else paho would call it for each message of QoS 0, which is slow.
+        acknowledged, client.on_publish = client.on_publish, None
+        _set(made, socket.TCP_CORK, 1)
+        code = client.loop_write()
+        _set(made, socket.TCP_CORK, 0)
+        client.on_publish = acknowledged
+        return code
+
     def _unseen(self) -> bool:
         """Return whether TLS has buffered data, which a selector does not see."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
+
+
+def _set(made: socket.socket, option: int, value: int) -> None:
+    """Set a TCP option; see tcp(7)."""
+    if made.family != socket.AF_UNIX:
+        with suppress(OSError):  # it may have been closed
+            made.setsockopt(socket.IPPROTO_TCP, option, value)

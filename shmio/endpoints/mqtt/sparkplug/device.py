@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from shmio.endpoints.mqtt.command_client import CommandClient
+from shmio.endpoints.mqtt.commands import CommandClient
 from shmio.endpoints.mqtt.feed import MAX_FRAMES_PER_TURN, follow
-from shmio.endpoints.mqtt.sparkplug.metrics import Metric, parts_of
-from shmio.endpoints.mqtt.sparkplug.node import Sample
+from shmio.endpoints.mqtt.sparkplug.node import Metric, Sample, parts_of
 from shmio.layout.glob import Glob
 from shmio.layout.model import Register
 from shmio.layout.values.codec import codec

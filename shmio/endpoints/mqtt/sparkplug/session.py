@@ -15,16 +15,14 @@ import msgspec
 from paho.mqtt.client import MQTTMessage
 
 from shmio.config import Mqtt, Sparkplug
-from shmio.endpoints.mqtt.backlog import Backlog
 from shmio.endpoints.mqtt.broker.directory import own_socket
-from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.connection.connection import BrokerConnection
-from shmio.endpoints.mqtt.connection.limits import FEW_IN_FLIGHT
+from shmio.endpoints.mqtt.connection.connection import FEW_IN_FLIGHT, BrokerConnection
 from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.feed import Feed
-from shmio.endpoints.mqtt.outbox import OVERHEAD_BYTES
+from shmio.endpoints.mqtt.outbox import OVERHEAD_BYTES, Backlog
 from shmio.endpoints.mqtt.sparkplug.device import Device, DeviceEvent
 from shmio.endpoints.mqtt.sparkplug.node import NAMESPACE, EdgeNode, Sample
+from shmio.endpoints.mqtt.topics import Message
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Register

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from shmio.config import Address, Mqtt
-from shmio.endpoints.mqtt.broker import process as broker
+from shmio.endpoints.mqtt.__main__ import run_broker
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
 from shmio.testing.ports import reserved_port
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE, image
@@ -59,7 +59,7 @@ class Process:
 
     def _run(self) -> None:
         try:
-            broker.run(self._worker)
+            run_broker(self._worker)
         except Exception as error:  # noqa: BLE001  whatever it is, it is the test's to tell
             self.failure = error
         finally:

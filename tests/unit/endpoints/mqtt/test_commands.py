@@ -13,7 +13,7 @@ import pytest
 from shmio.config import Mqtt, MqttTopic
 from shmio.connectors.injection.layers import Owner
 from shmio.endpoints.mqtt.bridge import Bridge
-from shmio.endpoints.mqtt.connection.limits import FEW_IN_FLIGHT
+from shmio.endpoints.mqtt.connection.connection import FEW_IN_FLIGHT
 from shmio.endpoints.mqtt.connection.socket_io import PACKETS
 from shmio.segment import Segment
 from shmio.segment.processes import WRITERS

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from paho.mqtt.properties import Properties
 
-from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.outbox import MAX_RESULTS, OVERHEAD_BYTES, TURN_MESSAGES, Outbox
+from shmio.endpoints.mqtt.topics import Message
 
 
 class FakeConnection:

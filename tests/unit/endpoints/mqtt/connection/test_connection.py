@@ -12,9 +12,9 @@ import pytest
 
 from shmio.backoff import Backoff
 from shmio.config import Mqtt
-from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.connection.connection import BrokerConnection
 from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
+from shmio.endpoints.mqtt.topics import Message
 
 TIMEOUT_S = 30
 
@@ -144,7 +144,7 @@ def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.Mo
             publish("open")
             broker.say("40 02 00 02", lambda: not connection.in_flight)
             assert "secret" in connection.problem
-            monkeypatch.setattr("shmio.endpoints.mqtt.connection.failure.REFUSED_S", 0.0)
+            monkeypatch.setattr("shmio.endpoints.mqtt.connection.connection.REFUSED_S", 0.0)
             publish("open")
             broker.say("40 02 00 03", lambda: not connection.in_flight)
             assert not connection.problem

@@ -14,9 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.sparkplug.metrics import parts_of
-from shmio.endpoints.mqtt.sparkplug.node import MAX_METRICS, REBIRTH, Command, EdgeNode, Sample
+from shmio.endpoints.mqtt.sparkplug.node import MAX_METRICS, REBIRTH, Command, EdgeNode, Sample, parts_of
+from shmio.endpoints.mqtt.topics import Message
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import codec

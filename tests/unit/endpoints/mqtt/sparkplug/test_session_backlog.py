@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from shmio.endpoints.mqtt.sparkplug.metrics import Metric
-from shmio.endpoints.mqtt.sparkplug.node import Sample
+from shmio.endpoints.mqtt.sparkplug.node import Metric, Sample
 from shmio.endpoints.mqtt.sparkplug.session import DeviceBacklog
 from shmio.layout.model import Register
 

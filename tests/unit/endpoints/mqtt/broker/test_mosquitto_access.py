@@ -13,8 +13,8 @@ import pytest
 from paho.mqtt.client import topic_matches_sub
 
 from shmio.config import Address, Mqtt, MqttAccount
-from shmio.endpoints.mqtt.broker.access import rights, secret_id
-from shmio.endpoints.mqtt.broker.directory import SECRET, folder
+from shmio.endpoints.mqtt.broker.directory import SECRET, folder, secret_id
+from shmio.endpoints.mqtt.broker.mosquitto import rights
 from shmio.segment import Segment
 from shmio.testing.mosquitto import missing
 from tests.unit.endpoints.harness import image

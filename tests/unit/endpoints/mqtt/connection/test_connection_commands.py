@@ -129,7 +129,7 @@ def test_values_come_though_the_broker_takes_no_second_connection(segment: Segme
 def test_values_come_though_the_broker_never_answers_to_subscribe(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.command_connection.CONNECT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.connection.SUBSCRIBE_S", 0.1)
     segment.writer("cell").publish(image(step=1), cycle=1)
     broker = Narrow(lets_in=True)
     with bridge(segment, broker.address) as running:

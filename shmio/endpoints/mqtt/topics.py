@@ -1,0 +1,319 @@
+"""Topics that the bridge publishes: the configuration's rules, and channels.
+
+A channel makes the payload of one topic when the outbox sends it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, NamedTuple, Protocol
+
+import msgspec
+
+from shmio.config import MqttTopic
+from shmio.layout.glob import Glob
+from shmio.layout.model import Layout, Register
+from shmio.layout.topic import canonical_path, decode_segment, names_part
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.text import json_value, texts
+from shmio.local.reading import holds_none, injected, reading
+from shmio.segment import Frame, FrameFollower, Provenance, Quality
+
+DEFAULT: Final = MqttTopic(match="**")
+"""The rule of registers that no other rule matches."""
+ONLINE: Final = b"online"
+NUMBERS: Final = (int, float)
+
+_ToJson = Callable[[bytes], Any]
+"""Converts an image to a value for JSON."""
+
+
+class TopicRules:
+    """The configuration's rules; the first that matches counts."""
+
+    def __init__(self, topics: Sequence[MqttTopic]) -> None:
+        """Compile the rules.
+
+        Raises:
+            PathError: A pattern is invalid.
+
+        """
+        self._frames = {pattern: rule for rule in topics if rule.payload == "frames" for pattern in rule.patterns}
+        rules = [(pattern, rule) for rule in topics if rule.payload != "frames" for pattern in rule.patterns]
+        self._parts: dict[str, MqttTopic] = {}
+        for pattern, rule in rules:
+            if names_part(pattern):
+                self._parts.setdefault(canonical_path(pattern, parts=True), rule)
+        self._rules = [(Glob(pattern), rule) for pattern, rule in rules if not names_part(pattern)]
+
+    def of(self, source: str, path: str) -> MqttTopic:
+        """Return the rule of a register, bit or slice."""
+        full = f"{source}/{path}"
+        return self._parts.get(full) or self._first(full)[1]
+
+    def parts(self, source: str) -> Iterator[str]:
+        """Yield the paths of a source's bits, slices and other parts that have rules of their own."""
+        for full, rule in self._parts.items():
+            first, _, path = full.partition("/")
+            if first == source and rule.publish:
+                yield path
+
+    def structure(self, source: str, path: str) -> str | None:
+        """Return the structure that a register is published in; empty: the source; None: by itself."""
+        glob, rule = self._first(f"{source}/{path}")
+        if glob is None or rule.payload != "structure":
+            return None
+        names = [source, *path.split("/")]
+        depths = range(1, len(names))
+        return next(("/".join(names[1:n]) for n in depths if glob.matches("/".join(names[:n]))), None)
+
+    def _first(self, full: str) -> tuple[Glob | None, MqttTopic]:
+        return next((found for found in self._rules if found[0].matches(full)), (None, DEFAULT))
+
+    def frames(self, source: str) -> MqttTopic | None:
+        """Return the rule for a source's whole frames; None: they are not published."""
+        rule = self._frames.get(source)
+        return rule if rule and rule.publish else None
+
+
+class Message(NamedTuple):
+    """One message for the broker.
+
+    ``keep``: it is a change of a value, which the backlog keeps while the broker is away.
+    ``source_ns``: when the source had the value, in ns since 1970; 0: unknown, or no value.
+    """
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+    keep: bool = False
+    source_ns: int = 0
+
+
+class Channel(Protocol):
+    """A topic that the bridge publishes."""
+
+    topic: str
+
+    def message(self, *, late: bool = False) -> Message:
+        """Make the message from the current state.
+
+        ``late``: it will not be sent now, but when the broker is back.
+        """
+
+
+class _RuledChannel:
+    """A topic that a rule selects."""
+
+    json = False
+
+    def __init__(self, follower: FrameFollower, topic: str, rule: MqttTopic) -> None:
+        self.topic = topic
+        self.limited = rule.deadband > 0 or rule.max_rate_hz is not None
+        """Whether a deadband or a maximum rate limits what is published."""
+        self.due_ns = 0
+        """When the next message may be sent, in ns of the source's clock."""
+        self._follower = follower
+        self._qos, self._retain = rule.qos, rule.retain
+        self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
+
+    def moved(self, _image: bytes) -> bool:
+        """Return whether a change is large enough to publish: always, without a deadband."""
+        return True
+
+    def _pause(self) -> None:
+        """Start the pause until the next message."""
+        if self.limited:
+            self.due_ns = self._follower.block.now_ns() + self._pause_ns
+
+    def _message(self, payload: bytes, *, late: bool) -> Message:
+        frame = self._follower.frame
+        return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
+
+
+class RegisterChannel(_RuledChannel):
+    """The topic of a register or an array's element, as text or JSON."""
+
+    def __init__(self, follower: FrameFollower, register: Register, topic: str, rule: MqttTopic) -> None:
+        super().__init__(follower, topic, rule)
+        self.registers = (register,)
+        self.json = rule.payload != "text"
+        self._register, self._deadband = register, rule.deadband
+        self._decode = codec(register, follower.block.layout.byte_order).decode
+        self._to_text = texts(register)
+        self._sent: Value = None
+
+    def moved(self, image: bytes) -> bool:
+        """Return whether the value is outside the deadband around the last one sent."""
+        if not self._deadband:
+            return True
+        pairs = zip(_flat(self._decode(image)), _flat(self._sent), strict=False)
+        return self._sent is None or any(_apart(new, old, self._deadband) for new, old in pairs)
+
+    def message(self, *, late: bool = False) -> Message:
+        """Make the message; without a good value, text is empty, and JSON says why."""
+        return self._message(self._json(late=late) if self.json else self._text(), late=late)
+
+    def _text(self) -> bytes:
+        frame = self._follower.frame
+        if frame is None or self._follower.quality is Quality.BAD:
+            self._note(None)
+            return b""
+        value = self._decode(frame.image)
+        self._note(value)
+        return self._to_text(value).encode()
+
+    def _json(self, *, late: bool) -> bytes:
+        follower = self._follower
+        frame, quality, reason = follower.frame, follower.quality, follower.reason
+        found = reading(follower.block, self._register, frame)
+        if holds_none(found.value):
+            quality, reason = Quality.BAD, reason or found.reason
+        self._note(None if quality is Quality.BAD else found.value)
+        value = json_value(found.value, self._register.element)
+        return _json_payload(value, quality, reason, found.provenance, frame, late=late)
+
+    def _note(self, value: Value) -> None:
+        if self._deadband:
+            self._sent = value
+        self._pause()
+
+
+class StructureChannel(_RuledChannel):
+    """The topic of a structure: its registers as one JSON object."""
+
+    json = True
+
+    def __init__(
+        self, follower: FrameFollower, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic
+    ) -> None:
+        """``path``: of the structure that contains the registers; empty: the whole source."""
+        super().__init__(follower, topic, rule)
+        self.registers = registers
+        depth = path.count("/") + 1 if path else 0
+        parts = [(register.path.split("/")[depth:], register) for register in registers]
+        self._value = _members(parts, follower.block.layout)
+
+    def message(self, *, late: bool = False) -> Message:
+        """Make the message; while the quality is bad, with the last known values."""
+        follower = self._follower
+        block, frame = follower.block, follower.frame
+        self._pause()
+        value, provenance = None, Provenance.LIVE
+        if frame is not None:
+            provenance = Provenance.INJECTED if injected(block, self.registers, frame) else frame.provenance
+            value = self._value(frame.image) if frame.source_ns else None
+        payload = _json_payload(value, follower.quality, follower.reason, str(provenance), frame, late=late)
+        return self._message(payload, late=late)
+
+
+ValueChannel = RegisterChannel | StructureChannel
+
+
+class FramesChannel(_RuledChannel):
+    """The topic of a block's frames: the bytes of the effective image."""
+
+    def message(self, *, late: bool = False) -> Message:
+        """Make the message; empty while there is no good frame."""
+        frame, quality = self._follower.frame, self._follower.quality
+        self._pause()
+        return self._message(b"" if frame is None or quality is Quality.BAD else frame.image, late=late)
+
+
+class StatusChannel:
+    """The topic of a source's status, as JSON."""
+
+    def __init__(self, follower: FrameFollower, topic: str) -> None:
+        self.topic = topic
+        self._follower = follower
+
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is published again when the broker is back
+        """Make the message from the current state."""
+        follower = self._follower
+        return status(self.topic, follower.quality, follower.reason, follower.missed, follower.frame)
+
+
+class BridgeStatusChannel:
+    """The topic of the bridge's status: always online; the will says offline."""
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  see StatusChannel
+        """Make the message ``online``."""
+        return Message(self.topic, ONLINE, 1, retain=True)
+
+
+class ClearedTopic:
+    """A topic that is no longer published; an empty message deletes the broker's retained one."""
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  see StatusChannel
+        """Make the empty message."""
+        return Message(self.topic, b"", 1, retain=True)
+
+
+def _json_payload(
+    value: object, quality: Quality, reason: str, provenance: str, frame: Frame | None, *, late: bool
+) -> bytes:
+    """Encode a value as JSON, with its quality, source time, provenance and sequence number."""
+    fields = {
+        "value": value,
+        "quality": str(quality),
+        "reason": reason,
+        "source_time": frame.source_ns / 1e9 if frame and frame.source_ns else None,
+        "provenance": provenance,
+        "sequence": frame.number if frame else 0,
+    }
+    return msgspec.json.encode(fields | {"late": True} if late else fields)
+
+
+def status(topic: str, quality: Quality, reason: str, missed: int, frame: Frame | None = None) -> Message:
+    """Make the message of a source's status topic.
+
+    ``missed``: number of frames that were skipped.
+    """
+    fields = {
+        "quality": str(quality),
+        "reason": reason,
+        "source_time": frame.source_ns / 1e9 if frame and frame.source_ns else None,
+        "provenance": str(frame.provenance) if frame else None,
+        "cycle": frame.cycle if frame else None,
+        "missed": missed,
+    }
+    return Message(topic, msgspec.json.encode(fields), 1, retain=True)
+
+
+def _flat(value: Value) -> Iterator[Value]:
+    if isinstance(value, list):
+        for item in value:
+            yield from _flat(item)
+    else:
+        yield value
+
+
+def _apart(new: Value, old: Value, deadband: float) -> bool:
+    numbers = isinstance(new, NUMBERS) and isinstance(old, NUMBERS) and not isinstance(new, bool)
+    return new != old and not (numbers and abs(new - old) < deadband)  # type: ignore[operator]  # they are numbers
+
+
+def _members(parts: Sequence[tuple[list[str], Register]], layout: Layout) -> _ToJson:
+    """Make the decoder of a JSON object.
+
+    ``parts``: each register with the names that lead to it from here.
+    """
+    groups: dict[str, list[tuple[list[str], Register]]] = {}
+    for (name, *rest), register in parts:
+        groups.setdefault(decode_segment(name), []).append((rest, register))
+    members = {
+        name: _members(inner, layout) if inner[0][0] else _member(inner[0][1], layout) for name, inner in groups.items()
+    }
+    return lambda image: {name: value(image) for name, value in members.items()}
+
+
+def _member(register: Register, layout: Layout) -> _ToJson:
+    decode, element = codec(register, layout.byte_order).decode, register.element
+    return lambda image: json_value(decode(image), element)
