@@ -20,11 +20,8 @@ from shmio.client.aio import client
 from shmio.client.calls import Stepped, Target
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
-from shmio.client.sync.campaign import Campaign
-from shmio.client.sync.client import Client, Subscription
-from shmio.client.sync.injection import Shadow
-from shmio.client.sync.model import Simulation
-from shmio.client.sync.steps import Steps
+from shmio.client.sync.client import Client, Simulation, Steps, Subscription
+from shmio.client.sync.injection import Campaign, Shadow
 from shmio.client.table import Change, Register, Table
 from shmio.client.update import Piece, Snapshot, Update
 from shmio.model.clock import Clock

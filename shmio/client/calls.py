@@ -1,4 +1,4 @@
-"""Shared by both clients: build requests, convert answers, translate gRPC statuses. No I/O."""
+"""Shared by both clients: target, requests, answers, and errors from gRPC statuses. No I/O."""
 
 from __future__ import annotations
 
@@ -24,27 +24,56 @@ from shmio.errors import (
 from shmio.messages import value_to_wire
 from shmio.model.clock import Clock, ClockMode
 from shmio.model.outcome import Outcome, OutcomeKind
+from shmio.model.replay import Playing, Wish
 from shmio.wire import shmio_v1_pb2 as wire
 
 STEP_PATIENCE_S: Final = 60.0
-_CLOCK_KEYS: Final = ("virtual", "step", "time_ns", "step_size_ns", "playing", "rate", "note")
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 WRITE_PATIENCE_S: Final = 30.0
-"""Beyond its own time-out a write is given so long to be answered: a slow source has its cycles."""
+"""Time limit for the answer to a write, in addition to its own: a source may have long cycles."""
+_SEARCH_PATIENCE_S: Final = 600.0
+"""Time limit for a search in a recording."""
 OPTIONS: Final = [
     ("grpc.max_receive_message_length", 64 << 20),
     ("grpc.keepalive_time_ms", 20_000),
-    # A restarted endpoint is found at once.
+    # Find a restarted endpoint soon.
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 1_000),
 ]
 
+_CLOCK_KEYS: Final = ("virtual", "step", "time_ns", "step_size_ns", "playing", "rate", "note")
 _ERRORS: Final[Mapping[grpc.StatusCode, type[ShmioError]]] = {
     grpc.StatusCode.NOT_FOUND: PathError,
     grpc.StatusCode.INVALID_ARGUMENT: ValueRangeError,
     grpc.StatusCode.FAILED_PRECONDITION: CommandError,
     grpc.StatusCode.RESOURCE_EXHAUSTED: EndpointError,
     grpc.StatusCode.ALREADY_EXISTS: ConflictError,
+}
+_REMOTE: Final[Mapping[grpc.StatusCode, type[RemoteError]]] = {
+    grpc.StatusCode.UNAVAILABLE: LostError,
+    grpc.StatusCode.UNAUTHENTICATED: UnknownClientError,
+}
+_PLAIN: Final = {
+    "Connection refused": "nothing listens on that port",
+    "No such file or directory": "there is no such socket",
+    "Domain name not found": "there is no host of that name",
+    "Cancelling all calls": "the endpoint has stopped",
+    "Socket closed": "the endpoint has stopped",
+}
+"""Short texts for gRPC's long ones."""
+_TLS: Final = {
+    "Hostname Verification": "its certificate does not name this host: use a name or address that it has",
+    "WRONG_VERSION_NUMBER": "it speaks plain text: leave the CA out (ca, --ca)",
+    "CERTIFICATE_VERIFY_FAILED": "its certificate is not from the CA that was named (ca, --ca), or has expired",
+}
+"""Short texts for gRPC's errors of TLS."""
+_UNIX: Final = "unix:"
+_MEANING: Final = {
+    grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
+    grpc.StatusCode.DEADLINE_EXCEEDED: "it did not answer in time",
+    grpc.StatusCode.UNAUTHENTICATED: "it does not know this client",
+    grpc.StatusCode.PERMISSION_DENIED: "it does not permit this",
+    grpc.StatusCode.UNIMPLEMENTED: "it does not serve shmio.v1, it is older than this client",
 }
 
 
@@ -93,16 +122,16 @@ class Target:
             details = f"too much for one message: give or ask for fewer values at once ({details})"
         if kind := _ERRORS.get(code):
             return kind(details)
-        told = _REMOTE.get(code, RemoteError)
+        error_type = _REMOTE.get(code, RemoteError)
         if tls := next((meaning for words, meaning in _TLS.items() if words in details), None):
-            return told(f"{self.address}: {tls}")
+            return error_type(f"{self.address}: {tls}")
         closed = "Socket closed" in details and not self.address.startswith(_UNIX)
         details = next((plain for words, plain in _PLAIN.items() if words in details), details)
         if closed and self.ca is None:
             details += ", or it speaks TLS: then name the CA of its certificate (ca, --ca)"
         elif closed and self.certificate is None:
             details += ", or it needs a client certificate (certificate and key)"
-        return told(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
+        return error_type(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
 
     def fail(self, error: Any) -> NoReturn:
         """Raise the translated error of a call."""
@@ -112,34 +141,6 @@ class Target:
 def unanswered(target: Target) -> RemoteError:
     """Return the error for a call that has begun without an answer from the endpoint."""
     return RemoteError(f"{target.address}: the endpoint has not answered within {WRITE_PATIENCE_S:g} s")
-
-
-_REMOTE: Final[Mapping[grpc.StatusCode, type[RemoteError]]] = {
-    grpc.StatusCode.UNAVAILABLE: LostError,
-    grpc.StatusCode.UNAUTHENTICATED: UnknownClientError,
-}
-_PLAIN: Final = {
-    "Connection refused": "nothing listens on that port",
-    "No such file or directory": "there is no such socket",
-    "Domain name not found": "there is no host of that name",
-    "Cancelling all calls": "the endpoint has stopped",
-    "Socket closed": "the endpoint has stopped",
-}
-"""What gRPC says at length."""
-_TLS: Final = {
-    "Hostname Verification": "its certificate does not name this host: use a name or address that it has",
-    "WRONG_VERSION_NUMBER": "it speaks plain text: leave the CA out (ca, --ca)",
-    "CERTIFICATE_VERIFY_FAILED": "its certificate is not from the CA that was named (ca, --ca), or has expired",
-}
-"""The same of TLS."""
-_UNIX: Final = "unix:"
-_MEANING: Final = {
-    grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
-    grpc.StatusCode.DEADLINE_EXCEEDED: "it did not answer in time",
-    grpc.StatusCode.UNAUTHENTICATED: "it does not know this client",
-    grpc.StatusCode.PERMISSION_DENIED: "it does not permit this",
-    grpc.StatusCode.UNIMPLEMENTED: "it does not serve shmio.v1, it is older than this client",
-}
 
 
 def _is_here(address: str) -> bool:
@@ -273,3 +274,27 @@ def _process(found: Any) -> dict[str, Any]:
             "real_time": source.real_time,
         }
     return process
+
+
+def replay_request(wish: Wish) -> Any:
+    """Return the request for Replay; times are sent as text."""
+    keys: dict[str, Any] = {**wish}
+    for key in {"seek", "until"} & keys.keys():
+        keys[key] = str(keys[key])
+    return wire.ReplayRequest(**keys)
+
+
+def playing(found: Any) -> list[Playing]:
+    """Convert the answer to Replay."""
+    return [
+        Playing(
+            one.source, one.time_s, one.position_s, one.length_s, one.speed, one.paused, one.loop, one.over,
+            one.until_s if one.HasField("until_s") else None,
+        )
+        for one in found.sources
+    ]  # fmt: skip
+
+
+def replay_patience_s(wish: Wish) -> float | None:
+    """Return the time limit for a request in s; None for the client's usual limit."""
+    return _SEARCH_PATIENCE_S if "change" in wish or "event" in wish else None

@@ -1,4 +1,4 @@
-"""Messages between an endpoint and a client that injects values. No I/O."""
+"""Messages between an endpoint and a client that injects values or declares injections. No I/O."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 
 from shmio.client import calls
-from shmio.client.arrays import InjectRequest
-from shmio.client.table import DTYPES, FIELDS, Array, Table
+from shmio.client.table import DTYPES, FIELDS, Array, InjectRequest, Table
 from shmio.client.update import Piece, Tables, Update
 from shmio.errors import RemoteError, ValueRangeError
+from shmio.messages import declaration_from_wire, declaration_to_wire
+from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
 from shmio.model.outcome import Outcome
 from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 
-MAX_WAITING: Final = 4096
+_MAX_WAITING: Final = 4096
 """Messages with originals that may wait to be read."""
 
 Given = Array | list[Any]
@@ -103,15 +105,15 @@ class Held:
     def keep(self, found: Any) -> None:
         """Keep the originals of a message until they are read; RemoteError if nobody reads them."""
         if found.originals:
-            if len(self._waiting) >= MAX_WAITING:
+            if len(self._waiting) >= _MAX_WAITING:
                 raise RemoteError(
-                    f"{MAX_WAITING} messages with originals are waiting: iterate over them, or do not request originals"
+                    f"{_MAX_WAITING} messages with originals wait: iterate over them, or do not request originals"
                 )
             self._waiting.append(found.originals)
 
     @property
     def waits(self) -> bool:
-        """Whether there are originals to read."""
+        """Whether originals wait to be read."""
         return bool(self._waiting)
 
     def originals(self) -> Iterator[Update]:
@@ -126,3 +128,64 @@ def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outc
     """Return an outcome for each value, and with ``more`` one for all arrays and raw bytes."""
     paths = [*values, *([""] if more else [])]
     return calls.outcomes(paths, [outcome])
+
+
+# -- declared injections -------------------------------------------------------------------------------------
+
+
+def declare_request(declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool) -> Any:
+    """Return the request for Declare; ValueRangeError for an invalid key or value."""
+    given = [one if isinstance(one, Mapping) else msgspec.to_builtins(one) for one in declarations]
+    tables = [declaration_to_wire(table, f"injection[{index}]") for index, table in enumerate(given)]
+    return wire.DeclareRequest(declarations=tables, keep=keep)
+
+
+def declared(found: Any) -> tuple[Declared, ...]:
+    """Convert the first answer to Declare; RemoteError if it is invalid."""
+    if found is None or not found.HasField("declared"):
+        raise RemoteError("the endpoint's first answer to Declare is invalid")
+    return tuple(Declared(one.source, one.number, one.name, one.seed) for one in found.declared.injections)
+
+
+def happenings(found: Any) -> list[Happening]:
+    """Convert the events in an answer to Declare."""
+    known = wire.Happening.Kind.values()
+    return [
+        Happening(
+            one.source, one.number,
+            wire.Happening.Kind.Name(one.kind).removeprefix("KIND_").lower() if one.kind in known else "unknown",
+            one.clock_ns, one.utc_ns, one.frame, one.cycle, one.run, one.text,
+        )
+        for one in found.happenings
+    ]  # fmt: skip
+
+
+def lifted(found: Any) -> list[Lifted]:
+    """Convert the answer to LiftAll."""
+    return [Lifted(one.source, one.number, one.name, one.failure) for one in found.lifted]
+
+
+def injections(found: Any) -> list[Injection[Mapping[str, Any]]]:
+    """Convert the answer to ListInjections."""
+    return [
+        Injection(
+            number=one.number,
+            direction="in" if one.direction == wire.DIRECTION_IN else "out",
+            priority=one.priority,
+            keep=one.keep,
+            name=one.name,
+            writer=one.writer,
+            pid=one.pid,
+            ranges=tuple((part.offset, part.size, part.mask) for part in one.ranges),
+            running=_running(one.running, one.name) if one.HasField("running") else None,
+            source=one.source,
+        )
+        for one in found.injections
+    ]
+
+
+def _running(found: Any, name: str) -> Running[Mapping[str, Any]]:
+    states = wire.Running.State
+    state = states.Name(found.state).removeprefix("STATE_").lower() if found.state in states.values() else "unknown"
+    declaration = declaration_from_wire(found.declaration, name)
+    return Running(declaration, state, found.seed, found.runs, found.cycle, found.time_ns)

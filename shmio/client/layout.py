@@ -23,11 +23,11 @@ MAX_REGISTERS: Final = 1 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class BlockLayout(Layout):
-    """Layout of a source's block, with what the endpoint says of it.
+    """Layout of a source's block, with its properties in the instance.
 
     Attributes:
         source: Name of the source.
-        section: Which of the blocks that the source has had: a reload may give it another.
+        section: Number of the source's block: a reload may give the source another one.
         hash: Hash of the layout.
         period_ns: Time between two cycles.
         stale_ns: Age above which a frame is bad.
@@ -46,7 +46,7 @@ class BlockLayout(Layout):
 
     @property
     def big_endian(self) -> bool:
-        """Whether numbers have their most significant byte first."""
+        """Whether numbers are stored big-endian."""
         return self.byte_order == "big"
 
     @property

@@ -20,7 +20,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 RETRY_S: Final = 0.25
 """Time between two attempts to join."""
 PATIENCE_S: Final = 10.0
-"""So long an instance that is not there is waited for."""
+"""Time to wait for an instance that does not run."""
 _WHOLE: Final = frozenset({Column.INT32, Column.INT64, Column.UINT64})
 _FAILURE_CHARACTERS: Final = 400
 
@@ -36,7 +36,7 @@ class Values(Mapping[str, Any]):
     def __init__(self, table: Table) -> None:
         self._table = table
         self.changed: tuple[str, ...] = ()
-        """Paths of what came with the present step: all with the first one."""
+        """Paths of the values that came with the present step; the first step has all."""
 
     def __getitem__(self, path: str) -> Any:
         """Return a register's value; PathError if there is no such register."""
@@ -104,7 +104,7 @@ class Part:
     def take(self, found: Any) -> Work:
         """Return the step that an answer requests; RemoteError if the answer is invalid."""
         if found.WhichOneof("what") != "work":
-            raise RemoteError("the endpoint has not asked for a step")
+            raise RemoteError("the endpoint sent something other than a step")
         work = found.work
         changes = self._inputs.apply(work.values) if work.HasField("values") else ()
         if work.HasField("invalid"):
@@ -168,14 +168,14 @@ class Member:
         self.period_s = part.period_s
 
     def _present(self) -> int:
-        """The number of the step that waits for an answer; RemoteError if none does."""
+        """Return the number of the step that waits for an answer; RemoteError if none does."""
         if self._work is None:
             raise RemoteError(f"{self.source}: there is no step to answer")
         return self._work.step
 
 
-def join(source: str, name: str) -> bytes:
-    """The first message."""
+def join_request(source: str, name: str) -> bytes:
+    """Return the first message, which joins a source."""
     return wire.SimulateRequest(join=wire.Join(source=source, name=name)).SerializeToString()
 
 
@@ -187,23 +187,23 @@ class Rejoining:
         self._lost_s: float | None = time.monotonic()
         self._joined = False
         self._known: dict[str, object] = {}  # the latest outputs
-        self._told = True  # whether the present endpoint knows them all
+        self._sent = True  # whether the present endpoint has them all
         self._failure = ""
 
     def joined(self) -> None:
         """Note that the model has joined."""
-        self._lost_s, self._told, self._joined = None, not self._joined, True
+        self._lost_s, self._sent, self._joined = None, not self._joined, True
 
     def patient(self, error: ShmioError) -> bool:
         """Return whether the model should try to join again after an error."""
         if self._lost_s is None:
             self._lost_s = time.monotonic()
-        # The endpoint takes a client that was cut off for connected for a while.
+        # For a while, the endpoint may still count a client as connected whose connection was cut.
         again = isinstance(error, LostError) or (self._joined and isinstance(error, ConflictError))
         return again and time.monotonic() - self._lost_s < self._patience_s
 
     def heed(self, part: Part, work: Work) -> None:
-        """Log what the endpoint says about inputs and the previous answer."""
+        """Log why the endpoint refused the previous answer, if it did."""
         if work.refused:
             log.warning("%s: %s", part.source, work.refused)
 
@@ -214,10 +214,10 @@ class Rejoining:
         """
         outputs = {} if outputs is None else outputs
         if not isinstance(outputs, Mapping):
-            raise ValueRangeError(f"step gave {_shorten(repr(outputs))}, but must give outputs by their paths")
-        answer = part.done(work.step, outputs if self._told else {**self._known, **outputs})
+            raise ValueRangeError(f"step returned {_shorten(repr(outputs))}, but must return outputs by their paths")
+        answer = part.done(work.step, outputs if self._sent else {**self._known, **outputs})
         self._known.update(outputs)
-        self._told, self._failure = True, ""
+        self._sent, self._failure = True, ""
         return answer
 
     def failed(self, part: Part, work: Work, error: Exception) -> bytes:

@@ -1,4 +1,9 @@
-"""Tables of registers, with their latest values as numpy arrays."""
+"""Tables of registers with their latest values as numpy arrays, and the messages that fill them.
+
+A packed field with elements of a fixed size and a ``bytes`` field look the same on the wire
+(protobuf.dev, "Encoding"). This module therefore declares the messages again, from the generated
+description: where the API has numbers, these messages have the bytes of a little-endian array.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,9 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from google.protobuf import message_factory
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
 
 from shmio.errors import PathError, RemoteError
 from shmio.layout import model
@@ -17,7 +25,6 @@ from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 
 Array = np.ndarray[Any, np.dtype[Any]]
-
 
 DTYPES: Final[Mapping[Column, np.dtype[Any]]] = {
     Column.BOOL: np.dtype("?"),
@@ -40,7 +47,52 @@ FIELDS: Final = {
 _NEAR_CANDIDATES: Final = 500
 _SHOWN: Final = 200
 MAX_SLOTS: Final = 1 << 22
-"""A table with more is none of ours."""
+"""No endpoint sends a table with more."""
+
+
+# -- messages with packed arrays as bytes --------------------------------------------------------------------
+
+_FIXED: Final = frozenset(
+    {
+        FieldDescriptorProto.TYPE_BOOL,
+        FieldDescriptorProto.TYPE_FIXED32,
+        FieldDescriptorProto.TYPE_SFIXED32,
+        FieldDescriptorProto.TYPE_SFIXED64,
+        FieldDescriptorProto.TYPE_FIXED64,
+        FieldDescriptorProto.TYPE_FLOAT,
+        FieldDescriptorProto.TYPE_DOUBLE,
+    }
+)
+
+
+def _declared_anew() -> DescriptorPool:
+    file = FileDescriptorProto()
+    wire.DESCRIPTOR.CopyToProto(file)
+    for message in file.message_type:
+        for part in message.field:
+            if part.label == FieldDescriptorProto.LABEL_REPEATED and part.type in _FIXED:
+                part.label, part.type = FieldDescriptorProto.LABEL_OPTIONAL, FieldDescriptorProto.TYPE_BYTES
+    pool = DescriptorPool()
+    pool.Add(file)
+    return pool
+
+
+_POOL = _declared_anew()
+
+
+def _message(name: str) -> Any:
+    return message_factory.GetMessageClass(_POOL.FindMessageTypeByName(f"{wire.DESCRIPTOR.package}.{name}"))
+
+
+Values = _message("Values")
+ReadResponse = _message("ReadResponse")
+SubscribeResponse = _message("SubscribeResponse")
+InjectRequest = _message("InjectRequest")
+InjectResponse = _message("InjectResponse")
+SimulateResponse = _message("SimulateResponse")
+
+
+# -- tables --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,14 +164,14 @@ class Table:
         self.number: int = found.number
         self.source: str = found.source
         self.section: int = found.section
-        """Which of the blocks that the source has had: a reload may give it another."""
+        """Number of the source's block: a reload may give the source another one."""
         self.size: int = found.size
-        """Of a frame, in bytes."""
+        """Size of a frame in bytes."""
         self.hash: bytes = found.hash
         self.direction = "in" if found.direction == wire.DIRECTION_IN else "out"
-        """``in``: its updates tell what is written to the registers."""
+        """``in`` if its updates have what commands write to the registers, else ``out``."""
         self.ranges = tuple((one.offset, one.size, one.mask) for one in found.ranges)
-        """(offset, size, mask) of what an injection is over besides the registers."""
+        """(offset, size, mask) of the bytes and bits that an injection covers besides the registers."""
         self.registers = tuple(map(Register.of, found.registers))
         sizes = dict(zip(Column, found.slots[1:], strict=False))
         if sum(sizes.values()) > MAX_SLOTS:
@@ -131,15 +183,15 @@ class Table:
         self.arrays: dict[Column, Array] = {
             column: np.zeros(size, DTYPES[column]) for column, size in sizes.items() if size
         }
-        """The values by now, by column; the next update writes into them."""
+        """The latest values, by column; the next update changes them in place."""
         if Column.TEXT in self.arrays:
             self.arrays[Column.TEXT][:] = ""
         self.invalid = np.zeros(len(self.registers), bool)
-        """Registers, by their place, whose bytes are no value of their type."""
+        """For each register, whether its bytes are not a valid value of its type."""
         self.injected = np.zeros(len(self.registers), bool)
-        """Registers, by their place, of which an injection shows something else."""
+        """For each register, whether an injection covers its value."""
         self.state: object = None
-        """What the last update said of the whole frame: its quality, reason, provenance and incarnation."""
+        """Quality, reason, provenance and incarnation of the latest frame."""
         self._everything = {column: np.arange(len(array), dtype=np.uint32) for column, array in self.arrays.items()}
 
     @cached_property

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from shmio.client.arrays import SubscribeResponse
-from shmio.client.table import Array, Change, Table, unknown
+from shmio.client.table import Array, Change, SubscribeResponse, Table, unknown
 from shmio.errors import QualityError, RemoteError
 from shmio.layout import model
 from shmio.model.reading import Reading
@@ -25,13 +24,13 @@ class Piece(NamedTuple):
 class Update:
     """One frame of a source, or a change of its quality.
 
-    For a table of ``in`` it is what a command has written. ``update[path]`` is the latest value of
-    a register.
+    With a table of ``in``, it has what a command wrote. ``update[path]`` is the latest value of a
+    register.
 
     Attributes:
         changes: The received values; ``table.arrays`` has the latest values of all registers.
         clock_ns: Time since the instance's start.
-        source_ns: UTC of the values; 0 if there never were any.
+        source_ns: UTC time of the values; 0 if there are no values yet.
         marked: Whether the update also says which registers are invalid or injected.
         missed: With every frame, the number of frames lost before this one.
         ended: Whether a reload has removed the source, or all requested registers.
@@ -91,7 +90,7 @@ class Update:
 
     @property
     def readings(self) -> list[Reading]:
-        """The registers that may have changed since the update before, with their values by now."""
+        """The registers that may have changed since the previous update, with their latest values."""
         if self.ended:
             return []
         table = self.table
@@ -99,7 +98,7 @@ class Update:
         return [self.reading(place) for place in places]
 
     def reading(self, place: int, register: model.Register | None = None) -> Reading:
-        """Return the state of a register by its place in the table. ``register``: what describes it in the reading."""
+        """Return the reading of a register by its place in the table; ``register`` describes it there."""
         found = self.table.registers[place]
         value: Any = self.table.value(place) if self.source_ns else None
         quality, reason = self.quality_of(found.path)

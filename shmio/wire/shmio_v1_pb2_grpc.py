@@ -135,35 +135,35 @@ class ShmioServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def GetLayouts(self, request, context):
-        """The blocks as they are: enough to decode raw frames. A large block comes in several parts.
+        """Returns the layouts of blocks: enough to decode raw frames. A large block comes in several parts.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def GetStatus(self, request, context):
-        """How the instance and its processes are.
+        """Returns the state of the instance and of its processes.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Read(self, request, context):
-        """Registers at once; those of one source are from one frame.
+        """Reads registers once; those of one source come from one frame.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Subscribe(self, request, context):
-        """The present values, then what changes, or every frame.
+        """Sends the present values, then changes, or every frame.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Write(self, request, context):
-        """Registers of one source, all or nothing; what became of each.
+        """Writes registers of one source, all or none, and returns the outcome of each.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -184,14 +184,14 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Declare(self, request, context):
-        """Lays injections that their sources run by themselves, all or none; then the record of what is done, and when.
+        """Lays injections that their sources run by themselves, all or none; then sends their events.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ListInjections(self, request, context):
-        """The injections that stand, of all clients.
+        """Returns the present injections of all clients.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -205,63 +205,63 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def LiftAll(self, request, context):
-        """The emergency: lifts all injections, whoever laid them.
+        """Lifts all injections, whoever laid them: for an emergency.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Step(self, request, context):
-        """Takes time over, and moves it by one step; answered when every stream has what has changed in it.
+        """Takes control of time, and moves it by one step. It returns when every stream has the step's changes.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Steps(self, request_iterator, context):
-        """The same again and again, without a call for each: so many steps for each request, and an answer for each step.
+        """Does many steps by one call: each request asks for a number of steps, and each step is answered.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def SetStepSize(self, request, context):
-        """How far a step goes that does not say it; takes time over.
+        """Takes control of time, and sets the size of steps that are requested without one.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Play(self, request, context):
-        """Steps by itself from now on, in real time or faster or slower.
+        """Takes control of time, and lets it step by itself: in real time, faster or slower.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Pause(self, request, context):
-        """Steps no more by itself; takes time over.
+        """Takes control of time, and stops its steps.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Release(self, request, context):
-        """Time goes by itself again, from where it stands; nothing, if it does.
+        """Returns to real time, from the present time on; does nothing if time is real.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def WatchClock(self, request, context):
-        """How time stands: at once, then after each step and each change.
+        """Sends the state of the clock: at once, then after each step and each change.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Replay(self, request, context):
-        """Moves the sources that play recordings; without a wish it only tells how they play.
+        """Controls the sources that play recordings, and returns their state; a request without a wish changes nothing.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

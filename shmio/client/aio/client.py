@@ -1,4 +1,4 @@
-"""The client for asyncio."""
+"""The client for asyncio: its calls, and its streams of updates, steps and a model's work."""
 
 from __future__ import annotations
 
@@ -9,18 +9,15 @@ from typing import Any, Self, Unpack
 import grpc
 import msgspec
 
-from shmio.client import calls, injection, injections, replay
-from shmio.client.aio.campaign import Campaign
-from shmio.client.aio.injection import Shadow
-from shmio.client.aio.model import Simulation
-from shmio.client.aio.steps import Steps
-from shmio.client.aio.transport import CLOSED, Channel, Duplex, Step, Stream, sleep
-from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
-from shmio.client.calls import Target
+from shmio.client import calls, injection
+from shmio.client.aio.injection import Campaign, Shadow
+from shmio.client.aio.transport import CLOSED, Channel, Duplex, Step, Stream, outputs_of, sleep
+from shmio.client.calls import Stepped, Target
 from shmio.client.layout import BlockLayout, layouts
-from shmio.client.model import PATIENCE_S, RETRY_S, Rejoining
+from shmio.client.model import PATIENCE_S, RETRY_S, Member, Part, Rejoining, Work, join_request
+from shmio.client.table import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
 from shmio.client.update import Snapshot, Tables, Update
-from shmio.errors import CommandError, ConflictError, PathError, RemoteError, TimeError, ValueRangeError
+from shmio.errors import CommandError, ConflictError, PathError, RemoteError, ShmioError, TimeError, ValueRangeError
 from shmio.layout.glob import choose
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted
@@ -36,8 +33,10 @@ class Client:
 
     It has the methods of :class:`shmio.Cell`, and more.
 
-    Errors are those of a local program: PathError, ValueRangeError, CommandError, QualityError; EndpointError: more
-    than the endpoint gives to one client, or all; RemoteError: it cannot be reached, or does not let us.
+    Raises:
+        PathError, ValueRangeError, CommandError, QualityError: As from a local cell.
+        EndpointError: A limit of the endpoint is reached, for one client or for all.
+        RemoteError: The endpoint cannot be reached, or refuses this client.
     """
 
     def __init__(self, target: Target, timeout_s: float = 10.0) -> None:
@@ -70,11 +69,14 @@ class Client:
     async def get(self, *patterns: str) -> list[Reading]:
         """Read the registers that patterns name, whatever their quality: see :class:`shmio.Cell`.
 
-        The layouts are fetched with the first call, and when a reload has changed them. PathError: a pattern names
-        nothing; ValueRangeError: too much for one call.
+        The first call fetches the layouts, and so does a call after a reload has changed them.
+
+        Raises:
+            PathError: A pattern names nothing.
+            ValueRangeError: The registers are too many for one call.
         """
         if self._layouts is not None:
-            with suppress(PathError):  # as of the layouts before a reload
+            with suppress(PathError):  # the layouts may be those before a reload
                 return await self._get(patterns, self._layouts)
         self._layouts = await self.layouts()
         return await self._get(patterns, self._layouts)
@@ -209,26 +211,26 @@ class Client:
     async def declare(
         self, declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool = False
     ) -> Campaign:
-        """Lay injections that their sources run by themselves, all or none: tables as ``[[injection]]`` has them.
+        """Lay injections that their sources run by themselves, all or none.
 
         They are lifted when the campaign is closed, at the end of its ``async with`` block, or when
         this program ends. Iterate over the campaign for its events.
 
         Args:
-            declarations: Keys of ``[[injection]]`` tables.
+            declarations: Tables with the keys of ``[[injection]]`` in the configuration.
             keep: Whether they stay until they have ended, or somebody lifts them.
 
         Raises:
             ValueRangeError: A declaration is invalid.
             CommandError: A source refuses an injection.
         """
-        request = injections.declare_request(declarations, keep=keep)
+        request = injection.declare_request(declarations, keep=keep)
         return await Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     async def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
         """Return the present injections of these sources, or of all; the innermost come first."""
         request = wire.ListInjectionsRequest(sources=sources)
-        return injections.injections(await self._call(self._stub.ListInjections, request))
+        return injection.injections(await self._call(self._stub.ListInjections, request))
 
     async def lift(self, source: str, number: int) -> None:
         """Lift an injection, whoever laid it.
@@ -245,7 +247,7 @@ class Client:
         Raises:
             CommandError: Some could not be lifted.
         """
-        found = injections.lifted(await self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
+        found = injection.lifted(await self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
         if left := [one for one in found if one.failure]:
             raise CommandError(f"{len(left)} of {len(found)} injections were not lifted: {left[0].failure}")
         return found
@@ -319,10 +321,18 @@ class Client:
         return [one["name"] for one in (await self.status())["processes"] if one.get("real_time")]
 
     async def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
-        """Take control of time, and move it by steps; it returns when all streams have what changed in them.
+        """Take control of time, and move it by steps; return when all streams have their changes.
 
-        ``dt_s``: length of each step; None: the step size. Returns the clock after the last step. TimeError: a step
-        failed, or another program owns time; ValueRangeError.
+        Args:
+            dt_s: Length of each step in s; None for the step size.
+            count: Number of steps.
+
+        Returns:
+            The clock after the last step.
+
+        Raises:
+            TimeError: A step failed, or another program owns time.
+            ValueRangeError: The count or the length is out of range.
         """
         if count < 1:  # 0 would be a stream of steps without end
             raise ValueRangeError(f"the number of steps must be at least 1, not {count}")
@@ -346,19 +356,36 @@ class Client:
         return Steps(Duplex(self._channel, self._stub.Steps, *requests), count)
 
     async def set_step_size(self, dt_s: float) -> Clock:
-        """How far a step goes that does not say it; takes time over. TimeError, ValueRangeError."""
+        """Take control of time, and set the size of steps that are requested without one.
+
+        Args:
+            dt_s: The size in s.
+
+        Raises:
+            TimeError: Another program owns time.
+            ValueRangeError: The size is out of range.
+        """
         return await self._move(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s)))
 
     async def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Have time step by itself, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
+        """Take control of time, and let it step by itself.
+
+        Args:
+            rate: Speed of the clock relative to real time.
+            dt_s: Length of each step in s; None for the step size.
+
+        Raises:
+            TimeError: Another program owns time.
+            ValueRangeError: The rate or the length is out of range.
+        """
         return await self._move(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate))
 
     async def pause(self) -> Clock:
-        """Have time step no more by itself; takes it over. TimeError."""
+        """Take control of time, and stop its steps. TimeError: another program owns time."""
         return await self._move(self._stub.Pause, wire.PauseRequest())
 
     async def release(self) -> Clock:
-        """Have time go by itself again, from where it stands; how it stands then. TimeError."""
+        """Return to real time, from the present time on. TimeError: another program owns time."""
         return await self._move(self._stub.Release, wire.ReleaseRequest())
 
     async def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
@@ -374,11 +401,11 @@ class Client:
             CommandError: No recording is played, the search found nothing, or a source does not
                 answer.
         """
-        found = await self._call(self._stub.Replay, replay.request(wish), replay.patience_s(wish))
-        return replay.told(found)
+        found = await self._call(self._stub.Replay, calls.replay_request(wish), calls.replay_patience_s(wish))
+        return calls.playing(found)
 
     async def _move(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Clock:
-        """Call what moves time. TimeError: the endpoint refuses, or a step failed."""
+        """Call a method that moves time. TimeError: the endpoint refuses, or a step failed."""
         try:
             return calls.clock(await self._call(method, request, timeout_s))
         except CommandError as error:
@@ -426,6 +453,131 @@ class Subscription(AsyncIterator[Update]):
 
     def close(self) -> None:
         """End the subscription."""
+        self._stream.close()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+
+class Steps(AsyncIterator[Stepped]):
+    """Steps of time on one stream, which costs less than one call for each step.
+
+    Close it, or use ``async with``; use it in one task. Iterate over the steps that
+    :meth:`Client.steps` requested. Each comes when all streams have its changes, while the next
+    steps are already being computed. To do something between steps, call :meth:`step` instead.
+    """
+
+    def __init__(self, stream: Duplex, count: int) -> None:
+        """Take the stream, and the number of steps that it has requested."""
+        self._stream = stream
+        self._left = count
+        self._waiting: Iterator[Any] = iter(())
+
+    async def __anext__(self) -> Stepped:
+        """Wait for the next finished step; the iteration ends after all requested steps.
+
+        Raises:
+            CommandError: The step failed, or another program owns time; no later step is done.
+            ValueRangeError: The step size is out of range.
+            RemoteError: The connection failed.
+        """
+        if not self._left:
+            raise StopAsyncIteration
+        while True:
+            for found in self._waiting:
+                self._left -= 1
+                return Stepped.of(found)
+            try:
+                self._waiting = iter((await anext(self._stream)).steps)
+            except ShmioError:
+                self.close()
+                raise
+
+    async def step(self, dt_s: float | None = None) -> Stepped:
+        """Do one more step, and wait for it and all earlier ones; errors as for iteration."""
+        await self._stream.write(*calls.steps_requests(1, dt_s))
+        self._left += 1
+        last = None
+        async for done in self:
+            last = done
+        if last is None:
+            raise CommandError("the steps were closed")
+        return last
+
+    def close(self) -> None:
+        """Cancel the requested steps, except one that has begun."""
+        self._left = 0
+        self._stream.close()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+
+class Simulation(Member, AsyncIterator[Work]):
+    """A source that this program computes: iterate over the steps, and answer each.
+
+    Close it, or use ``async with``. Only :meth:`close` may be called from other tasks.
+    """
+
+    def __init__(self, stream: Duplex, part: Part) -> None:
+        super().__init__(part)
+        self._stream = stream
+
+    @classmethod
+    async def join(cls, channel: Channel, method: Any, source: str, name: str) -> Self:
+        """Join a source; see :meth:`Client.simulation`."""
+        stream = Duplex(channel, method, join_request(source, name))
+        try:
+            return cls(stream, Part(await anext(stream, None)))
+        except BaseException:
+            stream.close()
+            raise
+
+    async def __anext__(self) -> Work:
+        """Wait for the next step; the iteration ends when this object or its client is closed.
+
+        Raises:
+            LostError: The endpoint has ended, or a reload has changed the source.
+            RemoteError: The connection failed otherwise.
+        """
+        self._work = self._part.take(await anext(self._stream))
+        return self._work
+
+    async def done(self, outputs: Mapping[str, object]) -> None:
+        """Answer the present step with outputs by path; outputs that are left out keep their values.
+
+        Raises:
+            PathError: There is no such output; nothing was sent.
+            ValueRangeError: A value does not fit; nothing was sent.
+        """
+        await self._answer(self._part.done(self._present(), outputs))
+
+    async def fail(self, reason: str) -> None:
+        """Answer that the present step has failed; the outputs stay as they are."""
+        await self._answer(self._part.failed(self._present(), reason))
+
+    async def compute(self, work: Work, step: Step, rejoining: Rejoining) -> None:
+        """Call a program's function for a step, and answer with its outputs or its error."""
+        rejoining.heed(self._part, work)
+        try:
+            outputs = await outputs_of(step(work.time_s, work.dt_s, work.inputs))
+            answer = rejoining.answer(self._part, work, outputs)
+        except Exception as error:  # noqa: BLE001  whatever it is, the step has failed with it
+            answer = rejoining.failed(self._part, work, error)
+        await self._answer(answer)
+
+    async def _answer(self, data: bytes) -> None:
+        self._work = None
+        await self._stream.write(data)
+
+    def close(self) -> None:
+        """Leave the source; steps fail until another model joins."""
         self._stream.close()
 
     async def __aenter__(self) -> Self:

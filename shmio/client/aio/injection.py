@@ -1,14 +1,16 @@
-"""An injection of a program."""
+"""Injections of a program: one that it feeds with values, and declared ones."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Mapping
-from typing import Any, Self
+from contextlib import suppress
+from typing import Any, Protocol, Self
 
 from shmio.client import calls, injection
-from shmio.client.aio.transport import Background, Channel, Condition, Duplex
+from shmio.client.aio.transport import Background, Channel, Condition, Duplex, Stream
 from shmio.client.update import Update
-from shmio.errors import CommandError, RemoteError, ShmioError
+from shmio.errors import CommandError, PathError, RemoteError, ShmioError
+from shmio.model.injection import Happening
 from shmio.model.outcome import Outcome
 
 
@@ -23,10 +25,10 @@ class Shadow(AsyncIterator[Update]):
         self._stream = stream
         self._held = held
         self.number = held.number
-        """By which anybody may lift it."""
+        """The injection's number, with which anybody may lift it."""
         self.table = held.table
         self._turn = Condition()
-        self._answers: dict[int, Any] = {}  # by sequence number: None until it has come
+        self._answers: dict[int, Any] = {}  # by sequence number; None until the answer comes
         self._updates: list[Update] = []
         self._error: ShmioError | None = None
         self._over = False
@@ -60,7 +62,7 @@ class Shadow(AsyncIterator[Update]):
             wrong, or the injection does not cover it.
 
         Raises:
-            ValueRangeError: A value is of no type that has values.
+            ValueRangeError: A value has an unsupported Python type.
             CommandError: The injection is over.
             RemoteError: Somebody has lifted the injection, or the instance has ended.
         """
@@ -138,6 +140,67 @@ class Shadow(AsyncIterator[Update]):
         await self._reading.join(self._channel.timeout_s)
         self._stream.close()
         await self._reading.join()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+
+class Lift(Protocol):
+    """Lifts an injection of a source by its number."""
+
+    async def __call__(self, source: str, number: int) -> None:
+        """Lift an injection; PathError, CommandError if that fails."""
+
+
+class Campaign(AsyncIterator[Happening]):
+    """Injections that were declared together.
+
+    Iterate over it for their events, in one task; the iteration ends when all injections have
+    ended. ``declared`` has the injections in the order of the declarations, with their seeds.
+    """
+
+    def __init__(self, stream: Stream, first: Any, lift: Lift, *, keep: bool) -> None:
+        self._stream = stream
+        self._lift = lift
+        self._keep = keep
+        self.declared = injection.declared(first)
+        self._left = dict.fromkeys((one.source, one.number) for one in self.declared)
+        self._happened: list[Happening] = injection.happenings(first)
+
+    @classmethod
+    async def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
+        """Read the first answers to Declare, and return the campaign."""
+        try:
+            return cls(stream, await stream.first(), lift, keep=keep)
+        except BaseException:
+            stream.close()
+            raise
+
+    async def __anext__(self) -> Happening:
+        """Wait for the next event.
+
+        Raises:
+            RemoteError: The events were not read fast enough, or the instance has ended.
+        """
+        while not self._happened:
+            self._happened = injection.happenings(await anext(self._stream))
+        happened = self._happened.pop(0)
+        if happened.what == "lifted":
+            self._left.pop((happened.source, happened.number), None)
+        return happened
+
+    async def close(self) -> None:
+        """Lift the remaining injections, unless ``keep`` was given."""
+        left, self._left = self._left, {}
+        try:
+            for source, number in () if self._keep else left:
+                with suppress(PathError, CommandError):  # it has ended, or a reload removed its source
+                    await self._lift(source, number)
+        finally:
+            self._stream.close()  # this ends what still remains
 
     async def __aenter__(self) -> Self:
         return self

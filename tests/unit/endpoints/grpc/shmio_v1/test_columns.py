@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.client.arrays import Values
-from shmio.client.table import Table
+from shmio.client.table import Table, Values
 from shmio.endpoints.grpc.shmio_v1.columns import KINDS, Columns, merge, pack
 from shmio.endpoints.grpc.shmio_v1.views import describe
 from shmio.layout.model import Layout, Register

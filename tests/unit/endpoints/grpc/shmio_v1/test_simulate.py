@@ -475,7 +475,7 @@ def test_a_function_computes_a_source(instance: str) -> None:
         ({"row": [1, 2, 3]}, "row: expected 2 times 3 elements, found 3"),
         ({"row": [[1], [2, 3]]}, "row: expected 2 times 3 elements"),
         ({"row": 5}, "row: expected 2 times 3 elements, found no"),
-        (7, "step gave 7, but must give outputs by their paths"),
+        (7, "step returned 7, but must return outputs by their paths"),
     ],
 )
 def test_outputs_that_cannot_be_fail_the_step(
