@@ -17,8 +17,8 @@ import msgspec
 from common import begin, db201, interleave, table
 
 from shmio.config import Declaration
-from shmio.connectors.commands.processor import CommandProcessor
-from shmio.connectors.injection.output import Image, Output
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.output import Image, Output
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Provenance, Quality, Segment
 from shmio.segment.standing_injections import declared_document
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from shmio import worker
 from shmio.connectors import registry
 from shmio.connectors.base import Computed, Connector, Replayed
-from shmio.connectors.injection.layers import Owner
+from shmio.connectors.injection_layers import Owner
 from shmio.connectors.loop import Schedule, SourceLoop, WallClock
 from shmio.connectors.models.stepped import Inputs, PageClock, SteppedLoop
 from shmio.errors import ConfigError, ConnectorError

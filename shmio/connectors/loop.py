@@ -18,10 +18,9 @@ from typing import Final, NamedTuple, Protocol, TypeVar
 
 from shmio.backoff import Backoff
 from shmio.connectors.base import Connector
-from shmio.connectors.commands.processor import CommandProcessor
-from shmio.connectors.injection.declared_injections import Blocks
-from shmio.connectors.injection.output import Image, Output
-from shmio.connectors.injection.processor import OwnerOf
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.injections import Blocks, OwnerOf
+from shmio.connectors.output import Image, Output
 from shmio.errors import ConnectorError
 from shmio.logs import fields
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record

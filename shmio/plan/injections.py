@@ -62,8 +62,8 @@ def _check_in(program: Program, source: Source, layout: Layout) -> None:
 
 
 def _document(source: str, programs: list[Program]) -> bytes:
-    from shmio.connectors.injection.layers import MAX_INJECTIONS  # noqa: PLC0415
-    from shmio.connectors.injection.published import GROWTH  # noqa: PLC0415
+    from shmio.connectors.injection_layers import MAX_INJECTIONS  # noqa: PLC0415
+    from shmio.connectors.output import GROWTH  # noqa: PLC0415
 
     declarations: Iterable[Declaration] = [program.declaration for program in programs]
     try:

@@ -35,13 +35,11 @@ GROUPS: Final = {
     "commands": Group(
         (
             "shmio/connectors/base.py",
-            "shmio/connectors/commands/batch.py",
-            "shmio/connectors/injection/published.py",
-            "shmio/connectors/commands/processor.py",
-            "shmio/connectors/injection/layers.py",
-            "shmio/connectors/injection/processor.py",
+            "shmio/connectors/commands.py",
+            "shmio/connectors/injection_layers.py",
+            "shmio/connectors/injections.py",
             "shmio/connectors/loop.py",
-            "shmio/connectors/injection/output.py",
+            "shmio/connectors/output.py",
             "shmio/layout/values/write.py",
             "shmio/local/step_answers.py",
             "shmio/local/writer.py",
@@ -49,8 +47,6 @@ GROUPS: Final = {
         ),
         (
             "tests/unit/connectors/test_*.py",
-            "tests/unit/connectors/commands",
-            "tests/unit/connectors/injection",
             "tests/unit/connectors/models",
             "tests/unit/local/test_writer.py",
             "tests/unit/layout/values/test_write.py",

@@ -10,11 +10,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Protocol
 
 from shmio.connectors.base import Computed
-from shmio.connectors.commands.processor import CommandProcessor
-from shmio.connectors.injection.declared_injections import Blocks
-from shmio.connectors.injection.output import Image, Output
-from shmio.connectors.injection.processor import OwnerOf
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.injections import Blocks, OwnerOf, newest
 from shmio.connectors.loop import Counters, QualityLog, Schedule
+from shmio.connectors.output import Image, Output
 from shmio.errors import PathError, SegmentError, ShmioError
 from shmio.layout.topic import Topic, find
 from shmio.layout.values.codec import RegisterCodec, Value, codec
@@ -86,9 +85,7 @@ class Inputs:
 
 def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
     """Return the frame to read, or None and why it cannot be trusted."""
-    frame = block.latest()
-    while frame is not None and step is not None and block.came_with(frame, step):
-        frame = block.read(frame.number - 1)
+    frame = newest(block, step)
     if frame is None:
         return None, NO_DATA
     quality, reason = block.assess(frame)

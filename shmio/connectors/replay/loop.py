@@ -7,12 +7,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
-from shmio.connectors.commands.processor import CommandProcessor
-from shmio.connectors.injection.declared_injections import Blocks
-from shmio.connectors.injection.output import Output
-from shmio.connectors.injection.processor import OwnerOf
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.injections import Blocks, OwnerOf
 from shmio.connectors.loop import Counters
 from shmio.connectors.models.stepped import StepClock
+from shmio.connectors.output import Output
 from shmio.connectors.replay.player import OVER, STOPPED, Player, is_replayed
 from shmio.connectors.replay.recorded_source import Entry, RecordedSource
 from shmio.connectors.replay.recording import MAX_NS

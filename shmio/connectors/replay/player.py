@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from typing import Final, cast
 
-from shmio.connectors.injection.output import Image, Output
+from shmio.connectors.output import Image, Output
 from shmio.connectors.replay.recorded_source import Entry, RecordedSource
 from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record, Stamp
 from shmio.segment.commands import MAX_WRITES

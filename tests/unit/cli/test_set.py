@@ -17,8 +17,8 @@ import pytest
 import shmio
 from shmio.cli.set import read_value
 from shmio.cli.user import main
-from shmio.connectors.commands.processor import CommandProcessor
-from shmio.connectors.injection.output import Output
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.output import Output
 from shmio.errors import ConnectorError, ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, BlockWriter, Segment

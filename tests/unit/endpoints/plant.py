@@ -6,9 +6,9 @@ import threading
 import time
 from collections.abc import Sequence
 
-from shmio.connectors.commands.processor import CommandProcessor
-from shmio.connectors.injection.layers import Owner
-from shmio.connectors.injection.output import Image, Output
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.injection_layers import Owner
+from shmio.connectors.output import Image, Output
 from shmio.errors import ConnectorError
 from shmio.segment import BlockWriter, Provenance, Quality, Write
 from tests.unit.endpoints.harness import WRITER

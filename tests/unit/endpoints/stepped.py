@@ -9,9 +9,9 @@ import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from shmio.connectors.commands.processor import CommandProcessor
-from shmio.connectors.injection.layers import Owner
-from shmio.connectors.injection.output import Image, Output
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.injection_layers import Owner
+from shmio.connectors.output import Image, Output
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Provenance, Quality, Segment, Write
 from tests.unit.endpoints.harness import STALE_NS, Endpoint, endpoint

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from shmio.connectors.injection.layers import Owner
+from shmio.connectors.injection_layers import Owner
 from shmio.connectors.models.stepped import PageClock
 from shmio.connectors.replay.loop import ReplayLoop
 from shmio.connectors.replay.source import Replay

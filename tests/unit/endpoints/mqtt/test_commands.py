@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from shmio.config import Mqtt, MqttTopic
-from shmio.connectors.injection.layers import Owner
+from shmio.connectors.injection_layers import Owner
 from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.endpoints.mqtt.connection.connection import FEW_IN_FLIGHT
 from shmio.endpoints.mqtt.connection.socket_io import PACKETS

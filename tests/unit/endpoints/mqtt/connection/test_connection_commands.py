@@ -13,7 +13,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from shmio.backoff import Backoff
 from shmio.config import Address
-from shmio.connectors.injection.layers import Owner
+from shmio.connectors.injection_layers import Owner
 from shmio.segment import Segment
 from shmio.segment.processes import WRITERS
 from shmio.testing.mosquitto import Mosquitto

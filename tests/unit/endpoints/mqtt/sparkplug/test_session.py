@@ -11,7 +11,7 @@ import pytest
 
 from shmio.backoff import Backoff
 from shmio.config import Address, Mqtt, MqttTopic, Sparkplug
-from shmio.connectors.injection.layers import Owner
+from shmio.connectors.injection_layers import Owner
 from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.segment import Quality, Segment
 from shmio.segment.processes import WRITERS

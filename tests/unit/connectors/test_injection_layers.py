@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.injection.layers import MAX_INJECTIONS, Layer, LayerStack, Owner, covering, shadow
+from shmio.connectors.injection_layers import MAX_INJECTIONS, Layer, LayerStack, Owner, covering, shadow
 from shmio.layout.values.write import Write
 from shmio.segment import Direction
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.commands.finite import FiniteCheck
+from shmio.connectors.commands import FiniteCheck
 from shmio.layout.model import ByteOrder, Layout, Register
 from shmio.layout.values.write import Write, apply, encode
 

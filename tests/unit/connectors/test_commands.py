@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shmio.connectors.base import Lost, WriteLostError
-from shmio.connectors.commands.batch import Item, coalesce
-from shmio.connectors.commands.processor import MAX_WAITING, CommandProcessor
-from shmio.connectors.injection.output import Output
+from shmio.connectors.commands import MAX_WAITING, CommandProcessor, Item, coalesce
+from shmio.connectors.output import Output
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
 from shmio.local.writer import CommandSender

@@ -12,10 +12,9 @@ import msgspec
 import pytest
 
 from shmio.config import Declaration
-from shmio.connectors.commands.processor import CommandProcessor
-from shmio.connectors.injection.declared_layer import MAX_HELD
-from shmio.connectors.injection.layers import Owner
-from shmio.connectors.injection.output import Image, Output
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.injection_layers import MAX_HELD, Owner
+from shmio.connectors.output import Image, Output
 from shmio.errors import CommandError
 from shmio.injection.draw import SeededRandom
 from shmio.layout.compiler import Source, compile_sources

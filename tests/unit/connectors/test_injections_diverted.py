@@ -10,14 +10,14 @@ import pytest
 
 import shmio
 from shmio.config import Declaration
-from shmio.connectors.injection.layers import Owner
+from shmio.connectors.injection_layers import Owner
 from shmio.errors import CommandError, PathError
 from shmio.layout.values.codec import Value
 from shmio.local.attach import Attachment
 from shmio.segment import EventKind, Segment
 from shmio.segment.standing_injections import StandingInjection, encode
-from tests.unit.connectors.injection import test_processor as test_injector
-from tests.unit.connectors.injection.test_processor import LAYOUT, Rig
+from tests.unit.connectors import test_injections as test_injector
+from tests.unit.connectors.test_injections import LAYOUT, Rig
 
 segment = test_injector.segment
 GUEST = 0

@@ -11,7 +11,7 @@ import pytest
 
 from shmio.config import Declaration
 from shmio.connectors.base import Connector
-from shmio.connectors.injection.layers import MAX_INJECTIONS, Owner
+from shmio.connectors.injection_layers import MAX_INJECTIONS, Owner
 from shmio.connectors.loop import Schedule, SourceLoop, WallClock
 from shmio.errors import CommandError, PathError
 from shmio.layout.compiler import Source, compile_sources
@@ -262,7 +262,7 @@ def test_a_shadow_goes_when_its_client_does_unless_it_is_to_be_kept(rig: Rig) ->
 def test_clients_are_looked_after_now_and_then_however_many_commands_come(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.connectors.injection.processor.LOOK_NS", 10**15)
+    monkeypatch.setattr("shmio.connectors.injections.LOOK_NS", 10**15)
     rig.asked.clear()
     number = rig.client.inject(["speed"])
     for value in range(20):

@@ -1,1 +1,0 @@
-"""Commands toward a source: judged, batched and carried out with the next cycle."""
