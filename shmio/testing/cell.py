@@ -1,4 +1,4 @@
-"""A whole cell on free ports, as its user has it: started and stopped by the commands."""
+"""A whole cell that a test starts and stops by the commands, and what such tests need of the host."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from typing import Any
 
 import msgspec
 
+from shmio import realtime
 from shmio.config import Address
+from shmio.errors import ConfigError
 from shmio.local.status import read_status
 
 BIN = Path(sys.executable).parent
@@ -45,7 +47,7 @@ listen = ["{grpc}"]
 
 
 class Cell:
-    """An instance that was started, as its user has it."""
+    """An instance in a folder, operated by the commands."""
 
     def __init__(self, folder: Path, instance: str, grpc: Address) -> None:
         self.folder = folder
@@ -57,7 +59,7 @@ class Cell:
         return self.run("shmio-supervisor", *arguments)
 
     def run(self, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run one of our commands in the cell's folder."""
+        """Run one of shmio's commands in the cell's folder."""
         return subprocess.run(
             [BIN / command, *arguments],
             cwd=self.folder,
@@ -68,7 +70,7 @@ class Cell:
         )
 
     def output(self, command: str, *arguments: str) -> str:
-        """Run one of our commands; return what it prints.
+        """Run one of shmio's commands; return what it prints.
 
         Raises:
             AssertionError: The command failed. The message has its error output and the instance's logs.
@@ -81,31 +83,31 @@ class Cell:
         return done.stdout
 
     def up(self) -> None:
-        """Start it detached; returns when it runs."""
+        """Start the instance detached; return when it runs."""
         self.output("shmio-supervisor", "up", "--detach")
 
     def down(self) -> None:
-        """Stop it; returns when it is gone."""
+        """Stop the instance; return when it is gone."""
         self.output("shmio-supervisor", "down")
 
     def status(self) -> dict[str, Any]:
-        """What ``status --json`` prints, without a process for each look."""
+        """Return what ``status --json`` prints, without starting a process."""
         status: dict[str, Any] = msgspec.to_builtins(read_status(self.instance, ""))
         return status
 
     def processes(self) -> dict[str, dict[str, Any]]:
-        """The processes of ``status``, by name."""
+        """Return the processes of ``status``, by name."""
         return {process["name"]: process for process in self.status()["processes"]}
 
     def logs(self) -> str:
-        """All log files, for the message of a failing test."""
+        """Return all log files as text, for the message of a failing test."""
         return "\n".join(
             f"--- {file.name}\n{file.read_text()}" for file in sorted((self.folder / "logs").glob("*.log"))
         )
 
 
 def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE_S) -> None:
-    """Wait for what another process brings about; AssertionError when it does not."""
+    """Wait until a condition holds; AssertionError if it does not in time."""
     deadline = time.monotonic() + patience_s
     while not condition():
         if time.monotonic() > deadline:
@@ -114,9 +116,18 @@ def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE
 
 
 def kill(pid: int, sign: signal.Signals = signal.SIGKILL) -> None:
-    """Signal a process that is not our child, for certain that one and no other."""
+    """Signal a process that is not a child of this one; a pidfd ensures that no other process gets the signal."""
     handle = os.pidfd_open(pid)
     try:
         signal.pidfd_send_signal(handle, sign)
     finally:
         os.close(handle)
+
+
+def may_be_realtime() -> bool:
+    """Return whether this user may have a real-time priority."""
+    try:
+        realtime.check(1)
+    except ConfigError:
+        return False
+    return True

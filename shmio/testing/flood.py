@@ -1,4 +1,4 @@
-"""A flood of gRPC calls whose names nobody serves, as raw HTTP/2: clients' libraries refuse to send some of them."""
+"""A flood of gRPC calls to unknown methods, as raw HTTP/2, because client libraries refuse to send some of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final
 NOT_UTF8: Final = b"/x\xff\xfe/y"
 UNKNOWN: Final = b"/shmio.v1.Shmio/NoSuchCall"
 WINDOW: Final = 64
-"""So few calls under way on a connection are not refused for their number."""
+"""A server accepts at least this many concurrent calls on a connection."""
 
 _PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 _FIELDS: Final = {
@@ -28,14 +28,14 @@ PATIENCE_S: Final = 60.0
 
 
 class Flood:
-    """Threads that send such calls as fast as they are answered, each over connections of its own."""
+    """Threads that send such calls as fast as they are answered, each over its own connections."""
 
     def __init__(self, names: Sequence[bytes] = (NOT_UTF8, UNKNOWN), window: int = WINDOW) -> None:
-        """``window``: most calls of a connection that are not answered yet."""
+        """Take the names to call, and the maximum number of unanswered calls of a connection."""
         self.answered = 0
-        """Calls that have got their status."""
+        """Number of calls that were answered with a status."""
         self.lost = 0
-        """Connections that the server ended."""
+        """Number of connections that the server ended."""
         self._names = names
         self._window = window
         self._connections: set[socket.socket] = set()
@@ -46,7 +46,7 @@ class Flood:
     def upon(
         self, target: tuple[str, int] | str, tls: ssl.SSLContext | None = None, threads: int = 2
     ) -> Iterator[None]:
-        """Flood this address (a string: a UNIX socket) as long as the context lasts."""
+        """Flood an address, or the UNIX socket with this path, for the length of a ``with`` block."""
         workers = [threading.Thread(target=self._run, args=(target, tls)) for _ in range(threads)]
         for worker in workers:
             worker.start()
@@ -56,7 +56,7 @@ class Flood:
             self._over.set()
             with self._lock:
                 for connection in self._connections:
-                    _end(connection)  # else who waits for answers would hold up an event loop that is to give them
+                    _end(connection)  # else a worker waits for answers from an event loop that waits for the worker
             for worker in workers:
                 worker.join()
 
@@ -91,7 +91,7 @@ class Flood:
 
 
 def request(name: bytes, stream: int) -> bytes:
-    """The headers of a call without messages, uncompressed (RFC 7541, 6.2.2)."""
+    """Return the headers of a call without messages, uncompressed (RFC 7541, 6.2.2)."""
     block = b"".join(
         b"\0" + bytes((len(field),)) + field + bytes((len(value),)) + value
         for field, value in (_FIELDS | {b":path": name}).items()
@@ -102,7 +102,7 @@ def request(name: bytes, stream: int) -> bytes:
 
 @contextmanager
 def connect(target: tuple[str, int] | str, tls: ssl.SSLContext | None = None) -> Iterator[socket.socket]:
-    """Connected, by TLS if there is a context for it."""
+    """Connect to a server, by TLS if a context is given."""
     if isinstance(target, str):
         plain = socket.socket(socket.AF_UNIX)
         plain.settimeout(PATIENCE_S)
@@ -114,13 +114,13 @@ def connect(target: tuple[str, int] | str, tls: ssl.SSLContext | None = None) ->
 
 
 def _end(connection: socket.socket) -> None:
-    """Have who reads from it see the end; what TLS has to say before is no matter of another thread."""
+    """Shut the socket down without TLS's farewell, so that the thread that reads from it sees the end."""
     with suppress(OSError):
         socket.socket.shutdown(connection, socket.SHUT_RDWR)
 
 
 def _frames(connection: socket.socket) -> Iterator[tuple[int, int]]:
-    """Kind and flags of each; OSError at the end."""
+    """Yield the kind and the flags of each frame; OSError at the end."""
     received = bytearray()
     while True:
         while len(received) < 9 or len(received) < 9 + int.from_bytes(received[:3], "big"):

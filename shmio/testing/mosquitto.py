@@ -1,4 +1,4 @@
-"""A mosquitto of a test's own, to be killed and started as it likes."""
+"""A mosquitto broker for a test, which may kill and restart it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from shmio.endpoints.mqtt.broker.program import find_mosquitto
 
 PATIENCE_S = 20.0
 TETHER = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
-"""Of util-linux: what it starts dies with the thread that starts it, so that a test run that is killed leaves none."""
+"""Ends the broker with the thread that started it, so that a killed test run leaves none. Part of util-linux."""
 
 
 def missing() -> str:
-    """Why there can be none here; empty: there can."""
+    """Return why mosquitto cannot run here, or an empty string."""
     return "" if find_mosquitto() else "mosquitto is not installed: apt-get install mosquitto"
 
 
 class Mosquitto:
-    """Keeps its port from one start to the next; its log is ``mosquitto.log`` in its folder."""
+    """A broker that keeps its port when it restarts; its log is ``mosquitto.log`` in its folder."""
 
     def __init__(self, folder: Path, address: Address, *lines: str) -> None:
-        """``lines``: of its configuration, after those for the port; default: anybody may connect."""
+        """Write the configuration; ``lines`` follow the lines for the port, and by default anybody may connect."""
         self.folder = folder
         self.address = address
         self._file = folder / "mosquitto.conf"
@@ -35,16 +35,16 @@ class Mosquitto:
 
     @property
     def log(self) -> str:
-        """What it has logged so far."""
+        """The log so far."""
         return (self.folder / "mosquitto.log").read_text()
 
     @property
     def pid(self) -> int:
-        """Of the process, if it runs; 0: it does not."""
+        """The pid of the broker, or 0 if it does not run."""
         return self._process.pid if self._process else 0
 
     def start(self) -> None:
-        """Start it; returns when it listens."""
+        """Start the broker; return when it listens."""
         program = find_mosquitto() or "mosquitto"
         with (self.folder / "mosquitto.log").open("ab") as log:
             self._process = subprocess.Popen([*TETHER, program, "-c", self._file], stdout=log, stderr=log)
@@ -60,7 +60,7 @@ class Mosquitto:
                 return
 
     def kill(self) -> None:
-        """End it as a crash would."""
+        """Kill the broker, as in a crash."""
         if self._process is not None:
             self._process.kill()
             self._process.wait(PATIENCE_S)

@@ -1,4 +1,4 @@
-"""TCP ports for tests: given by the kernel, never numbered in the tests."""
+"""TCP ports for tests: the kernel chooses them, so tests contain no port numbers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from shmio.config.address import Address
 
 @contextmanager
 def reserved_port(host: str = "127.0.0.1") -> Iterator[Address]:
-    """Keep a free port for the length of a ``with`` block.
+    """Reserve a free port for the length of a ``with`` block.
 
-    The port is bound, but nothing listens: connections are refused, and the kernel gives it to nobody who asks for any
-    port. Who asks for this one, with SO_REUSEADDR as all servers here do, gets it.
+    The port is bound, but nothing listens: connections are refused, and the kernel does not choose it for others. A
+    server that binds it with SO_REUSEADDR, as all servers here do, gets it.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as keeper:

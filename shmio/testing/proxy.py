@@ -21,6 +21,11 @@ from typing import Self
 from shmio.config.address import Address
 from shmio.testing.ports import reserved_port
 
+Edit = Callable[[bytes], bytes | None]
+Framing = Callable[[bytes | bytearray], int]
+
+_CHUNK = 1 << 16
+_TIMEOUT_S = 10
 _MAX_QUEUED = 4 << 20  # bytes under way in one direction, beyond which the sender is left waiting
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with RST
 
@@ -105,10 +110,6 @@ class Pipe:
         self._queued -= self.last_sent
 
 
-Edit = Callable[[bytes], bytes | None]
-Framing = Callable[[bytes | bytearray], int]
-
-
 def tpkt(data: bytes | bytearray) -> int:
     """Return the length of the ISO-on-TCP frame (RFC 1006) at the start of ``data``; 0 if unknown yet."""
     return data[2] << 8 | data[3] if len(data) >= 4 else 0
@@ -178,10 +179,6 @@ class Tampering:
             passed = frame if self._edit is None else self._edit(frame)
             if passed:
                 yield passed
-
-
-_CHUNK = 1 << 16
-_TIMEOUT_S = 10
 
 
 class FaultProxy:

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from shmio.testing.cell import CONFIG, Cell
-from shmio.testing.priority import may_be_realtime
+from shmio.testing.cell import CONFIG, Cell, may_be_realtime
 
 
 @pytest.mark.skipif(not may_be_realtime(), reason="this user may have no real-time priority")

@@ -10,7 +10,7 @@ import pytest
 
 from shmio import realtime
 from shmio.errors import ConfigError
-from shmio.testing.priority import may_be_realtime
+from shmio.testing.cell import may_be_realtime
 
 
 def refuse(*_: object) -> None:
