@@ -1,4 +1,4 @@
-"""Logging: lines that name process and source, in files that rotate.
+"""Logging: lines that name process and source, in files that rotate, and a limit on how many clients can cause.
 
 One line per event, fields in fixed order, extra fields as ``key=value``::
 
@@ -11,10 +11,13 @@ import logging
 import logging.handlers
 import os
 import sys
+import time
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from datetime import UTC, datetime
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Final
 
 from shmio.errors import ConfigError
 
@@ -145,3 +148,37 @@ def fields(**values: object) -> dict[str, dict[str, object]]:
 def printable(text: str) -> str:
     """Return text as one line, without characters that would move a terminal's cursor."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+MAX_LINES: Final = 20
+"""Most lines of one kind in each turn, of :data:`TURN_S`."""
+TURN_S: Final = 10.0
+
+
+class LogRateLimit(logging.Filter):
+    """Limits the records of one kind per turn, so that no client can fill the log. Safe in any thread.
+
+    The unformatted text of a record is its kind. The first record of a later turn says how many
+    were left out.
+    """
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic, *, one_kind: bool = False) -> None:
+        """Create the filter; with ``one_kind`` all records are of one kind, for foreign loggers."""
+        super().__init__()
+        self._clock_s = clock_s
+        self._one_kind = one_kind
+        self._kinds: dict[str, tuple[float, int]] = {}
+        """By kind: when its turn ends, and how many records came in it."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether the record is written."""
+        now_s, text = self._clock_s(), str(record.msg)
+        kind = "" if self._one_kind else text
+        until_s, count = self._kinds.get(kind, (0.0, 0))
+        if now_s < until_s:
+            self._kinds[kind] = until_s, count + 1
+            return count < MAX_LINES
+        self._kinds[kind] = now_s + TURN_S, 1
+        if count > MAX_LINES:
+            record.msg = f"{text} ({count - MAX_LINES} more like this were left out before)"
+        return True

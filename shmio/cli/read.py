@@ -20,8 +20,7 @@ from shmio.layout.values.literal import literal_text
 from shmio.layout.values.text import json_value
 from shmio.logs import printable
 from shmio.model.cell import Cell
-from shmio.model.reading import Reading
-from shmio.model.values import Provenance, Quality
+from shmio.model.values import Provenance, Quality, Reading
 
 TABLE_EVERY_S = 0.2
 CLOCK_CHARACTERS = 12

@@ -19,7 +19,7 @@ from shmio.layout.values.text import from_text, wire_type
 from shmio.local.writer import MIN_PERIODS, TIMEOUT_S
 from shmio.logs import printable
 from shmio.model.cell import Cell
-from shmio.model.outcome import Outcome, OutcomeKind
+from shmio.model.values import Outcome, OutcomeKind
 
 MATCHES = 3
 """Number of matching registers that the error about a pattern names."""

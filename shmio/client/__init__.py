@@ -26,9 +26,8 @@ from shmio.client.table import Change, Register, Table
 from shmio.client.update import Piece, Snapshot, Update
 from shmio.model.clock import Clock
 from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
-from shmio.model.outcome import Outcome, OutcomeKind
 from shmio.model.replay import Playing, Wish
-from shmio.model.values import Column, Provenance, Quality
+from shmio.model.values import Column, Outcome, OutcomeKind, Provenance, Quality
 
 __all__ = [
     "BlockLayout",

@@ -23,8 +23,8 @@ from shmio.errors import (
 )
 from shmio.messages import value_to_wire
 from shmio.model.clock import Clock, ClockMode
-from shmio.model.outcome import Outcome, OutcomeKind
 from shmio.model.replay import Playing, Wish
+from shmio.model.values import Outcome, OutcomeKind
 from shmio.wire import shmio_v1_pb2 as wire
 
 STEP_PATIENCE_S: Final = 60.0

@@ -15,8 +15,7 @@ from shmio.client.update import Piece, Tables, Update
 from shmio.errors import RemoteError, ValueRangeError
 from shmio.messages import declaration_from_wire, declaration_to_wire
 from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
-from shmio.model.outcome import Outcome
-from shmio.model.values import Column
+from shmio.model.values import Column, Outcome
 from shmio.wire import shmio_v1_pb2 as wire
 
 _MAX_WAITING: Final = 4096

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 from shmio.client.table import Array, Change, SubscribeResponse, Table, unknown
 from shmio.errors import QualityError, RemoteError
 from shmio.layout import model
-from shmio.model.reading import Reading
-from shmio.model.values import Column, Provenance, Quality
+from shmio.model.values import Column, Provenance, Quality, Reading
 from shmio.wire import shmio_v1_pb2 as wire
 
 

@@ -38,9 +38,7 @@ from shmio.local.subscription import Subscription
 from shmio.local.timekeeper import TimeMethods
 from shmio.local.writer import SourceWriter
 from shmio.model.injection import Injection, Lifted, Running
-from shmio.model.outcome import Outcome
-from shmio.model.reading import Reading
-from shmio.model.values import Quality
+from shmio.model.values import Outcome, Quality, Reading
 from shmio.segment.block import Block, Cursor, Entry, Frame
 from shmio.segment.commands import Direction
 from shmio.segment.processes import Activity, Report

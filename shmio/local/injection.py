@@ -14,7 +14,7 @@ from shmio.layout.topic import Topic, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import cover, merge
 from shmio.local.writer import PendingCommand, SourceWriter
-from shmio.model.outcome import Outcome
+from shmio.model.values import Outcome
 from shmio.segment.block import Block, Cursor
 from shmio.segment.commands import CommandAssembler, CommandWrites, Direction, apply, decode_writes
 from shmio.segment.events import Event, EventKind

@@ -11,8 +11,7 @@ from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import Value, codec
-from shmio.model.reading import Reading
-from shmio.model.values import Provenance, Quality
+from shmio.model.values import Provenance, Quality, Reading
 from shmio.segment.block import Block, Frame
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from shmio.layout.model import Register
 from shmio.layout.topic import parse_topic
 from shmio.local.following import Following
 from shmio.local.reading import reading
-from shmio.model.reading import Reading
-from shmio.model.values import Provenance, Quality
+from shmio.model.values import Provenance, Quality, Reading
 from shmio.segment.block import Block, Frame, FrameFollower
 from shmio.segment.changed_registers import ChangeScan
 

@@ -19,7 +19,7 @@ from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge
-from shmio.model.outcome import Outcome, OutcomeKind
+from shmio.model.values import Outcome, OutcomeKind
 from shmio.segment.commands import (
     EMPTY,
     MAX_NAME_BYTES,

@@ -10,10 +10,8 @@ if TYPE_CHECKING:
     from shmio.layout.model import Layout
     from shmio.model.clock import Clock
     from shmio.model.injection import Declared, Happening, Injection, Lifted
-    from shmio.model.outcome import Outcome
-    from shmio.model.reading import Reading
     from shmio.model.replay import Playing, Wish
-    from shmio.model.values import Provenance, Quality
+    from shmio.model.values import Outcome, Provenance, Quality, Reading
 
 
 class Held(Protocol):
@@ -76,7 +74,7 @@ class Update(Protocol):
 
     @property
     def ended(self) -> bool:
-        """Whether a reload has removed the source, or what a pattern named in it: no more updates come of it.
+        """Whether a reload has removed the source, or what a pattern named in it; it sends no more updates.
 
         When all sources have ended, the iteration waits until it is closed or the instance ends.
         """
@@ -117,11 +115,11 @@ class Shadow(Held, Protocol):
 
         It is ``rejected`` if the injection does not cover the path. Of a remote cell all values of one
         call have the same outcome, the worst, and it is also ``rejected`` if a path or value is wrong.
-        If somebody has lifted the injection, it is ``rejected``, or a remote cell raises RemoteError.
+        If somebody has lifted the injection, the outcome is ``rejected``, or a remote cell raises RemoteError.
 
         Raises:
             PathError: There is no such register on this host.
-            ValueRangeError: A value does not fit its register, or is of no type that has values.
+            ValueRangeError: A value does not fit its register, or has a type that no register has.
             CommandError: The injection is over, or the source's queue has no room.
         """
 
@@ -156,8 +154,8 @@ class Cell(Held, Protocol):
 
     :func:`shmio.attach` returns one on this host, :func:`shmio.connect` one behind gRPC. The methods
     raise the errors of :mod:`shmio.errors`; every method raises NotRunningError if the instance has
-    ended or cannot be reached. Only ``sources`` and ``clock`` of a cell on this host then still tell
-    what was last.
+    ended or cannot be reached. Only ``sources`` and ``clock`` of a cell on this host then still return
+    the last state.
     """
 
     @property
@@ -186,8 +184,8 @@ class Cell(Held, Protocol):
 
         Args:
             patterns: As for :meth:`get`.
-            every_frame: Whether to give an update for each frame, in order, and count those that are
-                lost; otherwise a slow reader gets the newest values.
+            every_frame: Whether to give an update for each frame, in order, and count the lost frames;
+                otherwise a slow reader gets the newest values.
             max_rate_hz: Without ``every_frame``: the most updates a second of each source; 0: no limit.
         """
 
@@ -199,7 +197,7 @@ class Cell(Held, Protocol):
             timeout_s: How long the values may wait for a cycle of the source; None: 2 s, or three cycles.
 
         Returns:
-            The outcome of each value, with its path as it was given, in the given order.
+            The outcome of each value, under the path that you gave, in the same order.
 
         Raises:
             PathError: A path names nothing, or on this host: the paths belong to several sources, to

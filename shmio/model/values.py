@@ -1,8 +1,14 @@
-"""Quality and provenance of values, with the numbers that segment and wire use."""
+"""Values as programs read and write them: quality, provenance, readings, and outcomes of writes."""
 
 from __future__ import annotations
 
-from enum import IntEnum
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from shmio.layout.model import Register
+    from shmio.layout.values.codec import Value
 
 
 class Quality(IntEnum):
@@ -38,3 +44,78 @@ class Column(IntEnum):
     FLOAT = 5
     DOUBLE = 6
     TEXT = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """The state of one register at the time it was read.
+
+    Attributes:
+        source: Name of the source.
+        register: The register or array element: its path within the source, type, dimensions and comment.
+        value: The last known value, even while the quality is bad; None if there never was one.
+        quality: Quality of the value.
+        reason: Why the quality is not good; empty if it is.
+        provenance: Where the value comes from: live, simulated, replayed or injected.
+        source_time: The source's time stamp, UTC in s; None if there never was a value.
+        age_s: Age of the value by the source's clock, in s; None if there never was a frame. In an update
+            of a remote cell it is not known: 0, or None while the quality is bad.
+    """
+
+    source: str
+    register: Register
+    value: Value
+    quality: Quality
+    reason: str
+    provenance: str
+    source_time: float | None
+    age_s: float | None
+
+    @property
+    def path(self) -> str:
+        """Path of the register, with its source."""
+        return f"{self.source}/{self.register.path}"
+
+
+class OutcomeKind(StrEnum):
+    """Kind of outcome of a value."""
+
+    WRITTEN = "written"
+    """The device confirmed the value."""
+    TAKEN = "taken"
+    """An injection over ``/in`` took the value in the device's place."""
+    SHADOWED = "shadowed"
+    """Consumers see the value of an injection over ``/out``."""
+    ACCEPTED = "accepted"
+    """The source accepted the value; the caller did not wait for the device."""
+    REJECTED = "rejected"
+    """The source rejected the whole command before it did anything."""
+    REFUSED = "refused"
+    """The device refused the value."""
+    EXPIRED = "expired"
+    """The value was not sent to the device, and will not be."""
+    UNKNOWN = "unknown"
+    """The value was sent, or perhaps sent, but no answer came: read before you write again."""
+
+
+_DONE = frozenset({OutcomeKind.WRITTEN, OutcomeKind.TAKEN, OutcomeKind.SHADOWED, OutcomeKind.ACCEPTED})
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The outcome of one value.
+
+    Attributes:
+        path: Path of the register.
+        kind: Kind of outcome.
+        text: The reason, if there is one.
+    """
+
+    path: str
+    kind: OutcomeKind
+    text: str = ""
+
+    @property
+    def done(self) -> bool:
+        """Whether the value reached its target, or an injection took it."""
+        return self.kind in _DONE

@@ -13,8 +13,7 @@ import pytest
 
 import shmio
 from shmio.errors import CommandError, NotRunningError, PathError, TimeError, ValueRangeError
-from shmio.model.outcome import OutcomeKind
-from shmio.model.values import Provenance, Quality
+from shmio.model.values import OutcomeKind, Provenance, Quality
 from shmio.testing.cell import CONFIG, Cell, until
 from shmio.testing.ports import reserved_port
 

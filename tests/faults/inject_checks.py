@@ -6,7 +6,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from tests.faults.checks import Complain, Counts, Source
 from tests.faults.write_checks import SURELY_NOT
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 from shmio.errors import CommandError, PathError, QualityError
 from shmio.local.attach import Attachment
 from shmio.model.injection import Injection
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from tests.faults.checker import Checker
 from tests.faults.checks import Counts, Source, word_at
 from tests.faults.inject_checks import QUIET_NS, SHOWN_NS, GuardCheck, LifeCheck

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import shmio
 from shmio.errors import ShmioError
-from shmio.model.outcome import Outcome, OutcomeKind
+from shmio.model.values import Outcome, OutcomeKind
 from tests.faults.truth import Truth
 
 PAUSE_S = 0.05

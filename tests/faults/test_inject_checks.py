@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from tests.faults.checks import Source
 from tests.faults.inject_checks import INNER, LIFTED_NS, OUTER, QUIET_NS, SHOWN_NS, ChainCheck, GuardCheck, LifeCheck
 from tests.faults.truth import Truth

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from tests.faults.checks import Source
 from tests.faults.truth import Truth
 from tests.faults.write_checks import LATE_NS, PublishCheck, WriteCheck

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from tests.faults.checks import Complain, Counts, Source
 
 SURELY_NOT = {OutcomeKind.REJECTED, OutcomeKind.REFUSED, OutcomeKind.EXPIRED}

@@ -13,7 +13,7 @@ import grpc
 
 from shmio.errors import CommandError
 from shmio.local.attach import Attachment
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from shmio.wire.simlog_v1_pb2 import PubRequest, ROSMessage, TopicDescriptor
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 from tests.faults.checker import Checker

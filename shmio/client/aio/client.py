@@ -21,9 +21,8 @@ from shmio.errors import CommandError, ConflictError, PathError, RemoteError, Sh
 from shmio.layout.glob import choose
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted
-from shmio.model.outcome import Outcome
-from shmio.model.reading import Reading
 from shmio.model.replay import Playing, Wish
+from shmio.model.values import Outcome, Reading
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 

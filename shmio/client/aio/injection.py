@@ -11,7 +11,7 @@ from shmio.client.aio.transport import Background, Channel, Condition, Duplex, S
 from shmio.client.update import Update
 from shmio.errors import CommandError, PathError, RemoteError, ShmioError
 from shmio.model.injection import Happening
-from shmio.model.outcome import Outcome
+from shmio.model.values import Outcome
 
 
 class Shadow(AsyncIterator[Update]):

@@ -21,8 +21,7 @@ from shmio.endpoints.grpc.streams.feed import Feeds
 from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.endpoints.grpc.time.virtual_time import VirtualTime
 from shmio.errors import SegmentError, ShmioError
-from shmio.log_rate_limit import LogRateLimit
-from shmio.logs import fields
+from shmio.logs import LogRateLimit, fields
 from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0

@@ -14,7 +14,7 @@ from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.endpoints.mqtt.broker.directory import folder, prepare, remove
 from shmio.endpoints.mqtt.broker.mosquitto import Mosquitto
 from shmio.endpoints.mqtt.broker.program import choose_broker
-from shmio.log_rate_limit import LogRateLimit
+from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 BROKER = "broker"

@@ -18,8 +18,7 @@ from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value
 from shmio.local.reading import reading
 from shmio.local.writer import SourceWriter
-from shmio.model.outcome import OutcomeKind
-from shmio.model.reading import Reading
+from shmio.model.values import OutcomeKind, Reading
 from shmio.segment import (  # fmt: skip
     Attributes,
     BlockSpec,

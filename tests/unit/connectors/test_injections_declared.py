@@ -22,7 +22,7 @@ from shmio.layout.values.codec import Value, codec
 from shmio.local.reading import reading
 from shmio.local.writer import CommandSender, SourceWriter
 from shmio.model.clock import Clock
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from shmio.segment import (  # fmt: skip
     Attributes,
     BlockSpec,

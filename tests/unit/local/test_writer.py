@@ -13,7 +13,7 @@ from shmio.errors import CommandError, PathError, SegmentError, ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.local.injection import Shadow
 from shmio.local.writer import SourceWriter
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from shmio.segment import (
     Attributes,
     BlockSpec,

@@ -16,7 +16,7 @@ from shmio.errors import CommandError, ConfigError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.local.reading import reading
 from shmio.local.writer import SourceWriter
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from shmio.segment import Attributes, BlockSpec, Frame, ProcessSpec, Provenance, Quality, Segment
 
 TABLE = b"""

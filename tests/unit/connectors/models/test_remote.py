@@ -17,7 +17,7 @@ from shmio.connectors.models.remote import Remote
 from shmio.errors import ConfigError, SegmentError, TimeError
 from shmio.local.time_control import Coordinator
 from shmio.local.writer import SourceWriter
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from shmio.segment import Attributes, BlockSpec, Frame, ProcessSpec, Provenance, Quality, Segment
 from shmio.segment.model_channel import ModelChannel, ModelRequest
 from tests.unit.connectors.models.test_stepped import GUEST, LAYOUT, MS, PATIENCE_S, PERIOD_NS, Running, latest, summed

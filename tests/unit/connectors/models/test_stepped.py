@@ -22,7 +22,7 @@ from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
 from shmio.local.time_control import Coordinator
 from shmio.local.writer import SourceWriter
-from shmio.model.outcome import OutcomeKind
+from shmio.model.values import OutcomeKind
 from shmio.segment import (
     Attributes,
     BlockSpec,

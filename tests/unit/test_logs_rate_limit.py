@@ -1,4 +1,4 @@
-"""What clients can have logged again and again does not fill the log."""
+"""Clients cannot fill the log by causing the same line again and again."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import logging
 
 import pytest
 
-from shmio.log_rate_limit import LINES, TURN_S, LogRateLimit
+from shmio.logs import MAX_LINES, TURN_S, LogRateLimit
 
 
-def test_lines_of_a_kind_are_rationed_and_the_rest_is_counted(caplog: pytest.LogCaptureFixture) -> None:
+def test_lines_of_a_kind_are_rate_limited_and_the_rest_is_counted(caplog: pytest.LogCaptureFixture) -> None:
     now_s = 100.0
-    log = logging.getLogger("test.ration")
-    ration = LogRateLimit(lambda: now_s)
-    log.addFilter(ration)
+    log = logging.getLogger("test.rate_limit")
+    rate_limit = LogRateLimit(lambda: now_s)
+    log.addFilter(rate_limit)
     try:
-        for number in range(LINES + 5):
+        for number in range(MAX_LINES + 5):
             log.warning("step failed: %s", number)
         log.warning("another kind: %s", 1)
         assert [record.getMessage() for record in caplog.records] == [
-            *(f"step failed: {number}" for number in range(LINES)), "another kind: 1",
+            *(f"step failed: {number}" for number in range(MAX_LINES)), "another kind: 1",
         ]  # fmt: skip
         caplog.clear()
         now_s += TURN_S
@@ -30,4 +30,4 @@ def test_lines_of_a_kind_are_rationed_and_the_rest_is_counted(caplog: pytest.Log
             "step failed: a (5 more like this were left out before)", "step failed: b", "another kind: 2",
         ]  # fmt: skip
     finally:
-        log.removeFilter(ration)
+        log.removeFilter(rate_limit)
