@@ -25,18 +25,18 @@ from typing import Any
 import msgspec
 
 from shmio.config import Declaration
-from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError
+from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError, ValueRangeError
 from shmio.layout.glob import choose
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
-from shmio.local.declared_injections import Campaign
-from shmio.local.following import Following
-from shmio.local.injection import Diversion, Shadow, as_given, by_path, lift_all, written
+from shmio.local.injection import Campaign, Diversion, Shadow, as_given, by_path, lift_all, written
 from shmio.local.reading import View, reading
-from shmio.local.subscription import Subscription
-from shmio.local.timekeeper import TimeMethods
+from shmio.local.replays import Replays
+from shmio.local.subscription import Following, Subscription
+from shmio.local.time_control import Timekeeper, check_step
 from shmio.local.writer import SourceWriter
+from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted, Running
 from shmio.model.values import Outcome, Quality, Reading
 from shmio.segment.block import Block, Cursor, Entry, Frame
@@ -95,18 +95,25 @@ TURN_S = 1.0
 """How often a waiting reader checks that the instance still runs, in s."""
 
 
-class Attachment(TimeMethods):
+class Attachment:
     """A running instance, attached to by a program on the same host.
 
     Use it as a context manager, or call :meth:`close`. :func:`attach` creates it.
     """
 
     def __init__(self, segment: Segment) -> None:
-        super().__init__(segment)
+        self._segment = segment
+        self._time = Timekeeper(segment)
+        self.replay = Replays(segment)
+        """The instance's replays: call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
+
+        The attachment must be ``writable`` to change them.
+        """
         self._turn = threading.Lock()
         self._guest: int | None = None
         self._source_writers: dict[str, SourceWriter] = {}
         self._open: weakref.WeakSet[Following[Any]] = weakref.WeakSet()
+        self._detached = False
 
     def _blocks(self) -> dict[str, Block]:
         if self._segment.closed:
@@ -129,18 +136,14 @@ class Attachment(TimeMethods):
         """Whether the attached instance still runs. Once it has stopped, attach again."""
         return self._segment.shared.current()
 
-    def _check_running(self) -> None:
-        if not self.current:
-            raise NotRunningError(f"instance {self.instance!r} has stopped")
-
     def layouts(self, *sources: str) -> dict[str, Layout]:
         """Return the layouts of these sources, or of all, by source. PathError: no such source."""
-        self._check_running()
+        self._segment.require_running()
         return {source: self.block(source).layout for source in dict.fromkeys(sources) or self._blocks()}
 
     def real_sources(self) -> list[str]:
         """Return the names of the sources that steps do not move, such as those with a device."""
-        self._check_running()
+        self._segment.require_running()
         return [source for source, block in self._blocks().items() if not block.attributes.stepped]
 
     def block(self, source: str | None = None) -> Block:
@@ -184,7 +187,7 @@ class Attachment(TimeMethods):
             PathError: A pattern names nothing.
             NotRunningError: The instance has stopped.
         """
-        self._check_running()
+        self._segment.require_running()
         blocks = self._blocks()
         chosen = choose(patterns, {source: block.layout for source, block in blocks.items()})
         frames = {source: blocks[source].latest() for source in {source for source, _ in chosen}}
@@ -196,9 +199,9 @@ class Attachment(TimeMethods):
         Closing the subscription or the attachment ends it.
         """
         subscription = Subscription(
-            self.instance, self._blocks, self._check_running, patterns, every_frame=every_frame, max_rate_hz=max_rate_hz
+            self._segment, self._blocks, patterns, every_frame=every_frame, max_rate_hz=max_rate_hz
         )
-        self._open.add(subscription)
+        self._end_with_this(subscription)
         return subscription
 
     def read(self, path: str) -> Reading:
@@ -287,8 +290,7 @@ class Attachment(TimeMethods):
             entry = cursor.next(min(rest_s, TURN_S))
             if entry is not None or retired:
                 return entry
-            if not self.current:
-                raise NotRunningError(f"instance {self.instance!r} has stopped")
+            self._segment.require_running()
             if rest_s < TURN_S:
                 return None
 
@@ -326,13 +328,13 @@ class Attachment(TimeMethods):
             cursor = block.cursor(after=0)
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Write values as :meth:`write` does; the outcomes have the paths as they were given.
+        """Write values as :meth:`write` does; each outcome has the path that you gave.
 
         Raises:
             PathError, ValueRangeError, CommandError: As :meth:`write`; nothing has been sent.
             NotRunningError: The instance has stopped.
         """
-        self._check_running()
+        self._segment.require_running()
         return as_given(values, self.write(values, timeout_s))
 
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
@@ -381,7 +383,7 @@ class Attachment(TimeMethods):
             CommandError: The source refuses, or does not answer.
             NotRunningError: The instance has stopped.
         """
-        self._check_running()
+        self._segment.require_running()
         block, topics = of_one_source("injection", paths, self._blocks())
         directions = {topic.direction or "out" for topic in topics}
         if len(directions) != 1:
@@ -432,9 +434,9 @@ class Attachment(TimeMethods):
             CommandError: A source refuses, or does not answer.
             NotRunningError: The instance has stopped.
         """
-        self._check_running()
-        campaign = Campaign(declarations, self._blocks(), self._source_writer, self._check_running, keep=keep)
-        self._open.add(campaign)
+        self._segment.require_running()
+        campaign = Campaign(self._segment, declarations, self._blocks(), self._source_writer, keep=keep)
+        self._end_with_this(campaign)
         return campaign
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
@@ -444,7 +446,7 @@ class Attachment(TimeMethods):
             PathError: There is no such source.
             NotRunningError: The instance has stopped.
         """
-        self._check_running()
+        self._segment.require_running()
         return [
             _with_source(source, one)
             for source in dict.fromkeys(sources) or self._blocks()
@@ -463,7 +465,7 @@ class Attachment(TimeMethods):
             CommandError: The source does not answer.
             NotRunningError: The instance has stopped.
         """
-        self._check_running()
+        self._segment.require_running()
         block = self.block(source)
         if not any(one.number == number and not one.lifted for one in block.standing.read()):
             raise PathError(f"{source}: there is no injection {number}; injections() lists them")
@@ -479,7 +481,7 @@ class Attachment(TimeMethods):
             CommandError: Some injections could not be lifted; the message gives the reasons.
             NotRunningError: The instance has stopped.
         """
-        self._check_running()
+        self._segment.require_running()
         blocks = [self.block(source) for source in dict.fromkeys(sources) or self._blocks()]
         standing = [(block, one) for block in blocks for one in block.standing.read() if not one.lifted]
         lift_all([(self._source_writer(block), one.number) for block, one in standing])
@@ -501,6 +503,75 @@ class Attachment(TimeMethods):
         """
         self._source_writer(self.block(source if source is not None else self.sources[0])).note(text)
 
+    @property
+    def clock(self) -> Clock:
+        """State of the instance's clock: wall time, or virtual time with its last step.
+
+        It may be called, as ``clock()`` of :class:`shmio.Cell`.
+        """
+        return self._segment.clock.read()
+
+    def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
+        """Move time by steps, and wait until all sources that use the instance clock have done them.
+
+        The first call of this method, :meth:`pause` or :meth:`play` takes over time: from then on only
+        steps move it. This program owns time until it detaches or calls :meth:`release`.
+        The attachment must be ``writable``.
+
+        Args:
+            dt_s: Length of each step in s, from 1 us to 1 h; None: the step size.
+            count: Number of steps.
+
+        Returns:
+            The state of the clock after the last step.
+
+        Raises:
+            TimeError: Another program owns time, or the step failed; the message says who failed or
+                did not answer.
+            ValueRangeError: The length is not within 1 us and 1 h, or the number is below 1.
+        """
+        dt_ns = _ns(dt_s)
+        if count < 1:
+            raise ValueRangeError(f"the number of steps must be at least 1, not {count}")
+        for _ in range(count):
+            self._time.step(dt_ns)
+        return self.clock
+
+    def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
+        """Step time in a thread until :meth:`pause`; returns the state of the clock.
+
+        Args:
+            rate: How many times as fast as real time; above 0, at most 1000.
+            dt_s: Length of a step in s; None: the step size.
+
+        Raises:
+            TimeError: Another program owns time.
+            ValueRangeError: The rate or the length is out of range.
+        """
+        self._time.play(rate, _ns(dt_s))
+        return self.clock
+
+    def pause(self) -> Clock:
+        """Stop time until it is stepped or played; returns the state of the clock.
+
+        Raises:
+            TimeError: Another program owns time, or a step failed while time was played.
+        """
+        self._time.pause()
+        return self.clock
+
+    def release(self) -> Clock:
+        """Return to real time, which goes on from the present virtual time; returns the state of the clock.
+
+        This program gives up the ownership of time. If time is real, nothing happens.
+
+        Raises:
+            TimeError: Another program owns time, time was virtual from the instance's start, or a
+                step failed while time was played.
+        """
+        self._time.release()
+        return self.clock
+
     def _source_writer(self, block: Block) -> SourceWriter:
         """Return the writer for a block. The first call takes a guest slot, which is kept."""
         if not self._segment.shared.writable:
@@ -513,13 +584,24 @@ class Attachment(TimeMethods):
                 known = self._source_writers[block.source] = SourceWriter(block, self._guest)
             return known
 
+    def _end_with_this(self, following: Following[Any]) -> None:
+        """End an iterator when the attachment is closed, at once if another thread has just done that."""
+        with self._turn:
+            detached = self._detached
+            self._open.add(following)
+        if detached:
+            following.end()
+
     def close(self) -> None:
         """Detach from the instance.
 
         Raises:
             TimeError: A step had failed while time was played.
         """
-        for one in list(self._open):
+        with self._turn:
+            self._detached = True
+            following = list(self._open)
+        for one in following:
             one.end()
         try:
             self._time.close()
@@ -542,6 +624,14 @@ def _with_source(source: str, one: StandingInjection) -> Injection[Mapping[str, 
     return Injection(
         one.number, one.direction, one.priority, one.keep, one.name, one.writer, one.pid, one.ranges, running, source
     )
+
+
+def _ns(dt_s: float | None) -> int | None:
+    """Check the length of a step, and convert it to ns; ValueRangeError."""
+    if dt_s is None:
+        return None
+    check_step(dt_s * 1e9)  # before rounding, which fails for infinity
+    return round(dt_s * 1e9)
 
 
 def attach(instance: str | None = None, *, writable: bool = False) -> Attachment:

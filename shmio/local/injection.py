@@ -1,23 +1,39 @@
-"""Injections that this program has laid, and the writes that they divert."""
+"""Injections of a local program: those whose values it gives, with the writes that they divert, and declared ones."""
 
 from __future__ import annotations
 
 import dataclasses
+import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
-from shmio.errors import CommandError, PathError, ValueRangeError
+import msgspec
+
+from shmio.config import Declaration
+from shmio.config.campaign import parse_campaign
+from shmio.config.declaration import check_declarations
+from shmio.errors import CommandError, ConfigError, DeclarationError, PathError, ValueRangeError
 from shmio.layout.topic import Topic, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import cover, merge
+from shmio.local.subscription import Following
 from shmio.local.writer import PendingCommand, SourceWriter
+from shmio.model.injection import Declared, Happening
 from shmio.model.values import Outcome
 from shmio.segment.block import Block, Cursor
 from shmio.segment.commands import CommandAssembler, CommandWrites, Direction, apply, decode_writes
 from shmio.segment.events import Event, EventKind
+from shmio.segment.segment import Segment
+
+if TYPE_CHECKING:
+    from shmio.injection import Program
+
+
+_EVENTS: Final = frozenset({EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.LIFTED})
 
 Next = Callable[[Cursor[Event], float | None], Event | None]
 """Waits at most so many seconds for a cursor's next event. None: no event came, or none will come.
@@ -36,7 +52,7 @@ class Diversion:
         command: The writer's number of the command, as in events.
         clock_ns: Time of the instance's clock.
         utc_ns: UTC time.
-        missed: Events lost since the previous diversion, which may have been about further writes.
+        missed: Events lost since the previous diversion; some may have been about further writes.
     """
 
     values: Mapping[str, Value]
@@ -84,8 +100,8 @@ class Shadow:
             timeout_s: How long the values may wait for a cycle of the source.
 
         Returns:
-            The outcome of each value, with its path as it was given: SHADOWED when consumers see it, or
-            an outcome as of a write for ``/in``; REJECTED when the shadow does not cover it or was lifted.
+            The outcome of each value, under the path that you gave: SHADOWED when consumers see it, or, for
+            ``/in``, an outcome as of a write; REJECTED when the shadow does not cover it or was lifted.
 
         Raises:
             PathError: A path names nothing.
@@ -193,6 +209,170 @@ def _written(
                 until_s = _deadline(timeout_s)
 
 
+class _Laid(NamedTuple):
+    """A declared injection that this program has laid."""
+
+    source_writer: SourceWriter
+    number: int
+    program: Program
+
+    def lift(self) -> None:
+        """Lift it. CommandError: it is over, was lifted already, or the source does not answer."""
+        self.source_writer.lift(self.number)
+
+
+def compile_declarations(
+    declarations: Sequence[Declaration], blocks: Mapping[str, Block], wanted: Callable[[], bool] = lambda: True
+) -> list[Program]:
+    """Compile declarations for this instance.
+
+    Args:
+        declarations: What to compile.
+        blocks: The instance's blocks, by source.
+        wanted: Called before each declaration; compilation stops when it returns False. Many
+            declarations over a large layout take seconds.
+
+    Raises:
+        ConfigError: The first fault, such as ``injection[0].target: …``.
+        CommandError: ``wanted`` returned False.
+    """
+    from shmio.injection import compile_program  # noqa: PLC0415 - loads numpy, which nothing else here needs
+
+    check_declarations(declarations)
+    layouts = {source: block.layout for source, block in blocks.items()}
+    periods_ns = {source: block.period_ns for source, block in blocks.items()}
+    programs = []
+    for index, declaration in enumerate(declarations):
+        if not wanted():
+            raise CommandError("its program no longer waits for it")
+        try:
+            programs.append(compile_program(declaration, layouts, periods_ns))
+        except ConfigError as error:
+            raise ConfigError(f'injection[{index}].{error} (injection "{declaration.name}")') from None
+    return programs
+
+
+def _lay(
+    declarations: Sequence[Declaration],
+    blocks: Mapping[str, Block],
+    source_writer: Callable[[Block], SourceWriter],
+    *,
+    keep: bool,
+) -> list[_Laid]:
+    """Lay all declared injections, or none of them; ConfigError, CommandError."""
+    laid: list[_Laid] = []
+    try:
+        for program in compile_declarations(declarations, blocks):
+            sender = source_writer(blocks[program.source])
+            try:
+                number = sender.declare(program.declaration, keep=keep)
+            except CommandError as error:
+                raise CommandError(f'{error} (injection "{program.declaration.name}")') from None
+            laid.append(_Laid(sender, number, program))
+    except BaseException:
+        for one in laid:
+            one.lift()
+        raise
+    return laid
+
+
+def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Declaration]:
+    """Read declarations from tables, and give each that has no seed a random one.
+
+    Raises:
+        DeclarationError: A declaration is wrong.
+    """
+    tables = [one if isinstance(one, Mapping) else msgspec.to_builtins(one) for one in declarations]
+    try:
+        read = parse_campaign({"injection": tables}) if tables else []
+    except ConfigError as error:
+        raise DeclarationError(str(error)) from None
+    # 53 bits: every JSON reader keeps such a number exactly.
+    return [msgspec.structs.replace(one, seed=secrets.randbits(53)) if one.seed is None else one for one in read]
+
+
+class Campaign(Following[Happening]):
+    """Declared injections that this program has laid.
+
+    Iterate over it for their events: the iteration ends when all of them are lifted. Events that were
+    overwritten before they could be read are left out. Leaving the ``with`` block lifts the rest,
+    unless they were laid with ``keep``.
+    """
+
+    def __init__(
+        self,
+        segment: Segment,
+        declarations: Iterable[Mapping[str, Any] | Declaration],
+        blocks: Mapping[str, Block],
+        source_writer: Callable[[Block], SourceWriter],
+        *,
+        keep: bool,
+    ) -> None:
+        """Lay all of them, or none.
+
+        Args:
+            segment: The instance's segment.
+            declarations: What to lay.
+            blocks: The instance's blocks, by source.
+            source_writer: Returns the writer that sends commands to a block.
+            keep: Whether the injections stay when this program ends.
+
+        Raises:
+            DeclarationError: A declaration is wrong.
+            CommandError: A source refuses one, or does not answer.
+        """
+        super().__init__(segment)
+        self._keep = keep
+        events = {source: block.events.cursor() for source, block in blocks.items()}
+        try:
+            laid = _lay(_read(declarations), blocks, source_writer, keep=keep)
+        except ConfigError as error:
+            raise DeclarationError(str(error)) from None
+        self.declared = tuple(
+            Declared(one.program.source, one.number, one.program.declaration.name, one.program.declaration.seed or 0)
+            for one in laid
+        )
+        """The injections, in the order of the declarations."""
+        self._left = {(one.program.source, one.number): one for one in laid}
+        sources = dict.fromkeys(one.program.source for one in laid)
+        self._cursors = {source: (blocks[source], events[source]) for source in sources}
+        for source in sources:
+            self._follow(blocks[source])
+
+    def _take(self) -> Happening | None:
+        for source, (block, cursor) in self._cursors.items():
+            retired = block.retired  # before looking
+            while (event := cursor.poll()) is not None:
+                if event.kind in _EVENTS and event.offset == 0 and (source, event.injection) in self._left:
+                    return self._happening(source, event)  # the first part, if the event has several
+            if cursor.take_missed():  # some of them may be about lifted injections
+                present = {one.number for one in block.standing.read() if not one.lifted}
+                self._left = {key: one for key, one in self._left.items() if key[0] != source or key[1] in present}
+            if retired:
+                self._left = {key: one for key, one in self._left.items() if key[0] != source}
+        if not self._left:
+            raise StopIteration
+        return None
+
+    def _happening(self, source: str, event: Event) -> Happening:
+        lifted = event.kind == EventKind.LIFTED
+        if lifted:
+            del self._left[source, event.injection]
+        run = event.item if event.kind in (EventKind.ACTIVATED, EventKind.DEACTIVATED) else 0
+        return Happening(
+            source, event.injection, str(EventKind(event.kind)), event.clock_ns, event.utc_ns, event.frame,
+            event.cycle, run, event.text if lifted else "",
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Lift the injections that still stand, unless they are to be kept."""
+        super().close()
+        for one in () if self._keep else self._left.values():
+            with suppress(CommandError):  # it is over, or somebody else has lifted it
+                one.lift()
+        self._left.clear()
+
+
 def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
     """Lift injections, given by writer and number. One that is already gone counts as lifted.
 
@@ -231,7 +411,7 @@ def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, 
 
 
 def as_given(paths: Iterable[str], outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Return outcomes with the paths as their caller gave them."""
+    """Return outcomes under the paths that the caller gave."""
     return [dataclasses.replace(outcome, path=path) for path, outcome in zip(paths, outcomes, strict=True)]
 
 

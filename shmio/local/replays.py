@@ -1,4 +1,7 @@
-"""Control replays from a local program: the sources of a recording move together, in step."""
+"""Control replays from a local program: the sources of a recording move together, in step.
+
+Also reads times of a recording as users write them.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,13 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from datetime import datetime
 from typing import Any, Final, Unpack
 
 import msgspec
 
-from shmio.errors import CommandError, NotRunningError, PathError, ValueRangeError
+from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.topic import look_up, parse_topic
-from shmio.local.recording_times import moment_ns
 from shmio.model.replay import Playing, Wish
 from shmio.segment.block import Block
 from shmio.segment.playhead import (
@@ -27,10 +30,10 @@ from shmio.segment.playhead import (
 )
 from shmio.segment.segment import Segment
 
-ANSWER_S: Final = 5.0
+_ANSWER_S: Final = 5.0
 """How long to wait for an answer that needs no search."""
-SEARCH_S: Final = 600.0
-TURN_NS: Final = 500_000_000
+_SEARCH_S: Final = 600.0
+_TURN_NS: Final = 500_000_000
 """How often to check whether the caller has given up."""
 
 
@@ -75,8 +78,7 @@ class Replays:
 
     def __call__(self, **wish: Unpack[Wish]) -> list[Playing]:
         """Change replays, as ``replay`` of :class:`shmio.Cell`; without arguments, only return their status."""
-        if not self._segment.shared.current():
-            raise NotRunningError(f"instance {self._segment.instance!r} has stopped")
+        self._segment.require_running()
         keys: dict[str, Any] = {**wish, "sources": tuple(wish.get("sources", ()))}
         for key in {"seek", "until"} & keys.keys():
             keys[key] = str(keys[key])
@@ -250,7 +252,7 @@ class Replays:
         answers = self._ask(
             searched,
             {source: FindRequest(after_ns[source], path, wanted.event) for source in searched},
-            SEARCH_S,
+            _SEARCH_S,
             given_up,
         )
         positions_ns = [found.position_ns for found in answers.values() if found.position_ns is not None]
@@ -270,7 +272,7 @@ class Replays:
             play = head.read()
             if play is not None:
                 asks[source] = move(play, clock_ns)
-        for source, found in self._ask(heads, asks, ANSWER_S).items():
+        for source, found in self._ask(heads, asks, _ANSWER_S).items():
             if found.error:
                 raise CommandError(f"{source}: {found.error}")
 
@@ -306,7 +308,7 @@ class Replays:
                 raise CommandError(f"source {source} does not answer: {self._state(source)}")
             if given_up():
                 raise CommandError(f"source {source} has not answered in time")
-            ring.wait(seen, min(rest_ns, TURN_NS))
+            ring.wait(seen, min(rest_ns, _TURN_NS))
 
     def _state(self, source: str) -> str:
         for slot in self._segment.processes:
@@ -357,3 +359,35 @@ def _replay_status(source: str, play: PlayState, clock_ns: int) -> Playing:
         play.over,
         (play.until_ns - play.begin_ns) / 1e9 if play.until_ns < play.end_ns else None,
     )
+
+
+def moment_ns(text: str, begin_ns: int) -> int:
+    """Parse a time, given in seconds from ``begin_ns`` or as a date and time.
+
+    Returns:
+        UTC in ns.
+
+    Raises:
+        ValueError: The text is neither.
+    """
+    try:
+        return begin_ns + round(float(text) * 1e9)
+    except ValueError:
+        return date_ns(text)
+    except OverflowError:
+        raise ValueError from None
+
+
+def date_ns(text: str) -> int:
+    """Parse a date and time in ISO 8601; local time, unless it names a time zone.
+
+    Returns:
+        UTC in ns.
+
+    Raises:
+        ValueError: The text is not a date and time.
+    """
+    try:
+        return round(datetime.fromisoformat(text).astimezone().timestamp() * 1e6) * 1000
+    except OverflowError:
+        raise ValueError from None

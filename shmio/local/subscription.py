@@ -1,22 +1,110 @@
-"""Follow registers of a local instance: their present values, then each change."""
+"""Follow registers of a local instance: their present values, then each change; and the base of such iterators."""
 
 from __future__ import annotations
 
 import math
+import select
+import threading
 import time
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from types import TracebackType
+from typing import Final, Generic, Self, TypeVar
 
 from shmio.errors import PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.layout.glob import choose
 from shmio.layout.model import Register
 from shmio.layout.topic import parse_topic
-from shmio.local.following import Following
 from shmio.local.reading import reading
 from shmio.model.values import Provenance, Quality, Reading
 from shmio.segment.block import Block, Frame, FrameFollower
 from shmio.segment.changed_registers import ChangeScan
+from shmio.segment.doorbell import Relay
+from shmio.segment.segment import Segment
+
+TURN_S: Final = 0.2
+"""How often a waiting iterator checks that the instance still runs and that nobody has closed the iterator."""
+
+Item = TypeVar("Item")
+
+
+class Following(Generic[Item]):
+    """Iterates over news of several blocks, in one thread; any thread may close it.
+
+    A relay for each followed block wakes it, for frames and events alike.
+    """
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._turn = threading.Lock()  # held while the mapped memory is read: close waits for it
+        self._relays: dict[int, Relay] = {}  # by the block's section
+        self._stop = weakref.finalize(self, _stop, self._relays)  # also for a program that does not close it
+        self._closed = False
+        self._due_s = math.inf
+        """When to look again although nothing has happened, in s of the monotonic clock."""
+        self._checked_s = time.monotonic()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Item:
+        while True:
+            with self._turn:
+                if self._closed:
+                    raise StopIteration
+                for relay in self._relays.values():
+                    relay.heard()  # before looking
+                found = self._take()
+                poll = select.poll()
+                for relay in self._relays.values():
+                    poll.register(relay.descriptor, select.POLLIN)
+            if found is not None:
+                return found
+            now_s = time.monotonic()
+            if now_s > self._checked_s + TURN_S:
+                self._segment.require_running()
+                self._checked_s = now_s
+            poll.poll(1000 * max(0.0, min(TURN_S, self._due_s - now_s)))
+
+    def _take(self) -> Item | None:
+        """Return the next item if there is one. StopIteration: none will come."""
+        raise NotImplementedError
+
+    def _follow(self, block: Block) -> None:
+        """Let a block wake this iterator."""
+        self._relays[block.section] = Relay(block.ring, f"following-{block.source}", round(TURN_S * 1e9))
+
+    def _leave(self, block: Block) -> None:
+        """Let a block wake this iterator no longer."""
+        self._relays.pop(block.section).join()
+
+    def end(self) -> None:
+        """End the iteration, and wait until nothing reads the mapped memory."""
+        self._closed = True
+        with self._turn:
+            self._stop()
+
+    def close(self) -> None:
+        """End the iteration."""
+        self.end()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _stop(relays: dict[int, Relay]) -> None:
+    """Stop relays, and wait until their threads have ended."""
+    for relay in relays.values():
+        relay.stop()
+    for relay in relays.values():
+        relay.join()
+    relays.clear()
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +130,8 @@ class Subscription(Following[Update]):
 
     def __init__(
         self,
-        instance: str,
+        segment: Segment,
         blocks: Callable[[], Mapping[str, Block]],
-        check_running: Callable[[], None],
         patterns: Sequence[str],
         *,
         every_frame: bool,
@@ -53,15 +140,13 @@ class Subscription(Following[Update]):
         """Prepare to follow.
 
         Args:
-            instance: Name of the instance, for messages.
+            segment: The instance's segment.
             blocks: Returns the instance's present blocks, by source.
-            check_running: Raises NotRunningError when the instance has stopped.
             patterns: What to follow.
             every_frame: Whether to give an update for each frame.
-            max_rate_hz: The most updates a second of each source; 0: no limit.
+            max_rate_hz: The most updates of each source in a second; 0: no limit.
         """
-        super().__init__(check_running)
-        self._instance = instance
+        super().__init__(segment)
         self._blocks = blocks
         self._patterns = patterns
         self._wanted: dict[str, list[str]] = {}  # by source, each pattern with its source
@@ -72,14 +157,14 @@ class Subscription(Following[Update]):
         try:
             _check(patterns, max_rate_hz, every_frame=every_frame)
             self._begin()
-        except (PathError, ValueRangeError) as error:  # the first update raises it, as from a remote cell
+        except (PathError, ValueRangeError) as error:  # the first update raises it, as it does for a remote cell
             self._refusal = error
 
     def _take(self) -> Update | None:
         if self._refusal is not None:
             raise self._refusal
         for follower in list(self._followers):
-            retired = follower.block.retired  # before looking: what was published before the end is still read
+            retired = follower.block.retired  # before looking: frames published before the end are still read
             if (update := follower.take()) is not None:
                 self._followers.remove(follower)  # the others come first now
                 self._followers.append(follower)
@@ -109,8 +194,8 @@ class Subscription(Following[Update]):
         self._follow(block)
 
     def _succeed(self, old: _Follower) -> Update | None:
-        """Follow the block that a reload has put in place of another; return the end if there is none."""
-        self._check_running()
+        """Follow the block with which a reload has replaced another; return the last update if there is none."""
+        self._segment.require_running()
         self._followers.remove(old)
         self._leave(old.block)
         blocks, source = self._blocks(), old.block.source
@@ -122,21 +207,11 @@ class Subscription(Following[Update]):
             return None
         gone = sorted(self._wanted.keys() - blocks.keys())
         named = f"source {gone[0]!r} was" if len(gone) == 1 else f"sources {', '.join(gone)} were"
-        return old.end(f"{named} removed from instance {self._instance!r} by a reload")
-
-    def close(self) -> None:
-        """End the subscription."""
-        self.end()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return old.end(f"{named} removed from instance {self._segment.instance!r} by a reload")
 
 
 def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) -> None:
-    """Raise ValueRangeError for what no endpoint accepts either."""
+    """Raise ValueRangeError for arguments that no endpoint accepts either."""
     if not patterns:
         raise ValueRangeError("no pattern is given: name a path, a structure, a glob, or a source")
     if not 0 <= max_rate_hz < math.inf:
@@ -146,12 +221,12 @@ def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) ->
 
 
 class _Follower:
-    """The registers of one block, and the frame that was given last."""
+    """Follows the registers of one block, and keeps the last frame that an update was for."""
 
     def __init__(self, block: Block, registers: Sequence[Register], *, every_frame: bool, interval_s: float) -> None:
         self.block = block
         self.due_s = math.inf
-        """When the next update may be given, if one waits for that."""
+        """Earliest time of the next update, if ``max_rate_hz`` delays one."""
         self._registers = registers
         self._scan = ChangeScan(registers)
         self._frames = FrameFollower(block)
@@ -204,7 +279,7 @@ class _Follower:
             return None
         try:
             return frames.newest()
-        except SegmentError:  # it was overwritten during each read: there will be another
+        except SegmentError:  # each copy was overwritten while it was read: there will be another frame
             return None
 
     def end(self, what: str) -> Update:

@@ -1,4 +1,4 @@
-"""Take over an instance's time, step it, and wait until every source has done the step."""
+"""Control an instance's time: take it over, step it until every source has done the step, play it, release it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
-from shmio.errors import TimeError, ValueRangeError
-from shmio.local.step_answers import StepWait, describe_silence, step_answer, take_over_note, unmoved_note
+from shmio.errors import SegmentError, ShmioError, TimeError, ValueRangeError
 from shmio.model.clock import Clock, ClockMode
+from shmio.model.values import Quality
 from shmio.segment.block import Block
 from shmio.segment.clock import time_lock
 from shmio.segment.processes import ProcessSlot
@@ -21,11 +21,21 @@ from shmio.segment.segment import Segment
 
 MIN_STEP_NS: Final = 1_000
 MAX_STEP_NS: Final = 3_600_000_000_000
-TURN_NS: Final = 100_000_000
+_TURN_NS: Final = 100_000_000
 """How often a process that waits for the owner of time polls: an owner that dies rings no bell."""
 MAX_RATE: Final = 1000.0
-DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
+_DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
 """Kinds of processes whose delivery a step may wait for."""
+_PATIENCE_S: Final = 2.0
+"""How long to wait for the owner of time to give it up; the gRPC endpoint does when its clients are idle."""
+_LATE_NS: Final = 500_000_000
+"""Playing catches up with at most this much delay."""
+
+_NOBODY: Final = (
+    "no source uses the instance clock, so stepping has no effect; sources with a device continue in real time"
+)
+_REAL: Final = "; shmio step --release returns to real time"
+_PAUSED: Final = f"it is paused until the next step{_REAL}"
 
 log = logging.getLogger("shmio.time")
 log.addHandler(logging.NullHandler())  # a program that asks for no log gets none
@@ -44,6 +54,18 @@ class Step:
     number: int
     time_ns: int
     dt_ns: int
+
+
+class StepWait(NamedTuple):
+    """A wait within a step: until a doorbell differs from ``seen``, at most ``rest_ns``.
+
+    The doorbell is that of ``block``, whose answer is awaited. If ``block`` is None it is the doorbell
+    of the processes that deliver steps.
+    """
+
+    block: Block | None
+    seen: int
+    rest_ns: int
 
 
 class Coordinator:
@@ -110,7 +132,7 @@ class Coordinator:
                 # A free-running source reads the page before each cycle, so none starts a cycle after this
                 # write. The present cycle, determined again afterwards, is therefore the last one.
                 self._write(self._frozen(state))
-                state = self._frozen(state._replace(note="" if steps else take_over_note(self._participants())))
+                state = self._frozen(state._replace(note="" if steps else _take_over_note(self._participants())))
             self._write(state)
             self._ring_all()
 
@@ -211,7 +233,7 @@ class Coordinator:
         check_step(dt_ns)
         step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
         participants = self._participants()
-        stands = unmoved_note(self._segment, participants)
+        stands = _unmoved_note(self._segment, participants)
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was cancelled"
         try:
@@ -261,7 +283,7 @@ class Coordinator:
                 name = self._segment.instance
                 how = ", which is playing it; stop that first" if state.playing else "; it is free when that ends"
                 raise TimeError(f"the time of instance {name!r} is moved by {self._owner(state.owner)}{how}")
-            bell.wait(seen, min(rest_ns, TURN_NS))
+            bell.wait(seen, min(rest_ns, _TURN_NS))
 
     def _frozen(self, state: Clock) -> Clock:
         """Return the state of virtual time that continues wall time from now."""
@@ -302,19 +324,19 @@ class Coordinator:
         while waiting:
             block = waiting[0]
             seen = block.ring.doorbell()  # before looking
-            found = step_answer(block, number)
+            found = _step_answer(block, number)
             if found is not None:
                 waiting.remove(block)
                 problems += [f"{block.source}: {found}"] if found else []
                 continue
             passed_ns = time.monotonic_ns() - begun_ns
             if passed_ns >= self._hard_ns:
-                silent = [block for block in waiting if step_answer(block, number) is None]
-                problems += [describe_silence(self._segment, block, self._hard_ns) for block in silent]
+                silent = [block for block in waiting if _step_answer(block, number) is None]
+                problems += [_describe_silence(self._segment, block, self._hard_ns) for block in silent]
                 return "; ".join(problems)
             if passed_ns >= self._soft_ns and not told:
                 told = True
-                names = [block.source for block in waiting if step_answer(block, number) is None]
+                names = [block.source for block in waiting if _step_answer(block, number) is None]
                 note = f"step {number} waits for {', '.join(names)}"
                 log.warning(note)
                 self._write(asked._replace(note=note))
@@ -345,7 +367,7 @@ class Coordinator:
 
     def _owes(self, slot: ProcessSlot, number: int) -> bool:
         """Whether another living process delivers steps and has not delivered this one yet."""
-        if slot.kind not in DISPATCHERS:
+        if slot.kind not in _DISPATCHERS:
             return False
         last = self._segment.clock.delivered(slot.index)
         return last is not None and last < number and slot.alive()  # our own lock does not count as one held
@@ -356,7 +378,141 @@ class Coordinator:
         return f"{names[0]} (pid {pid})" if names else f"another program (pid {pid})"
 
 
+class Timekeeper:
+    """Steps or plays an instance's time, and owns that time from the first step until it is closed.
+
+    Use it from one thread; it plays in a thread of its own.
+    """
+
+    def __init__(self, segment: Segment) -> None:
+        """``segment`` must be writable."""
+        self._segment = segment
+        self._coordinator = Coordinator(segment)
+        self._paused = threading.Event()
+        self._player: threading.Thread | None = None
+        self._failure: ShmioError | None = None
+
+    def step(self, dt_ns: int | None = None) -> Step:
+        """Move time by one step, as :meth:`Coordinator.step` does. TimeError: also while time is played."""
+        if self._player is not None:
+            raise TimeError("time is playing: pause it before you step it")
+        self._take_over()
+        return self._coordinator.step(dt_ns)
+
+    def play(self, rate: float = 1.0, dt_ns: int | None = None) -> None:
+        """Step in a thread, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
+        if dt_ns is not None:
+            check_step(dt_ns)
+        self.pause()
+        self._coordinator.set_playing(True, rate)
+        self._paused.clear()
+        self._player = threading.Thread(target=self._play, args=(rate, dt_ns), name="player", daemon=True)
+        self._player.start()
+
+    def pause(self) -> None:
+        """Stop playing, and take over time if this program does not own it.
+
+        Raises:
+            TimeError: Another program owns time, or a step failed while time was played.
+        """
+        self._take_over()
+        player, self._player = self._player, None
+        if player is not None:
+            self._paused.set()
+            player.join()
+        self._coordinator.set_playing(False)
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+
+    def release(self) -> None:
+        """Return to real time. TimeError: also if a step failed while time was played."""
+        self._segment.require_running()
+        self._coordinator.check_release()
+        if self._player is not None:
+            self.pause()
+        self._coordinator.release(_PATIENCE_S)
+
+    def close(self) -> None:
+        """Stop playing, and give up the ownership of time."""
+        try:
+            if self._player is not None:
+                self.pause()
+        finally:
+            self._coordinator.close()
+
+    def _take_over(self) -> None:
+        self._segment.require_running()
+        self._coordinator.take_over(_PATIENCE_S)
+
+    def _play(self, rate: float, dt_ns: int | None) -> None:
+        due_ns = time.monotonic_ns()
+        while not self._paused.is_set():
+            try:
+                step = self._coordinator.step(dt_ns)
+            except ShmioError as error:
+                self._failure = error
+                self._coordinator.set_playing(False)
+                return
+            now_ns = time.monotonic_ns()
+            due_ns = max(due_ns + round(step.dt_ns / rate), now_ns - _LATE_NS)
+            self._paused.wait(max(0, due_ns - now_ns) / 1e9)
+
+
 def check_step(dt_ns: float) -> None:
     """Raise ValueRangeError if a step may not have this length."""
     if not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
         raise ValueRangeError(f"a step is from 0.001 ms to 3600000 ms (1 h), not {dt_ns / 1e6:g} ms")
+
+
+def _step_answer(block: Block, number: int) -> str | None:
+    """Return a block's answer to a step: empty if done, the reason if it failed, None if none came."""
+    if block.retired:
+        return ""  # a reload has retired the block
+    try:
+        if block.playhead is not None:
+            play = block.playhead.read()
+            return None if play is None or play.step < number else ""
+        frame = block.latest()
+    except SegmentError as error:
+        return str(error)
+    if frame is None or frame.cycle < number:
+        return None
+    return frame.reason or "it gave no reason" if frame.quality is Quality.BAD else ""
+
+
+def _describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
+    """Describe a source that has not answered a step in time."""
+    what = f"{block.source}: no answer within {hard_ns / 1e9:g} s"
+    for slot in segment.processes:
+        if slot.name == block.source:
+            if slot.alive():
+                return f"{what} from pid {slot.report.pid}"
+            told = slot.supervised
+            return f"{what}: its process does not run ({told.phase}{told.note and f': {told.note}'})"
+    return what
+
+
+def _take_over_note(participants: Sequence[Block]) -> str:
+    """Return the clock's note after time was taken over."""
+    return _PAUSED if participants else f"{_NOBODY}{_REAL}"
+
+
+def _unmoved_note(segment: Segment, participants: Sequence[Block]) -> str:
+    """Describe what the next step will not move, with the remedy; empty if it moves everything."""
+    if not participants:
+        return _NOBODY if segment.clock.stepped else f"{_NOBODY}{_REAL}"
+    found: dict[str, list[str]] = {"paused": [], "over": []}
+    for block in participants:
+        try:
+            play = block.playhead.read() if block.playhead is not None else None
+        except SegmentError:  # the step itself reports it
+            continue
+        if play is not None and play.paused:
+            found["over" if play.over else "paused"].append(block.source)
+    return "; ".join(
+        f"the replay of {names[0]}{f' and {len(names) - 1} more' if names[1:] else ''} was {how} and did not move: "
+        "shmio replay play starts it"
+        for how, names in found.items()
+        if names
+    )

@@ -553,6 +553,11 @@ class Segment:
         """Whether a supervisor is alive."""
         return self.shared.locked(SUPERVISOR_LOCK)
 
+    def require_running(self) -> None:
+        """Raise NotRunningError if the instance has stopped."""
+        if not self.shared.current():
+            raise NotRunningError(f"instance {self.instance!r} has stopped")
+
     def set_state(self, pid: int, state: State, note: str = "") -> None:
         """Write the supervisor's pid, the instance's state and a note. Only the supervisor may."""
         header.write_supervisor(self.memory, pid, state)

@@ -41,7 +41,6 @@ GROUPS: Final = {
             "shmio/connectors/loop.py",
             "shmio/connectors/output.py",
             "shmio/layout/values/write.py",
-            "shmio/local/step_answers.py",
             "shmio/local/writer.py",
             "shmio/segment/commands.py",
         ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from shmio.errors import RecordingError
-from shmio.local.recording_times import moment_ns
+from shmio.local.replays import moment_ns
 from shmio.recording.reading.part import MAX_NS
 
 

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from shmio.connectors.replay.recorded_source import RecordedSource
 from shmio.errors import RecordingError
-from shmio.local.recording_times import date_ns
+from shmio.local.replays import date_ns
 from shmio.recording.dump import open_dump
 from shmio.recording.format.damage import Damage
 from shmio.segment.header import MAX_PROCESSES

@@ -13,6 +13,7 @@ import pytest
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.local.attach import Attachment, attach
+from shmio.local.subscription import Subscription
 from shmio.model.values import Quality
 from shmio.segment import BlockSpec, BlockWriter, Segment, Stamp
 
@@ -147,3 +148,18 @@ def test_a_subscription_that_is_dropped_leaves_no_thread(segment: Segment, cell:
 def relays() -> list[str]:
     """The threads that wake subscriptions."""
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("following-")]
+
+
+def test_a_subscription_that_comes_while_another_thread_closes_the_attachment_is_over(
+    segment: Segment, cell: Attachment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish(segment.writer("cell"), 1, 1, 1)
+
+    def overtaken(*arguments: Any, **options: Any) -> Subscription:
+        subscription = Subscription(*arguments, **options)
+        cell.close()
+        return subscription
+
+    monkeypatch.setattr("shmio.local.attach.Subscription", overtaken)
+    assert list(cell.subscribe("cell")) == []
+    assert not [thread for thread in threading.enumerate() if thread.name == "following-cell"]

@@ -21,7 +21,7 @@ from shmio.endpoints.grpc.streams.outbox import SendQueue
 from shmio.errors import CommandError, ValueRangeError
 from shmio.injection import Program
 from shmio.layout.topic import names_part
-from shmio.local.declared_injections import check
+from shmio.local.injection import compile_declarations
 from shmio.messages import declaration_from_wire
 from shmio.segment import Block, Event, EventKind
 from shmio.wire import shmio_v1_pb2 as wire
@@ -179,7 +179,7 @@ def _check(
             f"targets that are not just a register, times registers of their source, are more than {MAX_MATCHES}: "
             "declare fewer at once"
         )
-    return check(declarations, blocks, wanted)
+    return compile_declarations(declarations, blocks, wanted)
 
 
 class DeclaredInjection(InjectionFollower):

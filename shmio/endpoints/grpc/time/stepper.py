@@ -17,8 +17,7 @@ from shmio.endpoints.grpc.streams.wakeups import WakeUp, WakeUps
 from shmio.endpoints.grpc.time.timeline import Timeline
 from shmio.endpoints.grpc.time.virtual_time import TimeStatus, VirtualTime
 from shmio.errors import ShmioError, TimeError
-from shmio.local.step_answers import StepWait
-from shmio.local.time_control import Coordinator, Step, check_step
+from shmio.local.time_control import Coordinator, Step, StepWait, check_step
 from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
 

@@ -251,7 +251,7 @@ def test_what_a_client_that_is_gone_has_declared_is_not_looked_at_to_the_end(
         assert (await second.read()).declared.injections, "and the next one has its turn"
         second.cancel()
 
-    monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.declare.check", slow)
+    monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.declare.compile_declarations", slow)
     with_plant(segment, test)
 
 

@@ -7,8 +7,7 @@ from collections.abc import Callable, Generator
 from typing import Any
 
 from shmio.endpoints.grpc.time.stepper import StepDriver
-from shmio.local.step_answers import StepWait
-from shmio.local.time_control import Step
+from shmio.local.time_control import Step, StepWait
 
 MANY = 1_000_000
 DONE = Step(1, 50, 50)
