@@ -30,7 +30,7 @@ from shmio.segment.playhead import (
 )
 from shmio.segment.segment import Segment
 
-_ANSWER_S: Final = 5.0
+ANSWER_S: Final = 5.0
 """How long to wait for an answer that needs no search."""
 _SEARCH_S: Final = 600.0
 _TURN_NS: Final = 500_000_000
@@ -272,7 +272,7 @@ class Replays:
             play = head.read()
             if play is not None:
                 asks[source] = move(play, clock_ns)
-        for source, found in self._ask(heads, asks, _ANSWER_S).items():
+        for source, found in self._ask(heads, asks, ANSWER_S).items():
             if found.error:
                 raise CommandError(f"{source}: {found.error}")
 
