@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import io
 import json
 import math
@@ -61,6 +62,17 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
         _give_up_output()
         return 1
     return status
+
+
+def load(command: str) -> Callable[[argparse.Namespace], int]:
+    """Import the function of a verb, such as ``shmio.cli.instance.status:status``.
+
+    Each verb needs other parts of shmio. Ctrl-C ends the process at once meanwhile.
+    """
+    module, _, function = command.partition(":")
+    with ended_by_interrupt():
+        execute: Callable[[argparse.Namespace], int] = getattr(importlib.import_module(module), function)
+    return execute
 
 
 def complete(parser: argparse.ArgumentParser) -> None:

@@ -1,15 +1,13 @@
-"""``shmio-supervisor``: start, watch and stop an instance. Each verb is a module of ``shmio.cli.instance``."""
+"""``shmio-supervisor``: start, watch and stop an instance. The verbs are in ``shmio.cli.instance``."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.run import add_json, at_least, complete, ended_by_interrupt, run
-from shmio.plan.replay import add_arguments
+from shmio.cli.run import add_json, at_least, complete, load, run
 from shmio.version import __version__
 
 PROGRAM = "shmio-supervisor"
@@ -22,14 +20,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     complete(parser)
     arguments = parser.parse_args(argv)
 
-    with ended_by_interrupt():
-        verb = importlib.import_module(f"shmio.cli.instance.{arguments.verb}")  # each needs other parts of shmio
-
-    def command() -> int:
-        status: int = verb.execute(arguments)
-        return status
-
-    return run(PROGRAM, command, arguments)
+    detach = arguments.verb == "up" and arguments.detach
+    execute = load(f"shmio.cli.instance.{'detach:detach' if detach else arguments.command}")
+    return run(PROGRAM, lambda: execute(arguments), arguments)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -42,8 +35,11 @@ def _parser() -> argparse.ArgumentParser:
     target = argparse.ArgumentParser(add_help=False, parents=[file])
     target.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
 
-    def verb(name: str, text: str, parent: argparse.ArgumentParser) -> argparse.ArgumentParser:
-        return verbs.add_parser(name, help=text, description=text, parents=[parent])
+    def verb(name: str, text: str, *parents: argparse.ArgumentParser, command: str = "") -> argparse.ArgumentParser:
+        """Add a verb; ``command`` is its module and function in ``shmio.cli.instance``, if not its name."""
+        made = verbs.add_parser(name, help=text, description=text, parents=parents)
+        made.set_defaults(command=command or f"{name}:{name}")
+        return made
 
     up = verb("up", "start the instance; Ctrl-C, SIGTERM or closing the terminal stops it", file)
     up.add_argument(
@@ -53,16 +49,16 @@ def _parser() -> argparse.ArgumentParser:
         help="live (default); log: record, serve nothing; replay: play a recording in place of the sources",
     )
     up.add_argument("--detach", action="store_true", help="return when it runs, and leave it running")
-    add_arguments(up)
+    _add_replay(up)
     up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor on which a detached one tells its start
-    verb("down", "stop the instance", target)
+    verb("down", "stop the instance", target, command="control:down")
     add_json(verb("status", "show the state of the instance and its processes", target))
     text = "list the instances on this host, their files and the addresses on which they listen"
-    add_json(verb("list", text, argparse.ArgumentParser(add_help=False)), "print a JSON list")
-    add_json(verb("reload", "apply changes of the configuration; leave everything else alone", target))
-    verb("restart", "restart one process, as it was configured at the start or the last reload", target).add_argument(
-        "name", metavar="NAME"
-    )
+    add_json(verb("list", text, command="status:list_instances"), "print a JSON list")
+    text = "apply changes of the configuration; leave everything else alone"
+    add_json(verb("reload", text, target, command="control:reload"))
+    text = "restart one process, as it was configured at the start or the last reload"
+    verb("restart", text, target, command="control:restart").add_argument("name", metavar="NAME")
     add_json(verb("check", "validate the configuration and its layouts; start nothing", file))
     logs = verb("logs", "print the end of the log files", target)
     logs.add_argument("name", metavar="NAME", nargs="?", help="a process, or supervisor (default: all)")
@@ -77,6 +73,19 @@ def _parser() -> argparse.ArgumentParser:
         "files", metavar="FILE", nargs="*", type=Path, help="the block's sources (.db, .udt, .scl), and a plc.ini"
     )
     return parser
+
+
+def _add_replay(parser: argparse.ArgumentParser) -> None:
+    """Add the options that override the keys of ``[replay]``."""
+    group = parser.add_argument_group("with --mode replay, in place of the keys of [replay]")
+    group.add_argument("--from", nargs="+", metavar="FILE", help="the recording: one .mem, or several of one run")
+    group.add_argument("--start", metavar="TIME", help="seconds from its begin, or a date and time")
+    group.add_argument("--end", metavar="TIME", help="the same")
+    group.add_argument("--speed", type=float, metavar="X", help="times real time, 0.01 to 1000 (default: 1)")
+    group.add_argument("--injections", choices=("keep", "leave out"), help="those of the recording (default: keep)")
+    group.add_argument("--loop", action="store_true", default=None, help="again and again")
+    group.add_argument("--paused", action="store_true", default=None, help="begin when told to: shmio replay play")
+    group.add_argument("--record", action="store_true", default=None, help="start the recorder of the configuration")
 
 
 if __name__ == "__main__":

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -18,8 +16,6 @@ from shmio.segment import Origin
 
 LEAD_NS: Final = 2_000_000_000
 """Lead of the clock's start over the recording's, if possible, for the processes to start."""
-_OPTIONS: Final = ("from", "start", "end", "speed", "injections")
-_FLAGS: Final = ("loop", "paused", "record")
 
 
 class Replayed(NamedTuple):
@@ -29,40 +25,6 @@ class Replayed(NamedTuple):
     origin: Origin
     notices: list[str]
     """Lines about what was removed from or added to the configuration."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of ``up`` that override the keys of ``[replay]``."""
-    group = parser.add_argument_group("with --mode replay, in place of the keys of [replay]")
-    group.add_argument("--from", nargs="+", metavar="FILE", help="the recording: one .mem, or several of one run")
-    group.add_argument("--start", metavar="TIME", help="seconds from its begin, or a date and time")
-    group.add_argument("--end", metavar="TIME", help="the same")
-    group.add_argument("--speed", type=float, metavar="X", help="times real time, 0.01 to 1000 (default: 1)")
-    group.add_argument("--injections", choices=("keep", "leave out"), help="those of the recording (default: keep)")
-    group.add_argument("--loop", action="store_true", default=None, help="again and again")
-    group.add_argument("--paused", action="store_true", default=None, help="begin when told to: shmio replay play")
-    group.add_argument("--record", action="store_true", default=None, help="start the recorder of the configuration")
-
-
-def given(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the command line's options as keys of ``[replay]``; ConfigError in other modes."""
-    found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}
-    if found and arguments.mode != "replay":
-        raise ConfigError(f"--{next(iter(found))} goes with --mode replay only")
-    if "from" in found:
-        found["file"] = [str(Path(file).absolute()) for file in found.pop("from")]
-    return {name: _moment(value) if name in ("start", "end") else value for name, value in found.items()}
-
-
-def options(keys: Mapping[str, Any]) -> list[str]:
-    """Return keys of ``[replay]`` as options for a detached supervisor's command line."""
-    words: list[str] = []
-    for name, value in keys.items():
-        if name == "file":
-            words += ["--from", *value]
-        else:
-            words += [f"--{name}"] if value is True else [f"--{name}={value}"]
-    return words
 
 
 def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) -> Replayed:
@@ -181,10 +143,3 @@ def _check_names(names: list[str], file: str) -> None:
 
 def _listed(value: str | list[str] | None) -> list[str]:
     return [value] if isinstance(value, str) else value or []
-
-
-def _moment(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text

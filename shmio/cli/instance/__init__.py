@@ -1,1 +1,1 @@
-"""Verbs of ``shmio-supervisor``, one module each, with ``execute(arguments) -> exit status``."""
+"""Verbs of ``shmio-supervisor``: functions that take the arguments and return the exit status."""

@@ -18,7 +18,7 @@ from shmio.plan.processes import Plan
 from shmio.segment import PREFIX, BlockSpec, Segment
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def check(arguments: argparse.Namespace) -> int:
     """Print what the instance would need: processes, registers and memory."""
     file = config_file(arguments)
     prepared = prepare(file)

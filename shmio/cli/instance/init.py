@@ -17,7 +17,7 @@ EXAMPLE = ("supervisor.toml", "db201.db")
 EXAMPLE_NAME = "a50"
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def init(arguments: argparse.Namespace) -> int:
     """Write the files, or none of them if one exists already."""
     file = config_file(arguments)
     _refuse_present(file)

@@ -151,7 +151,7 @@ _LINE = re.compile(
 """As shmio.logs writes it."""
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def logs(arguments: argparse.Namespace) -> int:
     """Print the last lines, and with ``-f`` new lines until Ctrl-C."""
     folder, processes = _where(arguments)
     names = [SUPERVISOR, *processes]

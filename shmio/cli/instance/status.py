@@ -1,35 +1,48 @@
-"""``shmio-supervisor status``: print the state of an instance and its processes."""
+"""``shmio-supervisor status`` and ``list``: print the state of an instance, or all instances of this host."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 
 import msgspec
 
 from shmio.cli.target import config_option, target
-from shmio.errors import NotRunningError
-from shmio.local.status import ClockStatus, InstanceStatus, ProcessStatus, SourceStatus, read_status
+from shmio.errors import ControlError, NotRunningError, SegmentError
+from shmio.local.status import (
+    ClockStatus,
+    InstanceStatus,
+    ProcessStatus,
+    SourceStatus,
+    read_status,
+    status_of,
+    supervisor_silence,
+)
 from shmio.logs import printable
 from shmio.model.clock import ClockMode
+from shmio.segment import Segment, instances
+from shmio.supervisor import control
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
+_LIST_HEADINGS = ("NAME", "STATE", "FILE", "LISTENS ON")
+WHERE_S = 2.0
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def status(arguments: argparse.Namespace) -> int:
     """Print the status; return 1 if the instance does not run."""
     try:
         wanted = target(arguments)
-        status = read_status(wanted.name, config_option(arguments), wanted.file)
+        found = read_status(wanted.name, config_option(arguments), wanted.file)
     except NotRunningError as error:
-        status = InstanceStatus(None, note=str(error))
+        found = InstanceStatus(None, note=str(error))
     if arguments.json:
-        print(msgspec.json.format(msgspec.json.encode(status), indent=2).decode())
-    elif status.running:
-        print("\n".join(map(printable, _table(status))))
+        print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+    elif found.running:
+        print("\n".join(map(printable, _table(found))))
     else:
-        print(status.note if status.instance is None else f"{status.instance}: stopped; {status.note}", file=sys.stderr)
-    return 0 if status.running else 1
+        print(found.note if found.instance is None else f"{found.instance}: stopped; {found.note}", file=sys.stderr)
+    return 0 if found.running else 1
 
 
 def _table(status: InstanceStatus) -> list[str]:
@@ -42,12 +55,14 @@ def _table(status: InstanceStatus) -> list[str]:
         lines.append(status.note)
     if status.clock and status.clock.mode != "wall":
         lines.append(clock_line(status.clock))
-    rows = [_HEADINGS, *(_row(process) for process in status.processes)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADINGS) - 1)]
-    for row in rows:
-        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
-        lines.append("  ".join([*cells, row[-1]]).rstrip())
-    return lines
+    return lines + _columns([_HEADINGS, *(_row(process) for process in status.processes)])
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows as lines with columns."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
+    padded = ([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]] for row in rows)
+    return ["  ".join(cells).rstrip() for cells in padded]
 
 
 def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
@@ -96,3 +111,61 @@ def _duration(seconds: float) -> str:
     if hours:
         return f"{hours} h {minutes} min"
     return f"{minutes} min {whole % 60} s" if minutes else f"{whole} s"
+
+
+class Listed(msgspec.Struct):
+    """An instance in the list.
+
+    ``file`` is the configuration that it was started from, and ``listen`` has addresses by process;
+    both are empty if unknown. ``note`` is a remark for the user.
+    """
+
+    name: str
+    state: str
+    file: str = ""
+    listen: dict[str, list[str]] = {}
+    note: str = ""
+
+
+def list_instances(arguments: argparse.Namespace) -> int:
+    """Print a line for each instance of this host."""
+    found = [one for name in instances() if (one := _look(name))]
+    if arguments.json:
+        print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+    elif found:
+        print("\n".join(map(printable, _list_table(found))))
+    else:
+        print("no instance is running", file=sys.stderr)
+    return 0
+
+
+def _look(name: str) -> Listed | None:
+    """Return what this user may know of an instance, or None if it has just ended."""
+    try:
+        with Segment.open(name) as segment:
+            status = status_of(segment, f"shmio-supervisor down --instance {name} stops them")
+            listed = Listed(name, status.state, str(segment.config or ""), note=status.note)
+            if segment.supervised:
+                listed.listen, listed.note = _listening(segment, listed.note)
+            return listed
+    except NotRunningError as error:
+        return Listed(name, "unknown", note=str(error)) if name in instances() else None
+    except SegmentError as error:  # of another user or version
+        return Listed(name, "unknown", note=str(error))
+
+
+def _listening(segment: Segment, note: str) -> tuple[dict[str, list[str]], str]:
+    """Return the supervisor's addresses by process, and the note, or why there are none."""
+    try:
+        answer = control.request(segment.header.control, control.Where(), WHERE_S, lambda: supervisor_silence(segment))
+        return answer.get("listen", {}), note
+    except ControlError as error:
+        return {}, note or str(error)
+
+
+def _list_table(found: list[Listed]) -> list[str]:
+    rows = [_LIST_HEADINGS]
+    for one in found:
+        listen = ", ".join(f"{process} {' '.join(addresses)}" for process, addresses in one.listen.items())
+        rows.append((one.name, one.state, one.file or "-", "; ".join(filter(None, (listen, one.note))) or "-"))
+    return _columns(rows)

@@ -1,111 +1,140 @@
-"""``shmio-supervisor up``: start an instance, in the foreground or detached.
-
-The module ``start`` starts it; a process that only waits for a detached supervisor does not import
-that module.
-"""
+"""``shmio-supervisor up``: start an instance in this process, which becomes its supervisor."""
 
 from __future__ import annotations
 
 import argparse
+import logging
 import os
-import select
-import subprocess
+import signal
 import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
-from shmio.cli.instance.start_messages import Failed, Started, StartMessage, headline
-from shmio.cli.run import ended_by_interrupt, say
-from shmio.cli.target import config_file, option_for
-from shmio.errors import ControlError
-from shmio.local.status import InstanceStatus, SourceStatus, read_status
-from shmio.plan.replay import given, options
-from shmio.supervisor.process import child_environment
+from shmio import logs
+from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage, headline, replay_keys
+from shmio.cli.run import say
+from shmio.cli.target import config_file
+from shmio.errors import ShmioError
+from shmio.logs import printable
+from shmio.plan.prepare import Prepared, peer, prepare
+from shmio.plan.processes import BROKER, Job, Plan
+from shmio.segment import State, instances
+from shmio.supervisor.main import Supervisor
+from shmio.supervisor.start import check_startable, hold_log_folder
 
-DETACH_S = 120.0
-"""The longest time that the start of a detached instance is waited for."""
 
-
-def execute(arguments: argparse.Namespace) -> int:
-    """Start the instance; return when it has stopped, or with ``--detach`` when it runs."""
-    file, keys = config_file(arguments), given(arguments)
-    if arguments.detach:
-        return _detach(file, arguments.mode, options(keys))
-    with ended_by_interrupt():
-        from shmio.cli.instance import start  # noqa: PLC0415
-
+def up(arguments: argparse.Namespace) -> int:
+    """Run an instance until it has stopped; with ``--report``, as the child of ``up --detach``."""
+    file, mode, keys = config_file(arguments), arguments.mode, replay_keys(arguments)
     if arguments.report is not None:
-        return start.detached(file, arguments.mode, keys, arguments.report)
-    return start.foreground(file, arguments.mode, keys)
+        return _detached(file, mode, keys, arguments.report)
+    return _foreground(file, mode, keys)
 
 
-def _detach(file: Path, mode: str, words: Sequence[str]) -> int:
-    command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
-    reader, writer = os.pipe()
-    with os.fdopen(reader, "rb") as answers:
-        child = subprocess.Popen(
-            [*command, "-c", str(file), "--mode", mode, "--report", str(writer), *words],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # it shares our standard error until it has its log file
-            pass_fds=(writer,),
-            env=child_environment(),
-            start_new_session=True,
-        )
-        os.close(writer)
-        try:
-            log_file, started = _await(answers.fileno())
-        except BaseException:
-            child.terminate()
-            child.wait()
-            raise
-    child.returncode = 0  # keeps Popen from warning that the child still runs
-    for line in started.history:
+def _foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
+    """Run an instance on a terminal; ``keys`` are those of ``[replay]`` from the command line."""
+    prepared = prepare(file, mode, keys)
+    plan = prepared.plan
+    for warning in plan.warnings:
+        say(warning, sys.stderr)
+    check_startable(plan)
+    left_over = plan.instance in instances()
+    say(headline(plan.instance, plan.mode, None if left_over else plan.segment_bytes, plan.log_dir))
+    for line in _processes(prepared):
         say(line)
-    status = read_status(started.instance)
-    say(headline(started.instance, mode, status.segment_bytes, Path(log_file).parent))
-    for line in started.processes:
-        say(line)
-    _tell_how(status, option_for(file))
+    say("Ctrl-C stops it, and so does closing the terminal")
+    console = logging.StreamHandler(sys.stderr)
+    console.setFormatter(_Console())
+    with hold_log_folder(plan.log_dir, plan.instance):
+        logs.setup(_log_file(plan), "supervisor")
+        logging.getLogger("shmio.supervisor").addHandler(console)
+        Supervisor(plan, replan=_replan(plan, keys)).run()
     return 0
 
 
-def _await(fd: int) -> tuple[str, Started]:
-    """Wait for the start; return the log file and the message, or raise ControlError."""
-    log_file = ""
-    for line in _lines(fd):
-        told = msgspec.json.decode(line, type=StartMessage)
-        if isinstance(told, Started):
-            return log_file, told
-        if isinstance(told, Failed):
-            raise ControlError(told.error)
-        log_file = told.log_file
-        for warning in told.warnings:
-            say(warning, sys.stderr)
-    raise ControlError(f"the supervisor died while it started; see {log_file or 'above'}")
+def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int:
+    """Run an instance detached, and send the result of the start through the descriptor ``report``."""
+    told = False
 
-
-def _lines(fd: int) -> Iterator[bytes]:
-    """Yield the lines that come through the pipe, until its end or the time-out."""
-    deadline = time.monotonic() + DETACH_S
-    received = b""
-    while True:
-        ready, _, _ = select.select([fd], [], [], max(0.0, deadline - time.monotonic()))
-        if not ready:
-            raise ControlError(f"the instance is not running after {DETACH_S:g} s and is stopped again")
-        data = os.read(fd, 65536)
-        if not data:
+    def tell(message: StartMessage) -> None:
+        nonlocal told
+        if told:
             return
-        *lines, received = (received + data).split(b"\n")
-        yield from lines
+        told = not isinstance(message, Configured)
+        with suppress(OSError):  # the waiting process gave up
+            os.write(report, msgspec.json.encode(message) + b"\n")
+        if told:
+            os.close(report)
+
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        prepared = prepare(file, mode, keys)
+        plan = prepared.plan
+        tell(Configured(printable(str(_log_file(plan))), tuple(map(printable, plan.warnings))))
+        check_startable(plan)
+
+        def on_state(state: State) -> None:
+            if state is not State.STOPPING:
+                history, processes = ([*map(printable, lines)] for lines in (supervisor.history, _processes(prepared)))
+                tell(Started(plan.instance, history, processes))
+
+        with hold_log_folder(plan.log_dir, plan.instance):
+            logs.setup(_log_file(plan), "supervisor", streams=True)
+            with _log_file(plan).open("ab") as log:
+                for stream in (sys.stdout, sys.stderr):
+                    os.dup2(log.fileno(), stream.fileno())
+            supervisor = Supervisor(plan, replan=_replan(plan, keys), on_state=on_state)
+            supervisor.run()
+    except ShmioError as error:
+        tell(Failed("\n".join(map(printable, str(error).split("\n")))))
+        return 1
+    except OSError as error:
+        tell(Failed(printable(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
+        return 1
+    tell(Failed("it was told to stop while it started"))
+    return 0
 
 
-def _tell_how(status: InstanceStatus, option: str) -> None:
-    for process in status.processes:
-        if isinstance(process, SourceStatus) and process.quality == "bad":
-            say(f"warning: source {process.name} is bad: {process.reason}", sys.stderr)
-    pid = status.supervisor.pid if status.supervisor else None
-    down = f"shmio-supervisor down {option}".rstrip()
-    say(f"{status.state}, supervisor pid {pid}; {down} stops it")
+def _log_file(plan: Plan) -> Path:
+    return plan.log_dir / "supervisor.log"
+
+
+def _replan(plan: Plan, keys: Mapping[str, Any]) -> Callable[[], Plan]:
+    """Return a function that plans the same file again, for a reload."""
+    return lambda: prepare(plan.config_file, plan.mode, keys).plan
+
+
+def _processes(prepared: Prepared) -> Iterator[str]:
+    """Yield a line about each process of the plan."""
+    jobs = prepared.plan.jobs
+    width = max((len(job.name) for job in jobs), default=0)
+    for job in sorted(jobs, key=lambda job: job.rank):
+        yield f"  {job.name:<{width}}  {job.kind:<8}  {_describe(job, prepared)}"
+    yield from prepared.notes
+
+
+def _describe(job: Job, prepared: Prepared) -> str:
+    config = job.config
+    if job.kind == "source":
+        layout = prepared.layouts[job.name]
+        source = next(source for source in prepared.config.source if source.name == job.name)
+        device = f"{source.connector} {peer(source)}".rstrip()
+        return f"{device}, {layout.name}: {layout.size} bytes every {source.period_ms:g} ms"
+    if job.kind == "emulator":
+        return f"{config['kind']} on {config['listen']}, program {config['program']}"
+    if job.kind == "recorder":
+        return f"to {config['directory']}"
+    if job.kind == "mqtt":
+        return f"{config['broker']} on {config['listen']}" if job.name == BROKER else f"under {config['prefix']}/"
+    return f"on {', '.join(job.listening)}"
+
+
+class _Console(logging.Formatter):
+    """Formats a log record as its message alone."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(record.getMessage())

@@ -76,7 +76,7 @@ sys.exit(entry.{name}())
         ("shmio", ["get", "--host", "unix:no.sock", "cell/a"], "grpc"),
         ("shmio_dump", ["info", "no.mem"], "shmio.cli.recordings.info"),
         ("shmio_supervisor", ["status", "--instance", "not-there"], "shmio.cli.instance.status"),
-        ("shmio_supervisor", ["up", "-c", "no.toml"], "shmio.cli.instance.start"),
+        ("shmio_supervisor", ["up", "-c", "no.toml"], "shmio.cli.instance.up"),
     ],
 )
 def test_ctrl_c_leaves_no_half_of_a_library(name: str, words: list[str], library: str) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from shmio.cli.instance.detach import replay_words
 from shmio.cli.supervisor import main
 from shmio.errors import ConfigError
 from shmio.plan.prepare import prepare
 from shmio.plan.processes import process_names
-from shmio.plan.replay import options
 from shmio.segment import Origin
 from tests.unit.connectors.replay.harness import BEGIN_NS, S, image, recorded
 
@@ -199,7 +199,7 @@ def test_what_cannot_be_is_named(file: Path, keys: dict[str, object], error: str
 
 def test_a_detached_supervisor_is_told_the_same() -> None:
     keys = {"file": ["/a.mem", "/b.mem"], "start": 1.5, "injections": "leave out", "loop": True}
-    assert options(keys) == ["--from", "/a.mem", "/b.mem", "--start=1.5", "--injections=leave out", "--loop"]
+    assert replay_words(keys) == ["--from", "/a.mem", "/b.mem", "--start=1.5", "--injections=leave out", "--loop"]
 
 
 def test_a_recorded_name_is_not_trusted(tmp_path: Path, instance: str) -> None:

@@ -1,0 +1,108 @@
+"""``shmio-supervisor down``, ``reload`` and ``restart``: have the running supervisor do something."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from shmio.cli.run import dumps
+from shmio.cli.target import ask, target
+from shmio.errors import FormatError, NotRunningError, UnfinishedError
+from shmio.logs import printable
+from shmio.segment import Segment, instances, stale_segment
+from shmio.supervisor import control
+from shmio.supervisor.control import remove_socket, socket_path
+
+STOP_S = 30.0
+EXIT_S = 5.0
+RELOAD_S = 90.0
+RESTART_S = 40.0
+WHERE_S = 5.0
+
+
+def down(arguments: argparse.Namespace) -> int:
+    """Ask the supervisor to stop, and wait for its end; if it is dead, remove what it left."""
+    wanted = target(arguments)
+    name = wanted.name
+    if name not in instances():
+        raise NotRunningError(f"no instance {name!r} is running: there is nothing to stop")
+    try:
+        with suppress(UnfinishedError), wanted.open() as segment:
+            if segment.supervised:
+                _stop(segment)
+                return 0
+    except FormatError as error:  # the file that it was started from is unknown
+        if wanted.file is not None:
+            raise FormatError(f"{error}; down --instance {name} clears it if its supervisor is dead") from None
+    print(f"{name}: its supervisor is dead; clearing what it left")
+    for line in stale_segment.clear(name, forget_control=lambda path: _forget(path, name)):
+        print(line)
+    return 0
+
+
+def _forget(path: str, name: str) -> None:
+    if path == socket_path(name):  # never a path from another user's segment
+        remove_socket(path)
+
+
+def _stop(segment: Segment) -> None:
+    pid = segment.supervisor[0]
+    print(f"stopping {segment.instance}, supervisor pid {pid}", flush=True)
+    pidfd = _pidfd(pid)
+    try:
+        ask(segment, control.Stop(), STOP_S)
+        if pidfd is not None:
+            select.select([pidfd], [], [], EXIT_S)
+    finally:
+        if pidfd is not None:
+            os.close(pidfd)
+    print(f"{segment.instance} is stopped")
+
+
+def _pidfd(pid: int) -> int | None:
+    """Return a descriptor that signals the supervisor's end; None in another PID namespace."""
+    with suppress(OSError):
+        return os.pidfd_open(pid)
+    return None
+
+
+def reload(arguments: argparse.Namespace) -> int:
+    """Have the configuration's changes applied; return 1 if a changed process does not run."""
+    with target(arguments).open_supervised() as segment:
+        answer = ask(segment, control.Reload(), RELOAD_S)
+    status = 1 if answer["problems"] else 0
+    if arguments.json:
+        told = {key: answer[key] for key in ("done", "kept", "warnings", "problems")}
+        print(dumps({"instance": segment.instance, **told}, indent=2))
+        return status
+    for line in answer["warnings"]:
+        print(printable(line), file=sys.stderr)
+    for line in answer["done"]:
+        print(printable(line))
+    kept = len(answer["kept"])
+    print(f"{segment.instance}: {kept} process{'es' * (kept != 1)} kept as {'they were' if kept != 1 else 'it was'}")
+    for line in answer["problems"]:
+        print(printable(line), file=sys.stderr)
+    return status
+
+
+def restart(arguments: argparse.Namespace) -> int:
+    """Have one process stopped and started; return when it runs again."""
+    with target(arguments).open_supervised() as segment:
+        ask(segment, control.Restart(arguments.name), RESTART_S)
+        print(f"{arguments.name} runs again")
+        where = ask(segment, control.Where(), WHERE_S)
+    file = Path(where["config"])
+    if _changed(file, where["read_ns"]):
+        print(f"{file} has changed since it was read; restart keeps the old configuration, reload takes the new")
+    return 0
+
+
+def _changed(file: Path, read_ns: int) -> bool:
+    with suppress(OSError):
+        return file.stat().st_mtime_ns > read_ns
+    return False

@@ -1,0 +1,164 @@
+"""``shmio-supervisor up --detach``: start an instance in a process of its own, and wait until it runs.
+
+This process only waits, and so does not import what starts an instance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from shmio.cli.run import say
+from shmio.cli.target import config_file, option_for
+from shmio.errors import ConfigError, ControlError
+from shmio.local.status import InstanceStatus, SourceStatus, read_status
+from shmio.segment import PREFIX
+from shmio.supervisor.process import child_environment
+
+DETACH_S = 120.0
+"""The longest time that the start of a detached instance is waited for."""
+_OPTIONS: Final = ("from", "start", "end", "speed", "injections")
+_FLAGS: Final = ("loop", "paused", "record")
+
+
+class Configured(msgspec.Struct, tag=True):
+    """A detached supervisor has read its configuration."""
+
+    log_file: str
+    warnings: tuple[str, ...]
+
+
+class Started(msgspec.Struct, tag=True):
+    """The instance runs.
+
+    ``history`` says what an earlier supervisor left; ``processes`` has a line for each process.
+    """
+
+    instance: str
+    history: list[str]
+    processes: list[str]
+
+
+class Failed(msgspec.Struct, tag=True):
+    """The start has failed."""
+
+    error: str
+
+
+StartMessage = Configured | Started | Failed
+"""A message is a line of JSON, of printable text."""
+
+
+def detach(arguments: argparse.Namespace) -> int:
+    """Start the instance; return when it runs."""
+    file, mode = config_file(arguments), arguments.mode
+    words = replay_words(replay_keys(arguments))
+    command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb") as answers:
+        child = subprocess.Popen(
+            [*command, "-c", str(file), "--mode", mode, "--report", str(writer), *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,  # it shares our standard error until it has its log file
+            pass_fds=(writer,),
+            env=child_environment(),
+            start_new_session=True,
+        )
+        os.close(writer)
+        try:
+            log_file, started = _await(answers.fileno())
+        except BaseException:
+            child.terminate()
+            child.wait()
+            raise
+    child.returncode = 0  # keeps Popen from warning that the child still runs
+    for line in started.history:
+        say(line)
+    status = read_status(started.instance)
+    say(headline(started.instance, mode, status.segment_bytes, Path(log_file).parent))
+    for line in started.processes:
+        say(line)
+    _tell_how(status, option_for(file))
+    return 0
+
+
+def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path) -> str:
+    """Return the first line about an instance. ``segment_bytes``: None before a take-over."""
+    size = "" if segment_bytes is None else f" ({segment_bytes / 1e6:.1f} MB)"
+    return f"{instance}: mode {mode}, segment {PREFIX}{instance}{size}, logs in {log_dir}"
+
+
+def replay_keys(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the command line's options as keys of ``[replay]``; ConfigError in other modes."""
+    found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}
+    if found and arguments.mode != "replay":
+        raise ConfigError(f"--{next(iter(found))} goes with --mode replay only")
+    if "from" in found:
+        found["file"] = [str(Path(file).absolute()) for file in found.pop("from")]
+    return {name: _moment(value) if name in ("start", "end") else value for name, value in found.items()}
+
+
+def replay_words(keys: Mapping[str, Any]) -> list[str]:
+    """Return keys of ``[replay]`` as options for the detached supervisor's command line."""
+    words: list[str] = []
+    for name, value in keys.items():
+        if name == "file":
+            words += ["--from", *value]
+        else:
+            words += [f"--{name}"] if value is True else [f"--{name}={value}"]
+    return words
+
+
+def _await(fd: int) -> tuple[str, Started]:
+    """Wait for the start; return the log file and the message, or raise ControlError."""
+    log_file = ""
+    for line in _lines(fd):
+        told = msgspec.json.decode(line, type=StartMessage)
+        if isinstance(told, Started):
+            return log_file, told
+        if isinstance(told, Failed):
+            raise ControlError(told.error)
+        log_file = told.log_file
+        for warning in told.warnings:
+            say(warning, sys.stderr)
+    raise ControlError(f"the supervisor died while it started; see {log_file or 'above'}")
+
+
+def _lines(fd: int) -> Iterator[bytes]:
+    """Yield the lines that come through the pipe, until its end or the time-out."""
+    deadline = time.monotonic() + DETACH_S
+    received = b""
+    while True:
+        ready, _, _ = select.select([fd], [], [], max(0.0, deadline - time.monotonic()))
+        if not ready:
+            raise ControlError(f"the instance is not running after {DETACH_S:g} s and is stopped again")
+        data = os.read(fd, 65536)
+        if not data:
+            return
+        *lines, received = (received + data).split(b"\n")
+        yield from lines
+
+
+def _tell_how(status: InstanceStatus, option: str) -> None:
+    for process in status.processes:
+        if isinstance(process, SourceStatus) and process.quality == "bad":
+            say(f"warning: source {process.name} is bad: {process.reason}", sys.stderr)
+    pid = status.supervisor.pid if status.supervisor else None
+    down = f"shmio-supervisor down {option}".rstrip()
+    say(f"{status.state}, supervisor pid {pid}; {down} stops it")
+
+
+def _moment(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
