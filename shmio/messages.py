@@ -1,4 +1,4 @@
-"""Converts values and declared injections between Python or TOML and messages of ``shmio.v1``."""
+"""Converts values, declared injections and events between Python or TOML and messages of ``shmio.v1``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from shmio.errors import ValueRangeError
+from shmio.model.event import Event, EventKind
+from shmio.model.values import Quality
 from shmio.wire import shmio_v1_pb2 as wire
 
 _OPERATIONS: Final[Mapping[str, Mapping[str, str]]] = {
@@ -164,3 +166,65 @@ def _own(part: Any, operation: str, key: str) -> dict[str, Any]:
         elif part.HasField(field):
             own[name] = getattr(part, field)
     return own
+
+
+_KINDS: Final = {
+    number: EventKind(name.removeprefix("KIND_").lower()) for name, number in wire.Event.Kind.items() if number
+}
+_DIRECTIONS: Final = {"out": wire.DIRECTION_OUT, "in": wire.DIRECTION_IN}
+
+
+def event_to_wire(event: Event) -> wire.Event:
+    """Convert an event."""
+    found = wire.Event(
+        source=event.source,
+        kind="KIND_UNSPECIFIED" if event.kind is EventKind.OTHER else f"KIND_{event.kind.name}",
+        number=event.number,
+        frame=event.frame,
+        cycle=event.cycle,
+        incarnation=event.incarnation,
+        clock_ns=event.clock_ns,
+        utc_ns=event.utc_ns,
+        quality=f"QUALITY_{event.quality.name}",
+        text=event.text,
+        injection=event.injection,
+        command=event.command,
+        by=event.by,
+        direction=_DIRECTIONS.get(event.direction),
+        missed=event.missed,
+    )
+    for path in event.paths:
+        register = found.registers.add(path=path)
+        if path in event.values:
+            register.value.CopyFrom(_found_to_wire(event.values[path], path))
+    return found
+
+
+def event_from_wire(found: wire.Event) -> Event:
+    """Convert a message to an event."""
+    return Event(
+        found.source, _KINDS.get(found.kind, EventKind.OTHER), found.number, found.frame, found.cycle,
+        found.incarnation, found.clock_ns, found.utc_ns,
+        Quality(found.quality) if found.quality in wire.Quality.values() else Quality.BAD,
+        found.text, found.injection, found.command, found.by,
+        ("in" if found.direction == wire.DIRECTION_IN else "out") if found.HasField("direction") else "",
+        tuple(one.path for one in found.registers),
+        {one.path: _found_from_wire(one.value, one.path) for one in found.registers if one.HasField("value")},
+        found.missed,
+    )  # fmt: skip
+
+
+def _found_to_wire(value: object, path: str) -> wire.Value:
+    """Convert a value, also one that is not valid: that is a message without a value."""
+    if value is None:
+        return wire.Value()
+    if isinstance(value, list):
+        return wire.Value(list=wire.List(values=[_found_to_wire(item, path) for item in value]))
+    return value_to_wire(value, path)
+
+
+def _found_from_wire(value: wire.Value, path: str) -> object:
+    kind = value.WhichOneof("kind")
+    if kind == "list":
+        return [_found_from_wire(item, path) for item in value.list.values]
+    return None if kind is None else value_from_wire(value, path)

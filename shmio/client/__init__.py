@@ -21,10 +21,12 @@ from shmio.client.calls import Stepped, Target
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
 from shmio.client.sync.client import Client, Simulation, Steps, Subscription
+from shmio.client.sync.events import Events
 from shmio.client.sync.injection import Campaign, Shadow
 from shmio.client.table import Change, Register, Table
 from shmio.client.update import Piece, Snapshot, Update
 from shmio.model.clock import Clock
+from shmio.model.event import Event, EventKind
 from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
 from shmio.model.replay import Playing, Wish
 from shmio.model.values import Column, Outcome, OutcomeKind, Provenance, Quality
@@ -37,6 +39,9 @@ __all__ = [
     "Clock",
     "Column",
     "Declared",
+    "Event",
+    "EventKind",
+    "Events",
     "Happening",
     "Injection",
     "Lifted",

@@ -30,6 +30,7 @@ from shmio.layout.glob import choose
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
+from shmio.local.events import Events
 from shmio.local.injection import Campaign, Diversion, Shadow, as_given, by_path, lift_all, written
 from shmio.local.reading import View, reading
 from shmio.local.replays import Replays
@@ -203,6 +204,21 @@ class Attachment:
         )
         self._end_with_this(subscription)
         return subscription
+
+    def events(self, *sources: str) -> Events:
+        """Follow what happens in these sources from now on, or in all that there are: see :class:`shmio.Cell`.
+
+        Closing the iterator or the attachment ends it.
+
+        Raises:
+            PathError: There is no such source.
+            NotRunningError: The instance has stopped.
+        """
+        self._segment.require_running()
+        followed = [self.block(source) for source in dict.fromkeys(sources) or self._blocks()]
+        events = Events(self._segment, self._blocks, followed)
+        self._end_with_this(events)
+        return events
 
     def read(self, path: str) -> Reading:
         """Read a register, whatever its quality.

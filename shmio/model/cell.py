@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 if TYPE_CHECKING:
     from shmio.layout.model import Layout
     from shmio.model.clock import Clock
+    from shmio.model.event import Event
     from shmio.model.injection import Declared, Happening, Injection, Lifted
     from shmio.model.replay import Playing, Wish
     from shmio.model.values import Outcome, Provenance, Quality, Reading
@@ -103,6 +104,20 @@ class Subscription(Held, Protocol):
         """
 
 
+class Events(Held, Protocol):
+    """Events as they happen, for one thread; any thread may close it, which ends the iteration.
+
+    Those of one source come in its order. When a reload has removed all sources, the iteration waits until
+    it is closed or the instance ends.
+    """
+
+    def __iter__(self) -> Iterator[Event]:
+        """Return the object itself."""
+
+    def __next__(self) -> Event:
+        """Wait for the next event. NotRunningError: the instance has ended."""
+
+
 class Shadow(Held, Protocol):
     """An injection whose values this program gives. Closing it lifts it, unless it was laid with ``keep``."""
 
@@ -187,6 +202,13 @@ class Cell(Held, Protocol):
             every_frame: Whether to give an update for each frame, in order, and count the lost frames;
                 otherwise a slow reader gets the newest values.
             max_rate_hz: Without ``every_frame``: the most updates a second of each source; 0: no limit.
+        """
+
+    def events(self, *sources: str) -> Events:
+        """Follow what happens in these sources from now on, or in all that there are.
+
+        Events are commands and their outcomes, injections, changes of quality, notes, and starts and stops
+        of a source's process. PathError: no such source.
         """
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:

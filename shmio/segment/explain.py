@@ -14,7 +14,8 @@ from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.text import json_value, to_text
 from shmio.layout.values.write import Write, bits_of, paths_of
 from shmio.layout.values.write import apply as write_to
-from shmio.segment.events import NO_WRITER, Event, EventKind
+from shmio.model.injection import Injection
+from shmio.segment.events import EVENT_DATA_SIZE, NO_WRITER, Event, EventKind
 from shmio.segment.processes import GUEST_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096
@@ -68,12 +69,14 @@ class Explained(NamedTuple):
         direction: ``in``, ``out`` or empty.
         by: Who caused the event: grpc, mqtt or a program; empty if nobody did, or it is unknown.
         laid: Definition of an injection that starts, with the last of its events; else None.
+        partial: Whether more events of the definition follow.
     """
 
     places: tuple[Place, ...]
     direction: str
     by: str
     laid: dict[str, Any] | None
+    partial: bool = False
 
 
 class _Injection(NamedTuple):
@@ -82,15 +85,30 @@ class _Injection(NamedTuple):
 
 
 class Explainer:
-    """Explains the events of one block, in the order of the recording."""
+    """Explains the events of one block, in their order."""
 
-    def __init__(self, source: str, layout: Layout | None) -> None:
-        """Take the block's layout; None if it cannot be read, and registers stay unnamed."""
+    def __init__(self, source: str, layout: Layout | None, most: int | None = None) -> None:
+        """Begin without known injections.
+
+        Args:
+            source: Name of the source.
+            layout: The block's layout; None if it cannot be read, and registers stay unnamed.
+            most: The most registers that are named of an event; None: all.
+        """
         self._source = source
         self._layout = layout
+        self._most = most
         self._injections: dict[int, _Injection] = {}
         self._documents: dict[int, bytes] = {}
         self._under_way: dict[tuple[int, int, int], dict[int, tuple[Place, ...]]] = {}
+
+    def know(self, present: Iterable[Injection[Any]]) -> None:
+        """Take the injections that were laid before the next event."""
+        for one in present:
+            if one.number not in self._injections and len(self._injections) < MAX_REMEMBERED:
+                # Of a declared one, the event that lays it does not name the registers either.
+                places = self._over(one.ranges) if one.running is None else ()
+                self._injections[one.number] = _Injection(one.direction, places)
 
     def explain(self, event: Event) -> Explained:
         """Explain the next event."""
@@ -109,7 +127,8 @@ class Explainer:
             places = known.places
         if event.kind == EventKind.LIFTED:
             self._injections.pop(event.injection, None)
-        return Explained(places, direction, by(event.writer), laid)
+        partial = event.kind == EventKind.INJECTED and laid is None and len(event.data) == EVENT_DATA_SIZE
+        return Explained(places, direction, by(event.writer), laid, partial)
 
     def _of_command(self, event: Event) -> tuple[Place, ...]:
         """Return the places that a command writes.
@@ -157,7 +176,7 @@ class Explainer:
     def _named(self, writes: Iterable[Write]) -> tuple[Place, ...]:
         if self._layout is None:
             return ()
-        paths = paths_of(self._layout, writes)
+        paths = paths_of(self._layout, writes, self._most)
         return tuple(Place(f"{self._source}/{path}", find(self._layout, path)) for path in paths)
 
     # ---- injections --------------------------------------------------------------------------------------------------

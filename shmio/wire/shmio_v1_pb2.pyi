@@ -365,6 +365,96 @@ class Ended(_message.Message):
     direction: Direction
     def __init__(self, source: _Optional[str] = ..., reason: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ...) -> None: ...
 
+class EventsRequest(_message.Message):
+    __slots__ = ("sources",)
+    SOURCES_FIELD_NUMBER: _ClassVar[int]
+    sources: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, sources: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class EventsResponse(_message.Message):
+    __slots__ = ("sources", "events")
+    SOURCES_FIELD_NUMBER: _ClassVar[int]
+    EVENTS_FIELD_NUMBER: _ClassVar[int]
+    sources: _containers.RepeatedScalarFieldContainer[str]
+    events: _containers.RepeatedCompositeFieldContainer[Event]
+    def __init__(self, sources: _Optional[_Iterable[str]] = ..., events: _Optional[_Iterable[_Union[Event, _Mapping]]] = ...) -> None: ...
+
+class Event(_message.Message):
+    __slots__ = ("source", "kind", "number", "frame", "cycle", "incarnation", "clock_ns", "utc_ns", "quality", "text", "injection", "command", "by", "direction", "registers", "missed")
+    class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        KIND_UNSPECIFIED: _ClassVar[Event.Kind]
+        KIND_STARTED: _ClassVar[Event.Kind]
+        KIND_STOPPED: _ClassVar[Event.Kind]
+        KIND_QUALITY: _ClassVar[Event.Kind]
+        KIND_ACCEPTED: _ClassVar[Event.Kind]
+        KIND_REJECTED: _ClassVar[Event.Kind]
+        KIND_WRITTEN: _ClassVar[Event.Kind]
+        KIND_REFUSED: _ClassVar[Event.Kind]
+        KIND_EXPIRED: _ClassVar[Event.Kind]
+        KIND_UNKNOWN: _ClassVar[Event.Kind]
+        KIND_DIVERTED: _ClassVar[Event.Kind]
+        KIND_TAKEN: _ClassVar[Event.Kind]
+        KIND_INJECTED: _ClassVar[Event.Kind]
+        KIND_LIFTED: _ClassVar[Event.Kind]
+        KIND_SHADOWED: _ClassVar[Event.Kind]
+        KIND_ACTIVATED: _ClassVar[Event.Kind]
+        KIND_DEACTIVATED: _ClassVar[Event.Kind]
+        KIND_NOTED: _ClassVar[Event.Kind]
+        KIND_REMOVED: _ClassVar[Event.Kind]
+    KIND_UNSPECIFIED: Event.Kind
+    KIND_STARTED: Event.Kind
+    KIND_STOPPED: Event.Kind
+    KIND_QUALITY: Event.Kind
+    KIND_ACCEPTED: Event.Kind
+    KIND_REJECTED: Event.Kind
+    KIND_WRITTEN: Event.Kind
+    KIND_REFUSED: Event.Kind
+    KIND_EXPIRED: Event.Kind
+    KIND_UNKNOWN: Event.Kind
+    KIND_DIVERTED: Event.Kind
+    KIND_TAKEN: Event.Kind
+    KIND_INJECTED: Event.Kind
+    KIND_LIFTED: Event.Kind
+    KIND_SHADOWED: Event.Kind
+    KIND_ACTIVATED: Event.Kind
+    KIND_DEACTIVATED: Event.Kind
+    KIND_NOTED: Event.Kind
+    KIND_REMOVED: Event.Kind
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    CYCLE_FIELD_NUMBER: _ClassVar[int]
+    INCARNATION_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_NS_FIELD_NUMBER: _ClassVar[int]
+    UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    QUALITY_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    INJECTION_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    REGISTERS_FIELD_NUMBER: _ClassVar[int]
+    MISSED_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    kind: Event.Kind
+    number: int
+    frame: int
+    cycle: int
+    incarnation: int
+    clock_ns: int
+    utc_ns: int
+    quality: Quality
+    text: str
+    injection: int
+    command: int
+    by: str
+    direction: Direction
+    registers: _containers.RepeatedCompositeFieldContainer[Assignment]
+    missed: int
+    def __init__(self, source: _Optional[str] = ..., kind: _Optional[_Union[Event.Kind, str]] = ..., number: _Optional[int] = ..., frame: _Optional[int] = ..., cycle: _Optional[int] = ..., incarnation: _Optional[int] = ..., clock_ns: _Optional[int] = ..., utc_ns: _Optional[int] = ..., quality: _Optional[_Union[Quality, str]] = ..., text: _Optional[str] = ..., injection: _Optional[int] = ..., command: _Optional[int] = ..., by: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ..., registers: _Optional[_Iterable[_Union[Assignment, _Mapping]]] = ..., missed: _Optional[int] = ...) -> None: ...
+
 class Value(_message.Message):
     __slots__ = ("boolean", "integer", "unsigned", "number", "text", "list")
     BOOLEAN_FIELD_NUMBER: _ClassVar[int]

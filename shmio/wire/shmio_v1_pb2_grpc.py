@@ -54,6 +54,11 @@ class ShmioStub(object):
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SubscribeRequest.SerializeToString,
                 response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.SubscribeResponse.FromString,
                 _registered_method=True)
+        self.Events = channel.unary_stream(
+                '/shmio.v1.Shmio/Events',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.EventsRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.EventsResponse.FromString,
+                _registered_method=True)
         self.Write = channel.unary_unary(
                 '/shmio.v1.Shmio/Write',
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.WriteRequest.SerializeToString,
@@ -157,6 +162,13 @@ class ShmioServicer(object):
 
     def Subscribe(self, request, context):
         """Sends the present values, then changes, or every frame.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def Events(self, request, context):
+        """Sends events of sources from now on: commands and their outcomes, injections, quality, starts and stops, notes.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -289,6 +301,11 @@ def add_ShmioServicer_to_server(servicer, server):
                     servicer.Subscribe,
                     request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.SubscribeRequest.FromString,
                     response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SubscribeResponse.SerializeToString,
+            ),
+            'Events': grpc.unary_stream_rpc_method_handler(
+                    servicer.Events,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.EventsRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.EventsResponse.SerializeToString,
             ),
             'Write': grpc.unary_unary_rpc_method_handler(
                     servicer.Write,
@@ -474,6 +491,33 @@ class Shmio(object):
             '/shmio.v1.Shmio/Subscribe',
             shmio_dot_wire_dot_shmio__v1__pb2.SubscribeRequest.SerializeToString,
             shmio_dot_wire_dot_shmio__v1__pb2.SubscribeResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Events(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/shmio.v1.Shmio/Events',
+            shmio_dot_wire_dot_shmio__v1__pb2.EventsRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.EventsResponse.FromString,
             options,
             channel_credentials,
             insecure,

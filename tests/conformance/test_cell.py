@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
@@ -13,8 +14,9 @@ import pytest
 
 import shmio
 from shmio.errors import CommandError, NotRunningError, PathError, TimeError, ValueRangeError
+from shmio.model.event import Event, EventKind
 from shmio.model.values import OutcomeKind, Provenance, Quality
-from shmio.testing.cell import CONFIG, Cell, until
+from shmio.testing.cell import CONFIG, Cell, kill, until
 from shmio.testing.ports import reserved_port
 
 LAYOUT = Path(__file__).parents[2] / "db201.db"
@@ -144,9 +146,82 @@ def test_closing_the_cell_ends_its_subscriptions(running: Cell) -> None:
     for opens in BOTH:
         cell = opens(running)
         updates = cell.subscribe(AT)
+        events = cell.events()
         next(updates)
         cell.close()
         assert list(updates) == []
+        assert list(events) == []
+
+
+def until_kind(events: Iterator[Event], *kinds: str) -> Event:
+    """The next event of one of these kinds."""
+    return next(event for event in events if event.kind in kinds)
+
+
+def test_events_say_what_is_written_and_what_became_of_it(cell: shmio.Cell) -> None:
+    with cell.events("cell") as events:
+        cell.set({AT: 3, "Outputs/101": 4}, timeout_s=20)
+        accepted = until_kind(events, "accepted")
+        values = dict(accepted.values)
+        while (event := next(events)).kind is EventKind.ACCEPTED:
+            values |= event.values
+        assert values in ({AT: 3, "cell/Outputs/101": 4}, {"cell/Outputs/100..101": [3, 4]})
+        assert (event.kind, event.direction, event.values, event.text) == ("written", "in", {}, "")
+        assert event.paths in ((AT, "cell/Outputs/101"), ("cell/Outputs/100..101",))
+        assert (event.source, event.quality, event.missed, event.injection) == ("cell", Quality.GOOD, 0, 0)
+        assert event.command == accepted.command > 0
+        assert event.by == accepted.by
+        assert event.by in ("grpc", "program 1")
+        assert event.number > accepted.number
+        assert min(event.frame, event.cycle, event.incarnation, event.clock_ns, event.utc_ns) > 0
+    assert list(events) == []
+
+
+def test_events_say_what_injections_do(cell: shmio.Cell) -> None:
+    with cell.events() as events:
+        with cell.inject(AT, name="test") as shadow:
+            laid = until_kind(events, "injected")
+            assert (laid.injection, laid.text, laid.paths, laid.direction) == (shadow.number, "test", (AT,), "out")
+            shadow.set({AT: 9})
+            shadowed = until_kind(events, "shadowed")
+            assert (shadowed.values, shadowed.direction, shadowed.by) == ({AT: 9}, "out", laid.by)
+        lifted = until_kind(events, "lifted")
+        assert (lifted.injection, lifted.paths, lifted.direction) == (shadow.number, (AT,), "out")
+        with cell.declare([DRIFT]) as campaign:
+            found = [until_kind(events, "injected", "activated", "lifted") for _ in range(2)]
+            assert [one.kind for one in found] == [EventKind.INJECTED, EventKind.ACTIVATED]
+        found.append(until_kind(events, "lifted"))
+        number = campaign.declared[0].number
+        assert {(one.injection, one.direction) for one in found} == {(number, "out")}
+        assert found[0].text == "drift"
+
+
+def test_events_say_which_writer_it_was(cell: shmio.Cell, running: Cell) -> None:
+    with cell.events("cell") as events, shmio.attach(running.instance, writable=True) as other:
+        other.note("gripper changed")
+        noted = until_kind(events, "noted")
+        assert (noted.text, noted.by.startswith("program "), noted.paths) == ("gripper changed", True, ())
+
+
+def test_events_of_an_unknown_source_are_refused_at_once(cell: shmio.Cell) -> None:
+    with pytest.raises(PathError, match="no source 'nix'"):
+        cell.events("cell", "nix")
+
+
+def test_another_thread_may_close_events(cell: shmio.Cell) -> None:
+    events = cell.events()
+    threading.Timer(0.05, events.close).start()
+    assert list(events) == []
+
+
+def test_events_go_on_over_a_restart_of_the_sources_process(cell: shmio.Cell, running: Cell) -> None:
+    with cell.events() as events:
+        kill(running.processes()["cell"]["pid"])
+        started = until_kind(events, "started")
+        assert (started.source, started.missed) == ("cell", 0)
+        good = next(event for event in events if event.quality is Quality.GOOD)
+        assert good.incarnation == started.incarnation > 1
+    until(lambda: cell.get(AT)[0].quality is Quality.GOOD, "good values")
 
 
 def test_set_writes_and_tells_what_became_of_each_value(cell: shmio.Cell) -> None:

@@ -10,6 +10,7 @@ import grpc
 import msgspec
 
 from shmio.client import calls, injection
+from shmio.client.aio.events import Events
 from shmio.client.aio.injection import Campaign, Shadow
 from shmio.client.aio.transport import CLOSED, Channel, Duplex, Step, Stream, outputs_of, sleep
 from shmio.client.calls import Stepped, Target
@@ -142,6 +143,17 @@ class Client:
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
         )
         return Subscription(Stream(self._channel, self._subscribe, request))
+
+    async def events(self, *sources: str) -> Events:
+        """Follow what happens in these sources from now on, or in all that there are: see :class:`shmio.Cell`.
+
+        Raises:
+            PathError: There is no such source.
+            ValueRangeError: There are too many sources.
+            EndpointError: Too many clients follow events.
+            RemoteError: The endpoint cannot be reached, or does not admit this client.
+        """
+        return await Events.begin(Stream(self._channel, self._stub.Events, wire.EventsRequest(sources=sources)))
 
     async def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Write values to one source as one command, and wait for the outcomes: :meth:`write` without its options."""

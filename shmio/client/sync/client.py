@@ -14,6 +14,7 @@ from shmio.client import calls, injection
 from shmio.client.calls import Stepped, Target
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S, RETRY_S, Member, Part, Rejoining, Work, join_request
+from shmio.client.sync.events import Events
 from shmio.client.sync.injection import Campaign, Shadow
 from shmio.client.sync.transport import CLOSED, Channel, Duplex, Step, Stream, outputs_of, sleep
 from shmio.client.table import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
@@ -143,6 +144,17 @@ class Client:
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
         )
         return Subscription(Stream(self._channel, self._subscribe, request))
+
+    def events(self, *sources: str) -> Events:
+        """Follow what happens in these sources from now on, or in all that there are: see :class:`shmio.Cell`.
+
+        Raises:
+            PathError: There is no such source.
+            ValueRangeError: There are too many sources.
+            EndpointError: Too many clients follow events.
+            RemoteError: The endpoint cannot be reached, or does not admit this client.
+        """
+        return Events.begin(Stream(self._channel, self._stub.Events, wire.EventsRequest(sources=sources)))
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Write values to one source as one command, and wait for the outcomes: :meth:`write` without its options."""

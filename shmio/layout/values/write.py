@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
 from typing import NamedTuple
 
 from shmio.errors import PathError
@@ -180,8 +181,8 @@ def _fill_rows(mask: bytearray, register: Register) -> None:
 # -- paths of writes -----------------------------------------------------------------------------------------
 
 
-def paths_of(layout: Layout, writes: Iterable[Write]) -> list[str]:
-    """Return the paths of the bits that writes set, in address order.
+def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -> list[str]:
+    """Return the paths of the bits that writes set, in address order; only the first ``most``.
 
     A register that is written in part is named by slices, elements, bytes or bits. A type without
     parts, such as REAL, is named as a whole. Bytes outside the block or of no register are skipped.
@@ -193,7 +194,8 @@ def paths_of(layout: Layout, writes: Iterable[Write]) -> list[str]:
         for at in range(offset, stop):
             bits[at] |= mask or 0xFF
         touched.update(_overlapping(layout, offset, stop))
-    return [path for index in sorted(touched) for path in _register_paths(layout, layout.registers[index], bits)]
+    paths = (path for index in sorted(touched) for path in _register_paths(layout, layout.registers[index], bits))
+    return list(islice(paths, most))
 
 
 def path_at(layout: Layout, offset: int) -> str:

@@ -8,9 +8,9 @@ from typing import Any, Final, Self
 
 import pytest
 
-from shmio.client import Campaign, Client, Shadow, Simulation, Steps, Subscription, connect, connect_aio
+from shmio.client import Campaign, Client, Events, Shadow, Simulation, Steps, Subscription, connect, connect_aio
 
-_HELD: Final = (Campaign, Client, Shadow, Simulation, Steps, Subscription)
+_HELD: Final = (Campaign, Client, Events, Shadow, Simulation, Steps, Subscription)
 _AT_ONCE: Final = {"subscribe", "steps"} | {"close"}
 """Methods that the asynchronous client does not await either; close: of all but those that follow."""
 _CLOSE_WAITS: Final = (Campaign, Client, Shadow)

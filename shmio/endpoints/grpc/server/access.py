@@ -35,7 +35,7 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
         INJECT: "Inject",
     },
     "shmio.v1.Shmio": {
-        READ: "GetLayouts GetStatus Read Subscribe ListInjections WatchClock",
+        READ: "GetLayouts GetStatus Read Subscribe Events ListInjections WatchClock",
         WRITE: "Write Simulate",
         INJECT: "Inject Declare Lift LiftAll",
         CONTROL: "Step Steps SetStepSize Play Pause Release Replay",

@@ -13,6 +13,7 @@ from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1 import describe
 from shmio.endpoints.grpc.shmio_v1.clock import TimeCalls
 from shmio.endpoints.grpc.shmio_v1.commands import CommandCalls
+from shmio.endpoints.grpc.shmio_v1.events import EventCalls
 from shmio.endpoints.grpc.shmio_v1.replay import ReplayCalls
 from shmio.endpoints.grpc.shmio_v1.selection import Selections
 from shmio.endpoints.grpc.shmio_v1.simulate import SimulateCalls
@@ -60,6 +61,7 @@ class ShmioV1:
         self._command_calls = CommandCalls(topics, feeds, self._selections, self._wake_ups)
         self._simulate_calls = SimulateCalls(feeds, segment)
         self._replay_calls = ReplayCalls(segment)
+        self._event_calls = EventCalls(feeds, wake_ups, segment)
         self._open: set[SubscribeCall] = set()
         self._ended_updates = 0
 
@@ -84,7 +86,13 @@ class ShmioV1:
             "Read": unary(self.read, wire.ReadRequest.FromString),
             "Subscribe": streaming(self.subscribe, wire.SubscribeRequest.FromString),
         }
-        for part in (self._command_calls, self._simulate_calls, self._time_calls, self._replay_calls):
+        for part in (
+            self._command_calls,
+            self._event_calls,
+            self._simulate_calls,
+            self._time_calls,
+            self._replay_calls,
+        ):
             calls |= part.handlers()
         return calls
 
@@ -162,6 +170,7 @@ class ShmioV1:
     def move(self, sources: Collection[str]) -> None:
         """Switch the streams of these sources to their present blocks, after a reload."""
         self._simulate_calls.move()
+        self._event_calls.move(sources)
         for subscription in self._open:
             subscription.move(sources)
 

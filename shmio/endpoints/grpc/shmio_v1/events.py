@@ -1,0 +1,309 @@
+"""The call Events: what happens in sources, explained once for all clients."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Collection, Mapping, Sequence
+from typing import Any, Final
+
+import grpc
+
+from shmio.endpoints.grpc.server.error_status import Context, refuse
+from shmio.endpoints.grpc.streams.encoding import field, number
+from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.wakeups import BatchReader, Callback, WakeUps
+from shmio.errors import EndpointError, PathError, ShmioError, ValueRangeError
+from shmio.layout.topic import shorten
+from shmio.local.events import EventReader
+from shmio.messages import event_to_wire
+from shmio.model.event import Event
+from shmio.segment import Block, Segment
+from shmio.segment.events import EVENT_SLOTS
+from shmio.wire import shmio_v1_pb2 as wire
+
+MAX_CALLS: Final = 256
+"""Bound of the open calls of Events."""
+MAX_SOURCES: Final = 256
+BATCH_EVENTS: Final = 32
+"""Events that are explained before the event loop serves the streams."""
+BATCH_S: Final = 0.005
+"""Time after which no further event of a batch is explained: an event may be about thousands of registers."""
+LOG_BYTES: Final = 8 << 20
+"""Bound of the size of a block's events that wait for clients; their number is that of the ring."""
+MESSAGE_BYTES: Final = 1 << 18
+"""Size up to which the events of all sources are sent in one message."""
+
+_SOURCES, _EVENTS = (wire.EventsResponse.DESCRIPTOR.fields_by_name[name].number for name in ("sources", "events"))
+_MISSED: Final = wire.Event.DESCRIPTOR.fields_by_name["missed"].number
+
+
+class EventLog:
+    """The latest events of one block as messages, for all calls that follow the block.
+
+    A call that is slower than the log is long loses the oldest events. For the event loop's thread.
+    """
+
+    def __init__(self, block: Block, wake_ups: WakeUps, after: int) -> None:
+        """Begin behind event ``after``."""
+        self.block = block
+        self.began = after
+        self.reader = EventReader(block, after=after)
+        self.first = 0
+        """Place of the oldest entry: how many have been dropped."""
+        self.missed = 0
+        """Events that were overwritten in the ring before they could be read."""
+        self.listeners: dict[Callback, None] = {}  # in the order in which they came
+        self._entries: deque[tuple[int, int, bytes]] = deque()  # number of the event, missed until then, message
+        self._size = 0
+        self._batches = BatchReader(block, wake_ups, self._read, patient=True)
+
+    @property
+    def end(self) -> int:
+        """Place behind the newest entry."""
+        return self.first + len(self._entries)
+
+    @property
+    def ended(self) -> bool:
+        """Whether no more entries will come."""
+        return not self._batches.alive
+
+    @property
+    def failed(self) -> bool:
+        """Whether the block can no longer be followed although it is in use."""
+        return self.ended and not self.reader.ended
+
+    def start(self) -> None:
+        """Start following the block."""
+        self._batches.start()
+        self._batches.look()
+
+    def stop(self) -> None:
+        """Stop following the block."""
+        self._batches.stop()
+
+    def entry(self, place: int) -> tuple[int, int, bytes]:
+        """Return an entry: the event's number, how many were missed until then, and the message."""
+        return self._entries[place - self.first]
+
+    def _read(self) -> bool:
+        """Read a few events; return whether more are waiting."""
+        before, followed = self.end, False
+        try:
+            self._read_batch()
+            followed = not self.reader.ended
+        finally:
+            if not followed:  # also after an error, which the caller reports
+                self.stop()
+            if self.end != before or not followed:
+                for wake in tuple(self.listeners):
+                    wake()
+        return self.reader.behind
+
+    def _read_batch(self) -> None:
+        until_s = time.monotonic() + BATCH_S
+        for _ in range(BATCH_EVENTS):
+            event = self.reader.next()
+            if event is None:
+                return
+            self._add(event)
+            if time.monotonic() > until_s:
+                return
+
+    def _add(self, event: Event) -> None:
+        found = event_to_wire(event)
+        found.ClearField("missed")  # each call has its own
+        message = found.SerializeToString()
+        self.missed += event.missed
+        self._entries.append((event.number, self.missed, message))
+        self._size += len(message)
+        while len(self._entries) > EVENT_SLOTS or self._size > LOG_BYTES:
+            self._size -= len(self._entries.popleft()[2])
+            self.first += 1
+
+
+class EventLogs:
+    """The logs of all blocks that calls follow."""
+
+    def __init__(self, wake_ups: WakeUps) -> None:
+        self._wake_ups = wake_ups
+        self._logs: dict[int, EventLog] = {}  # by the block's section
+
+    def join(self, block: Block, wake: Callback, *, after: int) -> EventLog:
+        """Return the log of a block; the first call to join starts it behind event ``after``.
+
+        ``wake`` is called when there are new events, and when the log ends.
+        """
+        log = self._logs.get(block.section)
+        if log is None:
+            log = self._logs[block.section] = EventLog(block, self._wake_ups, after)
+            log.start()
+        log.listeners[wake] = None
+        return log
+
+    def leave(self, log: EventLog, wake: Callback) -> None:
+        """Leave a log; it ends with its last call."""
+        log.listeners.pop(wake, None)
+        if not log.listeners:
+            log.stop()
+            self._logs.pop(log.block.section, None)
+
+
+class _Place:
+    """How far a call has read a block's log."""
+
+    def __init__(self, log: EventLog, after: int, missed: int = 0) -> None:
+        """Begin behind event ``after``. ``missed``: the events that were lost before that."""
+        self.log = log
+        self.missed = missed + max(0, log.began - after)
+        self._after = after
+        whole = after <= log.began
+        self._next = 0 if whole else log.end
+        self._log_missed = 0 if whole else log.missed
+
+    def next(self) -> bytes | None:
+        """Return the next serialised ``Event`` if there is one."""
+        log = self.log
+        if (dropped := log.first - self._next) > 0:
+            self.missed += dropped
+            self._next = log.first
+        while self._next < log.end:
+            event_number, log_missed, message = log.entry(self._next)
+            self._next += 1
+            if event_number <= self._after:  # the call came before the log had read it
+                self._log_missed = log_missed
+                continue
+            missed = self.missed + log_missed - self._log_missed
+            self.missed, self._log_missed = 0, log_missed
+            return message + number(_MISSED, missed) if missed else message
+        return None
+
+
+class EventsCall:
+    """An Events call: follows its sources, and collects their events."""
+
+    def __init__(self, feeds: Mapping[str, Feed], logs: EventLogs, instance: str, sources: Sequence[str]) -> None:
+        """Begin to follow. PathError: no such source; ValueRangeError: too many."""
+        if len(sources) > MAX_SOURCES:
+            raise ValueRangeError(f"{len(sources)} sources, at most {MAX_SOURCES} are allowed: none stands for all")
+        for source in sources:
+            if source not in feeds:
+                raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(feeds)}")
+        self._feeds = feeds
+        self._logs = logs
+        self._instance = instance
+        self._wake = asyncio.Event()
+        self._places: dict[str, _Place] = {}
+        self._moved: dict[str, EventLog | None] = {}
+        """The next log of each source that a reload has changed; None: the source was removed."""
+        for source in dict.fromkeys(sources) or feeds:
+            block = feeds[source].block
+            after = block.events.head()
+            self._places[source] = _Place(logs.join(block, self._wake.set, after=after), after)
+
+    def close(self) -> None:
+        """Stop following the sources."""
+        for log in (*(place.log for place in self._places.values()), *self._moved.values()):
+            if log is not None:
+                self._logs.leave(log, self._wake.set)
+        self._places.clear()
+        self._moved.clear()
+
+    def move(self, sources: Collection[str]) -> None:
+        """Prepare to follow the present blocks of these sources, after a reload."""
+        for source in self._places.keys() & sources:
+            feed, before = self._feeds.get(source), self._moved.get(source)
+            log = None if feed is None else self._logs.join(feed.block, self._wake.set, after=0)
+            if before is not None and before is not log:  # two reloads, and the client has not read up to the first
+                self._places[source].missed += before.end + before.missed
+                self._logs.leave(before, self._wake.set)
+            self._moved[source] = log
+        self._wake.set()
+
+    async def messages(self) -> AsyncIterator[bytes]:
+        """Yield serialised EventsResponses without end. EndpointError: a source can no longer be followed."""
+        yield b"".join(field(_SOURCES, source.encode()) for source in self._places)
+        while True:
+            self._wake.clear()  # before looking
+            if batch := self._batch():
+                yield batch
+            else:
+                await self._wake.wait()
+
+    def _batch(self) -> bytes:
+        """Return the present events up to a bound, those of the sources in turn."""
+        parts: list[bytes] = []
+        size, waiting = 0, deque(self._places)
+        while waiting and size < MESSAGE_BYTES:
+            source = waiting.popleft()
+            event = self._next(source)
+            if event is not None:
+                parts.append(field(_EVENTS, event))
+                size += len(event)
+                if source in self._places:
+                    waiting.append(source)
+        if self._places:  # another one comes first now
+            source = next(iter(self._places))
+            self._places[source] = self._places.pop(source)
+        return b"".join(parts)
+
+    def _next(self, source: str) -> bytes | None:
+        """Return the next serialised ``Event`` of a source; the last one, if a reload has removed it."""
+        place = self._places[source]
+        while (event := place.next()) is None and place.log.ended:
+            if source not in self._moved:
+                if place.log.failed:
+                    raise EndpointError(f"source {source}: its events can no longer be read; see the endpoint's log")
+                return None  # the reload is not complete yet
+            log = self._moved.pop(source)
+            self._logs.leave(place.log, self._wake.set)
+            if log is None:
+                del self._places[source]
+                removed = event_to_wire(place.log.reader.removed(self._instance))
+                removed.missed = place.missed
+                return removed.SerializeToString()
+            place = self._places[source] = _Place(log, 0, place.missed)
+        return event
+
+
+class EventCalls:
+    """The calls of Events."""
+
+    def __init__(self, feeds: Mapping[str, Feed], wake_ups: WakeUps, segment: Segment) -> None:
+        self._feeds = feeds
+        self._logs = EventLogs(wake_ups)
+        self._instance = segment.instance
+        self._open: set[EventsCall] = set()
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Return the handler of the call, by name. Events are serialised where they are read."""
+        return {"Events": grpc.unary_stream_rpc_method_handler(self.events, wire.EventsRequest.FromString)}
+
+    async def events(self, request: wire.EventsRequest, context: Context) -> AsyncIterator[bytes]:
+        """Stream the events of these sources, or of all, from now on.
+
+        Statuses:
+            NOT_FOUND: No such source.
+            INVALID_ARGUMENT: Too many sources.
+            RESOURCE_EXHAUSTED: Too many calls.
+        """
+        call = None
+        try:
+            if len(self._open) >= MAX_CALLS:
+                raise EndpointError(f"{MAX_CALLS} calls of Events are open, the maximum: one takes many sources")
+            call = EventsCall(self._feeds, self._logs, self._instance, request.sources)
+            self._open.add(call)
+            async for message in call.messages():
+                yield message
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            if call is not None:
+                self._open.discard(call)
+                call.close()
+
+    def move(self, sources: Collection[str]) -> None:
+        """Switch the streams of these sources to their present blocks, after a reload."""
+        for call in self._open:
+            call.move(sources)

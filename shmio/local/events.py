@@ -1,0 +1,120 @@
+"""Follow what happens in the sources of a local instance."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Final
+
+from shmio.local.subscription import Following
+from shmio.model.event import Event, EventKind
+from shmio.model.values import Quality
+from shmio.segment import events as segment_events
+from shmio.segment.block import Block
+from shmio.segment.segment import Segment
+
+MAX_PATHS: Final = 2048
+"""Most paths of an event: as many as a write of one event can set. An injection may cover more registers."""
+_KINDS: Final = {int(kind): EventKind(str(kind)) for kind in segment_events.EventKind}
+
+
+class EventReader:
+    """Reads a block's events in order, with their registers and values. For one thread."""
+
+    def __init__(self, block: Block, *, after: int | None = None) -> None:
+        """Begin behind event ``after`` (default: the newest one)."""
+        from shmio.segment.explain import Explainer  # noqa: PLC0415  loads numpy, which nothing else here needs
+
+        self.block = block
+        self._cursor = block.events.cursor(after=after)
+        self._explainer = Explainer(block.source, block.layout, MAX_PATHS)
+        self._explainer.know(block.standing.read())
+        self._missed = 0  # before the event that comes next
+        self._last: segment_events.Event | None = None
+
+    @property
+    def behind(self) -> bool:
+        """Whether there are events that are not read yet."""
+        return self._cursor.behind > 0
+
+    @property
+    def ended(self) -> bool:
+        """Whether a reload has retired the block, and all its events have been read."""
+        return self._cursor.ended
+
+    def next(self) -> Event | None:
+        """Return the next event if there is one, without waiting."""
+        while (event := self._cursor.poll()) is not None:
+            if missed := self._cursor.take_missed():
+                self._missed += missed
+                self._explainer.know(self.block.standing.read())
+            self._last = event
+            explained = self._explainer.explain(event)
+            if explained.partial:
+                continue  # the last of the events that define an injection stands for all
+            missed, self._missed = self._missed, 0
+            return Event(
+                self.block.source, _KINDS.get(event.kind, EventKind.OTHER), event.number, event.frame, event.cycle,
+                event.incarnation, event.clock_ns, event.utc_ns, event.quality, event.text, event.injection,
+                event.command, explained.by, explained.direction, tuple(place.path for place in explained.places),
+                {place.path: place.value for place in explained.places if place.valued}, missed,
+            )  # fmt: skip
+        return None
+
+    def removed(self, instance: str) -> Event:
+        """Return the last event of a source that a reload has removed."""
+        last, source = self._last, self.block.source
+        times = (0, 0, 0) if last is None else (last.frame, last.cycle, last.incarnation)
+        reason = f"source {source!r} was removed from instance {instance!r} by a reload"
+        return Event(
+            source,
+            EventKind.REMOVED,
+            0,
+            *times,
+            self.block.clock.read().present_ns,
+            time.time_ns(),
+            Quality.BAD,
+            reason,
+        )
+
+
+class Events(Following[Event]):
+    """The :class:`shmio.model.cell.Events` of a local instance."""
+
+    def __init__(self, segment: Segment, blocks: Callable[[], Mapping[str, Block]], followed: Iterable[Block]) -> None:
+        """Begin to follow.
+
+        Args:
+            segment: The instance's segment.
+            blocks: Returns the instance's present blocks, by source.
+            followed: The blocks to follow.
+        """
+        super().__init__(segment)
+        self._blocks = blocks
+        self._readers = [EventReader(block) for block in followed]
+        for reader in self._readers:
+            self._follow(reader.block)
+
+    def _take(self) -> Event | None:
+        for reader in list(self._readers):
+            event = reader.next()
+            if event is None and reader.ended:
+                event = self._succeed(reader)
+            if event is not None:
+                if reader in self._readers:  # the others come first now
+                    self._readers.remove(reader)
+                    self._readers.append(reader)
+                return event
+        return None
+
+    def _succeed(self, old: EventReader) -> Event | None:
+        """Follow the block that a reload has put in place of another; return the end if there is none."""
+        self._segment.require_running()
+        block = self._blocks().get(old.block.source)
+        self._leave(old.block)
+        if block is None:
+            self._readers.remove(old)
+            return old.removed(self._segment.instance)
+        new = self._readers[self._readers.index(old)] = EventReader(block, after=0)
+        self._follow(block)
+        return new.next()

@@ -1,0 +1,101 @@
+"""What happens in a source: commands and their outcomes, injections, quality, starts and stops, notes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from shmio.model.values import Quality
+
+
+class EventKind(StrEnum):
+    """Kind of an event."""
+
+    STARTED = "started"
+    """The source's process has started."""
+    STOPPED = "stopped"
+    """The source's process has stopped."""
+    QUALITY = "quality"
+    """The quality of the source's values has changed."""
+    ACCEPTED = "accepted"
+    """The source accepted an item of a command; one of the outcomes follows."""
+    REJECTED = "rejected"
+    """The source rejected the whole command before it did anything."""
+    WRITTEN = "written"
+    """The device confirmed the write."""
+    REFUSED = "refused"
+    """The device refused the write."""
+    EXPIRED = "expired"
+    """The write was not sent to the device, and will not be."""
+    UNKNOWN = "unknown"
+    """The write was sent, but no answer came."""
+    DIVERTED = "diverted"
+    """An injection took these values, which a writer or an injection further in had given."""
+    TAKEN = "taken"
+    """Injections took all of the item; nothing was left for the device."""
+    INJECTED = "injected"
+    """An injection was laid."""
+    LIFTED = "lifted"
+    """An injection was lifted."""
+    SHADOWED = "shadowed"
+    """An injection gave values, which consumers see."""
+    ACTIVATED = "activated"
+    """A declared injection became active."""
+    DEACTIVATED = "deactivated"
+    """A declared injection is no longer active."""
+    NOTED = "noted"
+    """A program added a note."""
+    REMOVED = "removed"
+    """A reload has removed the source: no more events come of it."""
+    OTHER = "other"
+    """An event of a later version of shmio."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What has happened in a source.
+
+    A write of more than 256 bytes has several events, one for each part.
+
+    Attributes:
+        source: Name of the source.
+        kind: What has happened.
+        number: Number of the event, ascending in each source until a reload replaces it; 0 with ``removed``.
+        frame: Number of the last frame before the event.
+        cycle: Cycle of the source's schedule.
+        incarnation: Number of the source's process.
+        clock_ns: The instance's clock.
+        utc_ns: UTC time.
+        quality: Quality after the event.
+        text: The reason, the note, or the name of the injection.
+        injection: Number of the injection that the event is about; 0: none.
+        command: The writer's number of the command that the event is about; 0: none.
+        by: Who caused the event: ``grpc``, ``mqtt``, or a program such as ``program 1``; empty if nobody did, or it
+            is unknown.
+        direction: ``in`` for what is written toward the device, ``out`` for what consumers see; empty if the event
+            is about no registers, or it is unknown.
+        paths: The registers, elements, slices or bits that the event is about, at most 2048.
+        values: Values by path, where the event has them: with ``accepted``, ``diverted`` and ``shadowed``. A value
+            of None stands for bytes that are not valid for their type.
+        missed: Events of the source that were lost between the event before and this one.
+    """
+
+    source: str
+    kind: EventKind
+    number: int
+    frame: int
+    cycle: int
+    incarnation: int
+    clock_ns: int
+    utc_ns: int
+    quality: Quality
+    text: str = ""
+    injection: int = 0
+    command: int = 0
+    by: str = ""
+    direction: str = ""
+    paths: tuple[str, ...] = ()
+    values: Mapping[str, Any] = field(default_factory=dict)
+    missed: int = 0
