@@ -24,6 +24,14 @@ AT: Final = "cell/Outputs/100"
 """A byte that the emulated controller leaves alone."""
 DRIFT: Final = {"name": "drift", "target": AT, "operation": "set", "value": 5}
 
+EXTRA: Final = """
+[[source]]
+name = "extra"
+connector = "memory"
+layout = "db201.db"
+period_ms = 50
+"""
+
 Opens = Callable[[Cell], shmio.Cell]
 
 
@@ -358,6 +366,33 @@ def test_there_is_nothing_to_replay(cell: shmio.Cell) -> None:
         cell.replay()
     with pytest.raises(CommandError, match="plays no recording"):
         cell.replay(paused=True)
+
+
+def test_events_go_on_over_a_reload_and_say_what_it_removes(tmp_path: Path, instance: str) -> None:
+    with started(tmp_path, instance) as running, ExitStack() as stack:
+        file = tmp_path / "supervisor.toml"
+        config = file.read_text()
+        file.write_text(config.replace("[[emulator]]", f"{EXTRA}\n[[emulator]]"))
+        running.output("shmio-supervisor", "reload")
+        cells = [stack.enter_context(opens(running)) for opens in BOTH]
+        for cell in cells:
+            until(lambda: set(cell.sources) == {"cell", "extra"}, "the new source")  # noqa: B023  called at once
+        followed = [stack.enter_context(cell.events()) for cell in cells]
+        file.write_text(config.replace("period_ms = 20", "period_ms = 40"))
+        running.output("shmio-supervisor", "reload")
+        texts = set()
+        for events in followed:
+            first = removed = None
+            while not (first and removed):
+                event = next(events)
+                assert event.missed == 0
+                if event.source == "cell" and event.number == 1:  # of the new block
+                    first = event
+                if event.kind is EventKind.REMOVED:
+                    removed = event
+            assert (first.kind, removed.source, removed.quality) == ("started", "extra", Quality.BAD)
+            texts.add(removed.text)
+        assert texts == {f"source 'extra' was removed from instance {instance!r} by a reload"}
 
 
 def test_an_instance_that_has_ended_says_so(tmp_path: Path, instance: str) -> None:
