@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from shmio.config.declaration import check_declarations
+from shmio.config.faults import named
 from shmio.config.model import Declaration, Section
 from shmio.config.read import check_text, convert, read_tables
-from shmio.config.wording import named
 from shmio.errors import ConfigError
 
 

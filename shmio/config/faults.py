@@ -1,24 +1,275 @@
-"""Collect all faults of a configuration, each with its line, within a bound."""
+"""Faults of a configuration: finds their lines, words them for its author, and collects a bounded number."""
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from tomllib import TOMLDecodeError
+from typing import Any, Final, get_args
 
-from shmio.config.lines import Lines
-from shmio.config.wording import named
+from msgspec import ValidationError
+
+from shmio.config.model import (
+    NAME_PATTERN,
+    NAME_RULE,
+    BrokerName,
+    ClockName,
+    DistributionName,
+    OperationName,
+    PayloadName,
+    ReplayedInjections,
+)
 from shmio.errors import ConfigError, LayoutError
 
+MAX_KEY: Final = 1_000
+"""Maximum characters of a key, all dotted parts together."""
+MAX_PARTS: Final = 64
+"""Maximum dotted parts of a key: the parser's time grows with their square."""
+MAX_LINE: Final = 80
+MAX_HINTED: Final = 100
+"""Longest word, in characters, for which a similar one is suggested."""
 MAX_SHOWN: Final = 1_000
 MAX_CHARACTERS: Final = 500
 """Limit for one fault, which may quote text as long as the file."""
+_TOKEN: Final = re.compile(
+    r"""\#[^\n]*|\"\"\"(?:\\.|[^\\])*?(?:\"{3,5}|\Z)|'''.*?(?:'{3,5}|\Z)|"(?:\\.|[^"\\\n])*"?|'[^'\n]*'?"""
+    r"""|\[\[|\]\]|[\[\]{}=.,\n]|[^\s"'\#\[\]{}=.,]+""",
+    re.DOTALL,
+)
 _KEY: Final = re.compile(r"[A-Za-z0-9_-]+(?:\[[0-9]+\]|\.[A-Za-z0-9_-]+)*(?=[:\s])")
 _PLACE: Final = re.compile(r"\b(source|emulator|injection)\[([0-9]+)\]")
+_QUOTES: Final = "'"
+_DOUBLE: Final = ("Cannot overwrite", "Cannot declare", "Duplicate inline table key")
+_ESCAPE: Final = ("Unescaped", "Invalid hex", "Escaped character", "Illegal character")
+_POSITION: Final = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
+_BARE: Final = re.compile(r"[^\s,=#\[\]{}\"']+")
+_TEXT: Final = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path, an address
+_WORDS: Final = {
+    "broker": BrokerName,
+    "clock": ClockName,
+    "distribution": DistributionName,
+    "injections": ReplayedInjections,
+    "operation": OperationName,
+    "payload": PayloadName,
+}
+"""Keys whose value is one of a few words."""
+_TYPES: Final = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "text",
+    "bool": "true or false",
+    "array": "a list in [ ]",
+    "object": "a table",
+}
+
+
+def too_long(text: str, most: int = MAX_KEY) -> int:
+    """Return the line of the first key with too many characters or parts, or 0."""
+    if all(len(line) <= most and line.count(".") < MAX_PARTS for line in text.split("\n")):
+        return 0
+    return Lines(text, most).too_long
+
+
+class Lines:
+    """The line of each key by its name in messages, such as ``source[0].host``.
+
+    One pass over the text finds all keys.
+    """
+
+    def __init__(self, text: str, most: int = MAX_KEY) -> None:
+        self._most = most
+        self._lines: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        self.double: tuple[str, int, int] | None = None
+        """The first duplicate key, and the lines of both occurrences."""
+        self.too_long = 0
+        """The line of the first key that is too long, where reading ends; 0 if there is none."""
+        self._read(text)
+
+    def of(self, key: str) -> int:
+        """Return the line of a key, or of the innermost table around it that is found, or 0."""
+        while key:
+            if key in self._lines:
+                return self._lines[key]
+            key = key[: max(key.rfind("."), key.rfind("["), 0)]
+        return 0
+
+    def _read(self, text: str) -> None:
+        line, counted, depth = 1, 0, 0
+        table, start, header = "", True, ""
+        parts: list[str] = []
+        length = 0
+        for match in _TOKEN.finditer(text):
+            piece = match[0]
+            if piece == "\n":
+                start = start or depth <= 0
+                parts, length = ([], 0) if depth <= 0 else (parts, length)
+                depth = max(depth, 0)
+                header = ""
+                continue
+            if piece.startswith("#"):
+                continue
+            first = piece[0]
+            if start and depth == 0 and first == "[" and not parts:
+                header, start = piece, False
+                continue
+            if (piece == "=" or (header and first == "]")) and (length > self._most or len(parts) > MAX_PARTS):
+                self.too_long = line + text.count("\n", counted, match.start())
+                return
+            if piece == "=" or (header and first == "]"):
+                if depth == 0 and parts and (start or header):
+                    line += text.count("\n", counted, match.start())
+                    counted = match.start()
+                    if header:
+                        table = self._table(parts, line, several=header == "[[")
+                    else:
+                        self._note(self._resolve(parts, table), line)
+                header, start, parts, length = "", False, [], 0
+            elif first in "[{":
+                depth += len(piece)
+                parts, length = [], 0
+            elif first in "]}":
+                depth = max(depth - len(piece), 0)
+                parts, length = [], 0
+            elif first == ",":
+                parts, length = [], 0
+            elif first != ".":
+                if length <= self._most:
+                    parts.append(_bare(piece))
+                length += len(piece) + 1
+
+    def _table(self, parts: list[str], line: int, *, several: bool) -> str:
+        if several:
+            name = self._resolve(parts[:-1], "", parts[-1])
+            count = self._counts[name] = self._counts.get(name, 0) + 1
+            table = f"{name}[{count - 1}]"
+            self._lines.setdefault(name, line)
+        else:
+            table = self._resolve(parts, "")
+        self._note(table, line)
+        return table
+
+    def _resolve(self, parts: list[str], table: str, last: str | None = None) -> str:
+        """Return the key of these parts; of several tables with one name, the last one."""
+        key = table
+        for part in parts:
+            key = f"{key}.{part}" if key else part
+            if key in self._counts:
+                key = f"{key}[{self._counts[key] - 1}]"
+        if last is None:
+            return key
+        return f"{key}.{last}" if key else last
+
+    def _note(self, key: str, line: int) -> None:
+        first = self._lines.setdefault(key, line)
+        if first != line and self.double is None:
+            self.double = key, first, line
+
+
+def _bare(token: str) -> str:
+    if token[0] in "\"'":
+        return token.strip(token[0])
+    return token
+
+
+def explain(error: ValidationError, key: str = "") -> str:
+    """Return ``key: what is wrong``; give ``key`` if the converted value is not a whole table."""
+    text, _, at = str(error).partition(" - at `$")
+    path = f"{key}{at.rstrip('`')}".lstrip(".")
+    missing = re.search(r"missing required field `([^`]*)`", text)
+    if missing:
+        return f"{path}.{missing[1]}: this key is needed".lstrip(".")
+    if repr(NAME_PATTERN) in text:
+        text = f"expected a name: {NAME_RULE}"
+    elif unknown := re.fullmatch(r"Invalid enum value ('.*')", text):
+        words = get_args(_WORDS[path.rpartition(".")[2]])
+        text = f"{unknown[1]} is unknown; valid: {', '.join(words)}{meant(unknown[1].strip(_QUOTES), words)}"
+    elif text.endswith("of length >= 1"):
+        text = "must not be empty"
+    text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)
+    text = text[:1].lower() + text[1:]
+    return f"{path}: {text}" if path else text
+
+
+def _types(match: re.Match[str]) -> str:
+    return " or ".join(_TYPES.get(name, name) for name in match[1].split(" | ") if name != "null")
+
+
+def decode(data: bytes, place: str) -> str:
+    """Return the text of a file; ``place`` names it. ConfigError unless it is UTF-8."""
+    try:
+        text = data.decode("utf-8-sig")  # some editors write a byte order mark
+    except UnicodeDecodeError as error:
+        utf16 = ", but UTF-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else f" at byte {error.start}"
+        raise ConfigError(f"{place}: not UTF-8{utf16}; save the file as UTF-8") from None
+    if "\0" in text:
+        raise ConfigError(f"{place}: zero bytes, as in UTF-16; save the file as UTF-8")
+    return text
+
+
+def near(word: str, names: Iterable[str]) -> list[str]:
+    """Return a list with the most similar name, regardless of case, or an empty list."""
+    folded = {name.lower(): name for name in names}
+    found = difflib.get_close_matches(word.lower(), folded, 1) if len(word) <= MAX_HINTED else []
+    return [folded[found[0]]] if found else []
+
+
+def hint(word: str, names: Iterable[str], otherwise: str) -> str:
+    """Return the suggestion for an unknown word; ``otherwise`` if no name is similar."""
+    return next((f"did you mean {name}?" for name in near(word, names)), otherwise)
+
+
+def meant(word: str, names: Iterable[str]) -> str:
+    """Return the suggestion to append to a message about an unknown word."""
+    return "".join(f"; did you mean {name}?" for name in near(word, names))
+
+
+def explain_toml(error: Exception, text: str) -> str:
+    """Return the parser's message with the line and, for frequent slips, the correction."""
+    if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() takes no more of them
+        return "a number in it has too many digits"
+    place = _POSITION.search(str(error))
+    if place is None:
+        return str(error)
+    lines = text.replace("\r\n", "\n").split("\n")
+    line, column = lines[int(place[1]) - 1], int(place[2]) - 1
+    shown = line.strip()[:MAX_LINE]
+    double = Lines(text).double
+    if double and str(error).startswith(_DOUBLE):
+        key, first, second = double
+        return f"{error}: {key[:MAX_LINE]} is given twice, in lines {first} and {second}; keep one of them"
+    return f"{error}: {shown}{_slip(str(error), line, column)}" if shown else str(error)
+
+
+def _slip(message: str, line: str, column: int) -> str:
+    if message.startswith("Illegal character '\\n'"):
+        return "; a quote is missing at its end"
+    if "\\" in line and message.startswith(_ESCAPE):
+        return "; in double quotes a backslash has a special meaning: write a path in single quotes, 'C:\\cell.db'"
+    word = next((word[0] for word in _BARE.finditer(line) if word.start() <= column < word.end()), "").strip("“”")
+    if message.startswith("Expected '='") or not _TEXT.fullmatch(word):
+        return ""
+    if word.lower() in ("true", "false"):
+        return f"; write {word.lower()}"
+    return f'; text is written in quotes: "{word[:MAX_LINE]}"'
+
+
+def named(message: str, tables: Mapping[str, Any]) -> str:
+    """Append the name of the source, emulator or injection that a message's key gives by number."""
+    key = re.match(r"(source|emulator|injection)\[(\d+)\](?!\.name:)", message)
+    if key is None:
+        return message
+    try:
+        name = tables[key[1]][int(key[2])]["name"]
+    except (LookupError, TypeError):
+        return message
+    return f'{message} ({key[1]} "{name}")' if isinstance(name, str) else message
 
 
 class Faults:
@@ -53,7 +304,7 @@ class Faults:
         if self.full:
             self.count += 1
             return
-        text = shortened(named(_PLACE.sub(self._place, message), self._tables))
+        text = _shortened(named(_PLACE.sub(self._place, message), self._tables))
         key = _KEY.match(text)
         line = self._lines.of(key[0]) if key else 0
         own = text.partition(":")[0]
@@ -76,7 +327,7 @@ class Faults:
 
     def warn(self, message: str) -> None:
         """Add a warning, ``key: what is odd``, which is shown after the faults."""
-        self._warnings.append(f"{self._file}: warning: {shortened(_PLACE.sub(self._place, message))}")
+        self._warnings.append(f"{self._file}: warning: {_shortened(_PLACE.sub(self._place, message))}")
 
     def _place(self, match: re.Match[str]) -> str:
         places, index = self.places.get(match[1], ()), int(match[2])
@@ -106,7 +357,7 @@ class Faults:
         raise ConfigError("\n".join([*ordered, *rest, *self._warnings]))
 
 
-def shortened(message: str) -> str:
+def _shortened(message: str) -> str:
     """Return a message, with its middle cut out if it is too long."""
     if len(message) <= MAX_CHARACTERS:
         return message

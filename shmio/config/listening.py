@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Final
 
 from shmio.config.address import UNIX, Address, UnixAddress, parse_address
+from shmio.config.faults import hint
 from shmio.config.model import ROLES, Config, Grpc, Listening, Token
 from shmio.errors import ConfigError
 
@@ -116,9 +116,8 @@ def _check_tokens(grpc: Grpc) -> None:
 def _check_roles(key: str, roles: Sequence[str]) -> None:
     for index, role in enumerate(roles):
         if role not in ROLES:
-            near = difflib.get_close_matches(role, ROLES, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(ROLES)}"
-            raise ConfigError(f"{key}.roles[{index}]: no role {role!r}; {hint}")
+            remedy = hint(role, ROLES, f"there are: {', '.join(ROLES)}")
+            raise ConfigError(f"{key}.roles[{index}]: no role {role!r}; {remedy}")
 
 
 def _check_secret(key: str, token: Token) -> None:

@@ -1,4 +1,4 @@
-"""Read a file into a checked :class:`Config`; each message names file, full key and remedy."""
+"""Read ``supervisor.toml`` into a checked :class:`Config`; each message names file, full key and remedy."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from shmio.config.declaration import declaration_faults
-from shmio.config.faults import Faults
-from shmio.config.lines import MAX_KEY, MAX_PARTS, too_long
+from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, decode, explain, explain_toml, hint, near, too_long
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
     Client,
@@ -36,14 +35,13 @@ from shmio.config.model import (
     Token,
     Trigger,
 )
-from shmio.config.mqtt.rules import check_mqtt, resolve_mqtt
-from shmio.config.properties import read_properties
-from shmio.config.wording import decode, explain, explain_toml, near
+from shmio.config.mqtt import check_mqtt, resolve_mqtt
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
 SECTION_PROCESSES = frozenset({"broker", "grpc", "mqtt", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
+MAX_PROPERTIES_BYTES = 64 << 10
 MAX_DEPTH = 64
 MAX_SECTIONS = 1_000
 """Maximum sections of one name that are checked."""
@@ -108,17 +106,17 @@ class Examined(NamedTuple):
 
 def examine(file: Path) -> Examined:
     """Read a ``supervisor.toml`` and collect all its faults; ConfigError if it cannot be parsed."""
-    text = read_text(file)
-    tables = parse(file, text)
+    text = _read_text(file)
+    tables = _parse(file, text)
     return _examine(tables, file.resolve().parent, Faults(file, tables, text))
 
 
 def read_tables(file: Path) -> dict[str, Any]:
     """Parse a TOML file without checking its keys; ConfigError."""
-    return parse(file, read_text(file))
+    return _parse(file, _read_text(file))
 
 
-def read_text(file: Path) -> str:
+def _read_text(file: Path) -> str:
     """Return a file's text; ConfigError if it is unreadable, too large, or not UTF-8."""
     try:
         with file.open("rb") as stream:
@@ -134,7 +132,7 @@ def read_text(file: Path) -> str:
     return decode(data, str(file))
 
 
-def parse(file: Path, text: str) -> dict[str, Any]:
+def _parse(file: Path, text: str) -> dict[str, Any]:
     """Parse TOML text; ConfigError if it is not TOML, or its keys or nesting are excessive."""
     if line := too_long(text):
         raise ConfigError(f"{file}:{line}: a key is longer than {MAX_KEY} characters or {MAX_PARTS} parts")
@@ -161,6 +159,40 @@ def _depth(value: Any) -> int:
             )
         level = inner
     return depth
+
+
+def read_properties(file: Path, key: str) -> dict[str, tuple[str, int]]:
+    """Read the text and line of each key of a properties file, such as ``plc.ini``.
+
+    It has lines ``key=value``. Blank lines, ``[section]`` lines and lines that begin with ``#``,
+    ``;`` or ``!`` are skipped. ``key`` is the section that names the file, for messages.
+
+    Raises:
+        ConfigError: The file cannot be read, is too large or not UTF-8, or has an invalid line or
+            a duplicate key.
+
+    """
+    place = f"{key}.properties: {file}"
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(MAX_PROPERTIES_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"{place}: {error.strerror}") from None
+    if len(data) > MAX_PROPERTIES_BYTES:
+        raise ConfigError(f"{place} is larger than {MAX_PROPERTIES_BYTES} bytes")
+    values: dict[str, tuple[str, int]] = {}
+    for number, line in enumerate(decode(data, place).splitlines(), 1):
+        stripped = line.strip()
+        if not stripped or stripped[0] in "#;!" or (stripped[0] == "[" and stripped[-1] == "]"):
+            continue
+        name, equals, value = stripped.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise ConfigError(f"{place}:{number}: expected key=value")
+        if name in values:
+            raise ConfigError(f"{place}:{number}: {name} is given twice")
+        values[name] = value.strip(), number
+    return values
 
 
 def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
@@ -340,20 +372,15 @@ def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
 def _unknown(key: str, table: str, whole: type[Section] = Config) -> str:
     known = whole if not table else _TABLES.get(re.sub(r"\[[^]]*\]", "", table))
     names = [name for name in known.__struct_fields__ if name not in _DERIVED] if known else []
-    hint = _hint(key.rpartition(".")[2], names, f"known here: {', '.join(names)}")
-    return f"{key}: unknown key; {hint}"
+    remedy = hint(key.rpartition(".")[2], names, f"known here: {', '.join(names)}")
+    return f"{key}: unknown key; {remedy}"
 
 
 def unknown_option(index: int, key: str, known: list[str]) -> str:
     """Return the message for a key of ``source[index]`` that is unknown, to the connector, too."""
     names = [*known, *(name for name in Source.__struct_fields__ if name not in _DERIVED)]
-    hint = _hint(key, names, f"the connector knows: {', '.join(known)}")
-    return f"source[{index}].{key}: unknown key; {hint}"
-
-
-def _hint(key: str, names: list[str], otherwise: str) -> str:
-    meant = near(key, names)
-    return f"did you mean {meant[0]}?" if meant else otherwise
+    remedy = hint(key, names, f"the connector knows: {', '.join(known)}")
+    return f"source[{index}].{key}: unknown key; {remedy}"
 
 
 def check_text(value: Any, key: str) -> None:

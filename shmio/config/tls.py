@@ -1,4 +1,4 @@
-"""Read and test the gRPC endpoint's PEM files: gRPC reports a bad file like a busy port."""
+"""The PEM files of ``[grpc.tls]`` and ``[mqtt.tls]``: reads and tests them, and makes TLS contexts."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import ssl
 from pathlib import Path
 from typing import NamedTuple
 
-from shmio.config.model import Tls
-from shmio.config.pem import detail, load_authority, load_pair
+from shmio.config.model import MqttTls, Tls
 from shmio.errors import ConfigError
 
 
@@ -20,23 +19,85 @@ class TlsFiles(NamedTuple):
 
 
 def read_tls(tls: Tls) -> TlsFiles:
-    """Read and test the PEM files; ConfigError names the key of an unusable file."""
+    """Read and test the gRPC endpoint's PEM files: gRPC reports a bad file like a busy port.
+
+    Raises:
+        ConfigError: A file is unusable; names its key.
+
+    """
     found = TlsFiles(
         key=_read("key", tls.key),
         certificate=_read("certificate", tls.certificate),
         client_ca=_read("client_ca", tls.client_ca) if tls.client_ca else None,
     )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    load_authority(context, tls.certificate, "grpc.tls.certificate")
+    _load_authority(context, tls.certificate, "grpc.tls.certificate")
     if tls.client_ca:
-        load_authority(context, tls.client_ca, "grpc.tls.client_ca")
+        _load_authority(context, tls.client_ca, "grpc.tls.client_ca")
     try:
-        load_pair(context, tls.certificate, tls.key, "grpc.tls")
+        _load_pair(context, tls.certificate, tls.key, "grpc.tls")
     except ssl.SSLError as error:
         other = error.reason == "KEY_VALUES_MISMATCH"
-        why = "not the key of grpc.tls.certificate" if other else f"no usable PEM private key{detail(error)}"
+        why = "not the key of grpc.tls.certificate" if other else f"no usable PEM private key{_detail(error)}"
         raise ConfigError(f"grpc.tls.key: {tls.key}: {why}") from None
     return found
+
+
+def client_context(tls: MqttTls) -> ssl.SSLContext:
+    """Return the TLS context for an external broker; ConfigError.
+
+    ``ca`` must have issued the broker's certificate, or one of the host's authorities if there is
+    no ``ca``.
+    """
+    context = ssl.create_default_context()
+    if tls.ca is not None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        _load_authority(context, tls.ca, "mqtt.tls.ca")
+    if tls.certificate is not None:
+        _identify(context, tls)
+    context.sslsocket_class = _Socket
+    return context
+
+
+def server_context(tls: MqttTls) -> ssl.SSLContext:
+    """Return the TLS context of shmio's own broker; ConfigError.
+
+    With ``ca``, clients must present a certificate issued by it.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    _identify(context, tls)
+    if tls.ca is not None:
+        _load_authority(context, tls.ca, "mqtt.tls.ca")
+        context.verify_mode = ssl.CERT_REQUIRED
+    return context
+
+
+class _Socket(ssl.SSLSocket):
+    """Closes itself when the TLS handshake fails; its creator could not close it then."""
+
+    def do_handshake(self, block: bool = False) -> None:
+        try:
+            super().do_handshake(block)
+        except OSError:
+            self.close()
+            raise
+
+
+def _identify(context: ssl.SSLContext, tls: MqttTls) -> None:
+    """Load shmio's certificate and key of ``[mqtt.tls]``."""
+    certificate, key = str(tls.certificate), str(tls.key)
+    for field, name in (("certificate", certificate), ("key", key)):
+        try:
+            with open(name, "rb"):  # noqa: PTH123  to tell which of both it is
+                pass
+        except OSError as error:
+            raise ConfigError(f"mqtt.tls.{field}: {name}: {error.strerror}") from None
+    try:
+        _load_pair(context, certificate, key, "mqtt.tls")
+    except ssl.SSLError as error:
+        raise ConfigError(
+            f"mqtt.tls: {certificate} and {key} are not a certificate and its key{_detail(error)}"
+        ) from None
 
 
 def _read(key: str, name: str) -> bytes:
@@ -44,3 +105,40 @@ def _read(key: str, name: str) -> bytes:
         return Path(name).read_bytes()
     except OSError as error:
         raise ConfigError(f"grpc.tls.{key}: {name}: {error.strerror}") from None
+
+
+def _load_pair(context: ssl.SSLContext, certificate: str, key: str, where: str) -> None:
+    """Load a certificate and its key into a context.
+
+    Raises:
+        ssl.SSLError: A file is unusable, or the key belongs to another certificate.
+        ConfigError: The key needs a passphrase; the message begins with ``where``.
+
+    """
+    try:
+        context.load_cert_chain(certificate, key, password=_refuse_to_ask)
+    except _EncryptedError:
+        raise ConfigError(f"{where}.key: {key}: needs a passphrase; use a key without one") from None
+
+
+def _load_authority(context: ssl.SSLContext, name: str, key: str) -> None:
+    """Make a context trust the authorities in a file; ConfigError begins with ``key``."""
+    try:
+        context.load_verify_locations(name)
+    except ssl.SSLError as error:
+        raise ConfigError(f"{key}: {name}: no usable PEM certificate{_detail(error)}") from None
+    except OSError as error:
+        raise ConfigError(f"{key}: {name}: {error.strerror}") from None
+
+
+class _EncryptedError(Exception):
+    pass
+
+
+def _refuse_to_ask() -> str:
+    raise _EncryptedError
+
+
+def _detail(error: ssl.SSLError) -> str:
+    """Return TLS's own reason in brackets, to append to a message, or an empty string."""
+    return f" ({error.reason})" if error.reason else ""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from shmio.config.wording import explain, meant
+from shmio.config.faults import explain, meant
 from shmio.connectors.base import Computed, Connector, Replayed
 from shmio.errors import ConfigError
 

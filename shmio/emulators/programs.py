@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from shmio.config.wording import meant
+from shmio.config.faults import meant
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
 from shmio.simulation import ModelRunner

@@ -28,8 +28,7 @@ from typing import Annotated, Final, Literal
 
 import msgspec
 
-from shmio.config.lines import MAX_PARTS, too_long
-from shmio.config.wording import explain, explain_toml
+from shmio.config.faults import MAX_PARTS, explain, explain_toml, too_long
 from shmio.errors import Diagnostic, PathError, ValueRangeError
 from shmio.layout.model import (
     MAX_BLOCK_BYTES,

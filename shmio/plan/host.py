@@ -10,11 +10,9 @@ from pathlib import Path
 
 from shmio import realtime
 from shmio.config import Config, Mqtt
+from shmio.config.credentials import read_accounts, read_password, read_tokens
 from shmio.config.folder import unwritable
-from shmio.config.mqtt.accounts import read_accounts, read_password
-from shmio.config.mqtt.tls import client_context, server_context
-from shmio.config.tls import read_tls
-from shmio.config.tokens import read_tokens
+from shmio.config.tls import client_context, read_tls, server_context
 from shmio.endpoints.mqtt.broker.program import choose_broker
 from shmio.errors import ConfigError
 

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shmio.config import Address
-from shmio.config.properties import read_properties
-from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, read_tables
+from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, read_properties, read_tables
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program
 from shmio.layout.model import Layout

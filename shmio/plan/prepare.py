@@ -11,10 +11,9 @@ import msgspec
 from msgspec.structs import replace
 
 from shmio.config import Address, Config, Emulator, Mqtt, Source
-from shmio.config.faults import Faults
-from shmio.config.mqtt.accounts import read_accounts
+from shmio.config.credentials import read_accounts
+from shmio.config.faults import Faults, meant
 from shmio.config.read import examine
-from shmio.config.wording import meant
 from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
 from shmio.layout.image import initial_value_warnings

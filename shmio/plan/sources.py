@@ -10,9 +10,8 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from shmio.config import Config, Source
-from shmio.config.faults import Faults
+from shmio.config.faults import Faults, near
 from shmio.config.read import unknown_option
-from shmio.config.wording import near
 from shmio.errors import ConfigError, RecordingError
 from shmio.layout.model import Layout
 from shmio.plan.layouts import LayoutFiles

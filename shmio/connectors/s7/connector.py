@@ -17,7 +17,7 @@ from typing import Annotated
 
 import msgspec
 
-from shmio.config.wording import meant
+from shmio.config.faults import meant
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blocks import BlockRead, BlockWrite, SizeProbe, ends, waves

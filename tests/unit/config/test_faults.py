@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from shmio.config import load
-from shmio.config.lines import Lines
+from shmio.config.faults import Lines
 from shmio.errors import ConfigError
 from shmio.plan.prepare import prepare
 

@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 import grpc
 
 from shmio.config import Address, Grpc, UnixAddress, parse_address
+from shmio.config.credentials import Secret, digest, read_tokens
 from shmio.config.listening import encrypted, takes_tokens
 from shmio.config.model import ROLES, Client
-from shmio.config.tokens import Secret, digest, read_tokens
 from shmio.endpoints.grpc.server.connections import peer_of
 from shmio.errors import ShmioError
 

@@ -13,7 +13,7 @@ import secrets
 from pathlib import Path
 from typing import Final
 
-from shmio.config.mqtt.accounts import hashed
+from shmio.config.credentials import hashed
 from shmio.errors import EndpointError
 from shmio.segment import Segment
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shmio.config import Address, Mqtt, MqttAccount
-from shmio.config.mqtt.accounts import read_accounts
+from shmio.config.credentials import read_accounts
 from shmio.endpoints.mqtt.broker.directory import BRIDGE, ID, SOCKET, new_secret, write_private
 from shmio.errors import EndpointError
 

@@ -19,8 +19,8 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from shmio.config.mqtt.accounts import read_password
-from shmio.config.mqtt.tls import client_context
+from shmio.config.credentials import read_password
+from shmio.config.tls import client_context
 from shmio.endpoints.mqtt.broker.directory import BRIDGE, secret_id, secret_of
 from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
 from shmio.endpoints.mqtt.topics import Message

@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 from shmio.backoff import Backoff
 from shmio.config import Mqtt
-from shmio.config.mqtt.rules import brokers
+from shmio.config.mqtt import brokers
 
 RECONNECT: Final = Backoff(0.25, 15.0, jitter=0.5)
 """Waits before the next attempt. Jitter: the bridges of a plant must not all reconnect at once."""

@@ -217,7 +217,7 @@ def secret(folder: Path, text: str) -> str:
 def test_a_wrong_password_is_told_and_the_right_one_heals(
     segment: Segment, make_broker: Callable[..., Mosquitto], tmp_path: Path
 ) -> None:
-    from shmio.config.mqtt.accounts import hashed
+    from shmio.config.credentials import hashed
 
     (tmp_path / "accounts").write_text(f"cell:{hashed('right')}\n")
     broker = make_broker("allow_anonymous false", f"password_file {tmp_path / 'accounts'}")

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from shmio.config import Mqtt, MqttAccount, load
-from shmio.config.mqtt.accounts import hashed, read_accounts, read_password
-from shmio.config.mqtt.rules import brokers
+from shmio.config.credentials import hashed, read_accounts, read_password
+from shmio.config.mqtt import brokers
 from shmio.errors import ConfigError
 
 OWN = '[mqtt]\nlisten = "127.0.0.1:1883"\n'

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shmio.config import Token
-from shmio.config.tokens import read_tokens
+from shmio.config.credentials import read_tokens
 from shmio.errors import ConfigError
 
 SECRET = "0123456789abcdef0123456789abcdef"

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 import pytest
 
+from shmio.config.faults import explain
 from shmio.config.model import NAME_PATTERN, NAME_RULE
-from shmio.config.wording import explain
 
 
 class Item(msgspec.Struct):
@@ -60,6 +60,6 @@ def test_the_words_of_msgspec_are_those_that_explain_reads(value: Any, words: st
     with pytest.raises(msgspec.ValidationError) as caught:
         msgspec.convert(value, Sample)
     assert str(caught.value) == words, (
-        "this msgspec words its errors differently: adapt shmio/config/wording.py, then the cap in pyproject.toml"
+        "this msgspec words its errors differently: adapt shmio/config/faults.py, then the cap in pyproject.toml"
     )
     assert explain(caught.value) == wanted

@@ -1,0 +1,182 @@
+"""Credentials: the gRPC endpoint's bearer tokens, and MQTT passwords.
+
+Their files must be accessible to their owner alone. Messages never quote a secret.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import re
+import secrets
+import stat
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from shmio.config.model import MqttAccount, Token
+from shmio.errors import ConfigError
+
+MIN_TOKEN_BYTES: Final = 20
+MAX_TOKEN_BYTES: Final = 1024
+MAX_PASSWORDS_BYTES: Final = 1 << 20
+ROUNDS: Final = 101
+"""PBKDF2 rounds, as mosquitto up to 2.0 uses; a password is checked once per connection."""
+_KEY: Final = "mqtt.password_file"
+_HASH: Final = re.compile(r"\$[0-9a-z-]{1,16}\$")
+"""Matches the beginning of a hash of any kind."""
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
+
+
+class Secret(NamedTuple):
+    """A bearer token's name, roles and SHA-256 digest; the token itself is not kept.
+
+    A random text needs no salt, and each check must be cheap.
+    """
+
+    name: str
+    roles: frozenset[str]
+    digest: bytes
+
+
+def read_tokens(tokens: Sequence[Token]) -> tuple[Secret, ...]:
+    """Read all tokens; ConfigError names the key of an invalid token and never quotes it."""
+    found: dict[bytes, Secret] = {}
+    for index, token in enumerate(tokens):
+        key = f"grpc.token[{index}]"
+        digest = bytes.fromhex(token.sha256) if token.sha256 is not None else _read_token(key, str(token.token_file))
+        if digest in found:
+            raise ConfigError(f"{key}: the same token as that of {found[digest].name!r}; give each one of its own")
+        found[digest] = Secret(token.name, frozenset(token.roles), digest)
+    return tuple(found.values())
+
+
+def digest(token: bytes) -> bytes:
+    """Return a token's SHA-256 digest."""
+    return hashlib.sha256(token).digest()
+
+
+def _read_token(key: str, name: str) -> bytes:
+    key = f"{key}.token_file: {name}"
+    text = _read_secret(key, name, MAX_TOKEN_BYTES + 3, instead="a new token").rstrip(b"\r\n")
+    if not MIN_TOKEN_BYTES <= len(text) <= MAX_TOKEN_BYTES or not all(0x21 <= byte <= 0x7E for byte in text):
+        raise ConfigError(
+            f"{key}: expected one token of {MIN_TOKEN_BYTES} to {MAX_TOKEN_BYTES} letters, digits and signs, and "
+            "nothing else: openssl rand -hex 32 makes one"
+        )
+    return digest(text)
+
+
+def read_password(name: str) -> str:
+    """Return shmio's password at an external broker: the file's first line.
+
+    Raises:
+        ConfigError: The file is unusable or its first line is empty; never quotes its contents.
+
+    """
+    password = _read_passwords(name).split("\n", 1)[0].rstrip("\r")
+    if not password:
+        raise ConfigError(f"{_KEY}: {name}: its first line, the password, is empty")
+    return password
+
+
+def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str]:
+    """Return the password hashes of the accounts of shmio's own broker, by account name.
+
+    Args:
+        name: Path of the file. Each line is ``name:password``, or ``name:hash`` as
+            mosquitto_passwd writes it.
+        roles: Accounts that must have a line.
+
+    Raises:
+        ConfigError: A line is invalid or missing; names the line and never quotes it.
+
+    """
+    accounts: dict[str, str] = {}
+    for number, line in enumerate(_read_passwords(name).splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        user, colon, secret = line.partition(":")
+        if not colon or not user.strip() or not secret:
+            raise ConfigError(f"{_KEY}: {name}: line {number}: expected name:password")
+        if user in accounts:
+            raise ConfigError(f"{_KEY}: {name}: line {number}: this name is given twice")
+        if user != user.strip() or secret != secret.strip():
+            raise ConfigError(
+                f"{_KEY}: {name}: line {number}: a blank next to the colon, or at an end, would be a part of it"
+            )
+        known = _is_hash(secret)
+        if not known and _HASH.match(secret):
+            raise ConfigError(
+                f"{_KEY}: {name}: line {number}: an unknown or damaged hash: use "
+                "mosquitto_passwd -H sha512-pbkdf2, or write the password itself"
+            )
+        accounts[user] = secret if known else hashed(secret)
+    if not accounts:
+        raise ConfigError(f"{_KEY}: {name}: it has no accounts; expected lines name:password")
+    for index, account in enumerate(roles):
+        if account.name is not None and account.name not in accounts:
+            raise ConfigError(f"mqtt.account[{index}].name: {account.name!r} has no line in {name}")
+    return accounts
+
+
+def hashed(password: str) -> str:
+    """Return a password's hash for mosquitto: PBKDF2 with SHA-512 (mosquitto-passwd(5))."""
+    salt = secrets.token_bytes(12)
+    digest = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, ROUNDS)
+    return f"$7${ROUNDS}${base64.b64encode(salt).decode()}${base64.b64encode(digest).decode()}"
+
+
+def _is_hash(secret: str) -> bool:
+    """Return whether mosquitto knows a hash: ``$7$ROUNDS$SALT$DIGEST`` or ``$6$SALT$DIGEST``."""
+    fields = secret.split("$")
+    try:
+        pbkdf2 = fields[:2] == ["", "7"] and len(fields) == 5 and 0 < int(fields[2]) <= 10_000_000
+        if not pbkdf2 and not (fields[:2] == ["", "6"] and len(fields) == 4):
+            return False
+        for part in fields[-2:]:
+            base64.b64decode(part, validate=True)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_passwords(name: str) -> str:
+    key = f"{_KEY}: {name}"
+    data = _read_secret(key, name, MAX_PASSWORDS_BYTES + 1, instead="new passwords")
+    if len(data) > MAX_PASSWORDS_BYTES:
+        raise ConfigError(f"{key}: larger than {MAX_PASSWORDS_BYTES} bytes")
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{key}: not UTF-8") from None
+
+
+def _read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes:
+    """Return the first ``most_bytes`` bytes of a secret's file.
+
+    Args:
+        key: The configuration key, with which messages begin.
+        name: Path of the file.
+        most_bytes: Maximum number of bytes to read.
+        instead: The replacement to make if others could have read the secret, for the message.
+
+    Raises:
+        ConfigError: The file cannot be read, or others may access it; never quotes its contents.
+
+    """
+    try:
+        fd = os.open(name, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # else a pipe without a writer blocks
+    except OSError as error:
+        raise ConfigError(f"{key}: {error.strerror}") from None
+    try:
+        mode = os.fstat(fd).st_mode
+        if not stat.S_ISREG(mode):
+            raise ConfigError(f"{key}: not a file")
+        if mode & _OTHERS:
+            raise ConfigError(
+                f"{key}: mode {stat.S_IMODE(mode):04o} lets other users read it: chmod 600, and {instead}"
+            )
+        return os.read(fd, most_bytes)
+    finally:
+        os.close(fd)

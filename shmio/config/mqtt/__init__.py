@@ -1,1 +1,0 @@
-"""The section ``[mqtt]`` of ``supervisor.toml``: keys, rules, TLS files and accounts."""
