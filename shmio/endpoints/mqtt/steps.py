@@ -26,7 +26,7 @@ class StepDelivery:
     """Delivers steps to the broker. Use it from the bridge's thread."""
 
     def __init__(self, clock: ClockPage, index: int, topic: str, connection: BrokerConnection, outbox: Outbox) -> None:
-        """``index``: of this process's slot."""
+        """``index``: number of this process's slot."""
         self._clock, self._index, self._topic, self._connection, self._outbox = clock, index, topic, connection, outbox
         self._delivering: StepMarker | None = None
         self._until_s = 0.0

@@ -1,6 +1,6 @@
 """Corrects what other clients publish on the bridge's topics, with growing pauses.
 
-Without them, two bridges with one prefix, or brokers that return each other's messages, would
+Without the pauses, two bridges with one prefix, or brokers that return each other's messages, would
 correct each other without end.
 """
 
@@ -17,17 +17,17 @@ from shmio.backoff import Backoff
 AT_ONCE: Final = 200
 """Topics that are corrected together."""
 PAUSE: Final = Backoff(0.1, 5.0)
-"""Pauses between corrections; they grow while others go on."""
+"""Pauses between corrections; they grow while others keep publishing on our topics."""
 CALM_PAUSES: Final = 4
-"""After so many pauses without a correction, the pause is as short as at first."""
+"""Number of pauses without a correction that resets the pause to its shortest."""
 CALM_S: Final = 60.0
-"""After this time without another, a rest is as short as at first."""
+"""Time without a rest that resets the rest to its shortest."""
 MOST_WAITING: Final = 1000
 """Maximum number of topics to correct; beyond that, everything is published again."""
 MOST_HEARD: Final = 2000
-"""Messages of others in a second that start a rest, in which none is corrected."""
+"""Messages of others in one second beyond which a rest begins, in which nothing is corrected."""
 REST: Final = Backoff(10.0, 320.0)
-"""The rests; they grow while others go on."""
+"""The rests; they grow while others keep publishing on our topics."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -56,7 +56,7 @@ class TopicGuard:
         self._waiting: dict[str, None] = {}
         self._everything = False
         self._pauses = self._rests = 0
-        """So many in a row: the next one is longer."""
+        """How many followed each other: the next one is longer."""
         self._due_s = self._until_s = self._second_s = 0.0
         self._count = 0
         self._resting = False

@@ -33,6 +33,14 @@ SAMPLE_BYTES: Final = 96
 """Approximate memory of a sample beside its value."""
 ELEMENT_BYTES: Final = 32
 """Approximate memory of a number in a list."""
+TURN_SAMPLES: Final = 2000
+"""Samples of the backlog that are sent before other work has its turn."""
+AHEAD_MS: Final = 86_400_000
+"""Maximum by which a host's clock may be ahead of ours."""
+HOST_S: Final = 10.0
+"""Time limit for a primary host to announce itself at one of several brokers."""
+
+log = logging.getLogger("shmio.mqtt")
 
 
 class DeviceBacklog(Backlog[list[Sample]]):
@@ -45,17 +53,6 @@ class DeviceBacklog(Backlog[list[Sample]]):
     def take(self, device: str) -> list[Sample]:
         """Remove and return the oldest samples of a device; empty: there are none."""
         return self.pop(device) or []
-
-
-def _size(sample: Sample) -> int:
-    register = sample.metric.register
-    return SAMPLE_BYTES + max(ELEMENT_BYTES * register.count, register.size)
-
-
-AHEAD_MS: Final = 86_400_000
-"""Maximum by which a host's clock may be ahead of ours."""
-
-log = logging.getLogger("shmio.mqtt")
 
 
 class _State(msgspec.Struct):
@@ -92,13 +89,6 @@ class PrimaryHost:
             self.online, self._at_ms = state.online, state.timestamp
 
 
-TURN_SAMPLES: Final = 2000
-"""Samples of the backlog that are sent before other work has its turn."""
-
-HOST_S: Final = 10.0
-"""Time limit for a primary host to announce itself at one of several brokers."""
-
-
 class Session:
     """The Sparkplug session of an instance. Call :meth:`turn` in each turn of the bridge's thread.
 
@@ -132,8 +122,7 @@ class Session:
         self._host_lost = False
         """Whether the host has gone since the births: even if it is back, it does not know them."""
         self._until_s = 0.0
-        """Deadline for the host to announce itself; then the next broker is tried, if there is one.
-        """
+        """Deadline for the host to announce itself; then the session tries the next broker."""
         self._elements = sparkplug.elements
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
         self._devices: dict[str, Device] = {}
@@ -146,8 +135,7 @@ class Session:
         self._room = 0
         """Number of samples of the backlog that may still be sent in this turn."""
         self._rebirth_asked = False
-        """Whether a host has asked for the births; they are sent once a turn at most, when there is
-        room."""
+        """Whether a host has asked for the births; a turn sends them at most once, if there is room."""
         self._defined = False
         """Whether the node's definition includes all current devices."""
         self._sent = self._received = self._refused = self._missed = 0
@@ -364,3 +352,8 @@ class _Outcome:
     def __call__(self, kind: EventKind, reason: str) -> None:
         if kind not in DONE:
             log.warning("Sparkplug command: %s: %s: %s", self._path, kind, reason)
+
+
+def _size(sample: Sample) -> int:
+    register = sample.metric.register
+    return SAMPLE_BYTES + max(ELEMENT_BYTES * register.count, register.size)
