@@ -20,7 +20,7 @@ import time
 import weakref
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
@@ -46,53 +46,7 @@ from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
 from shmio.segment.standing_injections import StandingInjection
 
-
-def take_guest_slot(segment: Segment) -> int:
-    """Take a free guest slot of the process table, for the life of this process.
-
-    Returns:
-        The number of the slot's command queue.
-
-    Raises:
-        SegmentError: No slot is free.
-    """
-    places = segment.processes.guests
-    for slot in places:
-        if slot.writer is not None and slot.take():
-            slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns())
-            return slot.writer
-    pids = ", ".join(str(slot.report.pid) for slot in places)
-    raise SegmentError(
-        f"instance {segment.instance!r} has places for {len(places)} writing programs; end one of pids {pids}"
-    )
-
-
-def of_one_source(what: str, paths: Collection[str], blocks: Mapping[str, Block]) -> tuple[Block, list[Topic]]:
-    """Resolve paths that must all belong to one source.
-
-    Args:
-        what: What the paths are for, such as "write"; used in messages.
-        paths: The paths.
-        blocks: The instance's blocks, by source.
-
-    Returns:
-        The source's block, and a topic for each path.
-
-    Raises:
-        PathError: The paths belong to several sources, or to none.
-    """
-    default = next(iter(blocks)) if len(blocks) == 1 else None
-    topics = [parse_topic(path, blocks, default) for path in paths]
-    for path, topic in zip(paths, topics, strict=True):
-        if topic.source not in blocks:
-            raise PathError(f"{path}: unknown source {topic.source}")
-    sources = {topic.source for topic in topics}
-    if len(sources) != 1:
-        raise PathError(f"one {what} is for one source, these are for {', '.join(sorted(sources)) or 'none'}")
-    return blocks[sources.pop()], topics
-
-
-TURN_S = 1.0
+_TURN_S: Final = 1.0
 """How often a waiting reader checks that the instance still runs, in s."""
 
 
@@ -301,13 +255,13 @@ class Attachment:
         """Wait for a frame or an event, and check in between that the instance has not stopped."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
-            rest_s = TURN_S if deadline_s is None else deadline_s - time.monotonic()
+            rest_s = _TURN_S if deadline_s is None else deadline_s - time.monotonic()
             retired = block.retired  # before looking: what was published before the end is still read
-            entry = cursor.next(min(rest_s, TURN_S))
+            entry = cursor.next(min(rest_s, _TURN_S))
             if entry is not None or retired:
                 return entry
             self._segment.require_running()
-            if rest_s < TURN_S:
+            if rest_s < _TURN_S:
                 return None
 
     def wait(
@@ -371,10 +325,7 @@ class Attachment:
             CommandError: A register is not writable, or the source's queue has no room.
                 After any of these errors nothing has been sent.
         """
-        block, topics = of_one_source("write", values, self._blocks())
-        for path, topic in zip(values, topics, strict=True):
-            if topic.direction == "out":
-                raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
+        block, topics = _of_one_source("write", values, self._blocks(), written=True)
         return self._source_writer(block).write(by_path(topics, values), timeout_s)
 
     def inject(self, *paths: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
@@ -400,7 +351,7 @@ class Attachment:
             NotRunningError: The instance has stopped.
         """
         self._segment.require_running()
-        block, topics = of_one_source("injection", paths, self._blocks())
+        block, topics = _of_one_source("injection", paths, self._blocks())
         directions = {topic.direction or "out" for topic in topics}
         if len(directions) != 1:
             raise PathError("an injection covers /out or /in, not both")
@@ -425,10 +376,7 @@ class Attachment:
             PathError: A path names nothing, or the paths belong to several sources.
             NotRunningError: The instance has stopped.
         """
-        block, topics = of_one_source("call", paths, self._blocks())
-        for path, topic in zip(paths, topics, strict=True):
-            if topic.direction == "out":
-                raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
+        block, topics = _of_one_source("call", paths, self._blocks(), written=True)
         patterns = [topic.path or "**" for topic in topics]
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
@@ -594,7 +542,7 @@ class Attachment:
             raise CommandError("this attachment only reads: attach with writable=True")
         with self._turn:
             if self._guest is None:
-                self._guest = take_guest_slot(self._segment)
+                self._guest = _take_guest_slot(self._segment)
             known = self._source_writers.get(block.source)
             if known is None or known.block is not block:
                 known = self._source_writers[block.source] = SourceWriter(block, self._guest)
@@ -631,6 +579,79 @@ class Attachment:
         self.close()
 
 
+def attach(instance: str | None = None, *, writable: bool = False) -> Attachment:
+    """Attach to a running instance on this host.
+
+    Args:
+        instance: Name of the instance; None if only one is running.
+        writable: Whether to write, inject and step, too. Only the user who runs the instance can.
+
+    Raises:
+        NotRunningError: The instance is not running, or you named none and several are running.
+        FormatError: Another version of shmio made the segment.
+        SegmentError: The segment cannot be opened, for example because you have no permission.
+    """
+    if instance is None:
+        running = running_instances()
+        if not running:
+            raise NotRunningError("no instance is running; start one with shmio-supervisor up")
+        if len(running) > 1:
+            raise NotRunningError(f"several instances are running, name one of them: {', '.join(running)}")
+        instance = running[0]
+    return Attachment(Segment.open(instance, writable=writable))
+
+
+def _take_guest_slot(segment: Segment) -> int:
+    """Take a free guest slot of the process table for as long as the segment is open.
+
+    Returns:
+        The number of the slot's command queue.
+
+    Raises:
+        SegmentError: No slot is free.
+    """
+    places = segment.processes.guests
+    for slot in places:
+        if slot.writer is not None and slot.take():
+            slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns())
+            return slot.writer
+    pids = ", ".join(str(slot.report.pid) for slot in places)
+    raise SegmentError(
+        f"instance {segment.instance!r} has places for {len(places)} writing programs; end one of pids {pids}"
+    )
+
+
+def _of_one_source(
+    what: str, paths: Collection[str], blocks: Mapping[str, Block], *, written: bool = False
+) -> tuple[Block, list[Topic]]:
+    """Resolve paths that must all belong to one source.
+
+    Args:
+        what: What the paths are for, such as "write"; used in messages.
+        paths: The paths.
+        blocks: The instance's blocks, by source.
+        written: Whether the paths are written to, so that none may end in ``/out``.
+
+    Returns:
+        The source's block, and a topic for each path.
+
+    Raises:
+        PathError: The paths belong to several sources, or to none, or one is an output.
+    """
+    default = next(iter(blocks)) if len(blocks) == 1 else None
+    topics = [parse_topic(path, blocks, default) for path in paths]
+    for path, topic in zip(paths, topics, strict=True):
+        if topic.source not in blocks:
+            raise PathError(f"{path}: unknown source {topic.source}")
+    sources = {topic.source for topic in topics}
+    if len(sources) != 1:
+        raise PathError(f"one {what} is for one source, these are for {', '.join(sorted(sources)) or 'none'}")
+    for path, topic in zip(paths, topics, strict=True):
+        if written and topic.direction == "out":
+            raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
+    return blocks[sources.pop()], topics
+
+
 def _with_source(source: str, one: StandingInjection) -> Injection[Mapping[str, Any]]:
     """Convert an injection from its segment's form to that of programs."""
     now, running = one.running, None
@@ -648,25 +669,3 @@ def _ns(dt_s: float | None) -> int | None:
         return None
     check_step(dt_s * 1e9)  # before rounding, which fails for infinity
     return round(dt_s * 1e9)
-
-
-def attach(instance: str | None = None, *, writable: bool = False) -> Attachment:
-    """Attach to a running instance on this host.
-
-    Args:
-        instance: Name of the instance; None if only one is running.
-        writable: Whether to write, inject and step, too. Only the user who runs the instance can.
-
-    Raises:
-        NotRunningError: The instance is not running, or several are and none was named.
-        FormatError: Another version of shmio made the segment.
-        SegmentError: The segment cannot be opened, for example for want of permission.
-    """
-    if instance is None:
-        running = running_instances()
-        if not running:
-            raise NotRunningError("no instance is running; start one with shmio-supervisor up")
-        if len(running) > 1:
-            raise NotRunningError(f"several instances are running, name one of them: {', '.join(running)}")
-        instance = running[0]
-    return Attachment(Segment.open(instance, writable=writable))

@@ -338,7 +338,7 @@ def _position(play: PlayState, text: str) -> int:
         position_ns = moment_ns(text, play.utc_ns + play.begin_ns) - play.utc_ns
     except ValueError:
         raise ValueRangeError(
-            f"{text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds from the begin of what is played"
+            f"{text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds from the start of the played range"
         ) from None
     if not play.begin_ns <= position_ns <= play.end_ns:
         length_s = (play.end_ns - play.begin_ns) / 1e9

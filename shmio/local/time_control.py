@@ -149,7 +149,7 @@ class Coordinator:
             self.check_release()
             if not self._owns:
                 self._take_lock(time.monotonic_ns() + round(patience_s * 1e9))
-            state = self._segment.clock.told()
+            state = self._segment.clock.last_written()
             if state.virtual:
                 # Each source reads the page before it publishes, so no frame is later than this.
                 offset_ns = state.time_ns - (time.monotonic_ns() - self._segment.header.started_ns)
@@ -233,7 +233,7 @@ class Coordinator:
         check_step(dt_ns)
         step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
         participants = self._participants()
-        stands = _unmoved_note(self._segment, participants)
+        unmoved = _unmoved_note(self._segment, participants)
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was cancelled"
         try:
@@ -241,7 +241,7 @@ class Coordinator:
             self._ring([block.source for block in participants])
             problem = yield from self._await_frames(step.number, participants, asked)
         finally:
-            note = f"step {step.number} failed: {problem}" if problem else stands
+            note = f"step {step.number} failed: {problem}" if problem else unmoved
             done = before.done if problem else step.number
             self._write(asked._replace(done=done, stepping=False, note=note))
         if not problem:
@@ -320,7 +320,7 @@ class Coordinator:
         begun_ns = time.monotonic_ns()
         waiting = list(participants)
         problems: list[str] = []
-        told = False
+        warned = False
         while waiting:
             block = waiting[0]
             seen = block.ring.doorbell()  # before looking
@@ -334,19 +334,19 @@ class Coordinator:
                 silent = [block for block in waiting if _step_answer(block, number) is None]
                 problems += [_describe_silence(self._segment, block, self._hard_ns) for block in silent]
                 return "; ".join(problems)
-            if passed_ns >= self._soft_ns and not told:
-                told = True
+            if passed_ns >= self._soft_ns and not warned:
+                warned = True
                 names = [block.source for block in waiting if _step_answer(block, number) is None]
                 note = f"step {number} waits for {', '.join(names)}"
                 log.warning(note)
                 self._write(asked._replace(note=note))
-            yield StepWait(block, seen, (self._hard_ns if told else min(self._soft_ns, self._hard_ns)) - passed_ns)
+            yield StepWait(block, seen, (self._hard_ns if warned else min(self._soft_ns, self._hard_ns)) - passed_ns)
         return "; ".join(problems)
 
     def _await_delivery(self, number: int) -> Generator[StepWait, None, str]:
         """Wait until the other processes have delivered a step; returns who has not, or an empty string."""
-        clock, begun_ns, told = self._segment.clock, time.monotonic_ns(), False
-        rung = False
+        clock, begun_ns = self._segment.clock, time.monotonic_ns()
+        rung = warned = False
         while True:
             seen = clock.delivered_bell.value()
             waiting = [slot for slot in self._segment.processes if self._owes(slot, number)]
@@ -359,8 +359,8 @@ class Coordinator:
             names = ", ".join(f"{slot.name} (pid {slot.report.pid})" for slot in waiting)
             if passed_ns >= self._hard_ns:
                 return f"not delivered within {self._hard_ns / 1e9:g} s by {names}"
-            if passed_ns >= self._soft_ns and not told:
-                told = True
+            if passed_ns >= self._soft_ns and not warned:
+                warned = True
                 log.warning("step %d waits for its delivery by %s", number, names)
             # With a time limit: a process that dies rings no bell.
             yield StepWait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
@@ -488,8 +488,8 @@ def _describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
         if slot.name == block.source:
             if slot.alive():
                 return f"{what} from pid {slot.report.pid}"
-            told = slot.supervised
-            return f"{what}: its process does not run ({told.phase}{told.note and f': {told.note}'})"
+            seen = slot.supervised
+            return f"{what}: its process does not run ({seen.phase}{seen.note and f': {seen.note}'})"
     return what
 
 

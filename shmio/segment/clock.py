@@ -103,19 +103,19 @@ class ClockPage:
         return bool(_word(self._memory, self._offset + _STEPPED_AT))
 
     def read(self) -> Clock:
-        """Return the present state. If the owner of time has died, nobody plays it.
+        """Return the present state. If the owner of time has died, ``playing`` is False.
 
         Raises:
             SegmentError: The page is corrupt.
         """
-        state = self.told()
+        state = self.last_written()
         if state.playing and not self._owned():
             state = state._replace(playing=False)
         if state.virtual:
             return state
         return state._replace(time_ns=time.monotonic_ns() - self._started_ns + state.offset_ns)
 
-    def told(self) -> Clock:
+    def last_written(self) -> Clock:
         """Return the state as last written, even if its writer is dead. SegmentError: the page is corrupt."""
         data = self._state.read(_STATE.size)
         before, state = self._last
@@ -127,7 +127,7 @@ class ClockPage:
     def write(self, state: Clock, *, ring: bool = True) -> None:
         """Write the page and ring its doorbell. Only the owner of time may.
 
-        ``ring`` is False if there is nothing to do yet for those who wait.
+        ``ring`` is False if the processes that wait have nothing to do yet.
         """
         self._state.write(_pack(state))
         if ring:

@@ -15,7 +15,7 @@ _STOP_AGAIN_S: Final = 0.01
 
 
 class Doorbell:
-    """A futex word in shared memory; ringing it wakes all who wait. Only ringing needs a writable mapping."""
+    """A futex word in shared memory; ringing it wakes all that wait. Only ringing needs a writable mapping."""
 
     def __init__(self, memory: memoryview, offset: int) -> None:
         self._memory = memory
@@ -26,7 +26,7 @@ class Doorbell:
         return _atomics.bell(self._memory, self._offset)
 
     def ring(self) -> None:
-        """Wake all who wait."""
+        """Wake all that wait."""
         _atomics.bell_ring(self._memory, self._offset)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> int:

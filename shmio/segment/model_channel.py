@@ -125,7 +125,7 @@ class ModelChannel:
         """Check the geometry. ValueError: it is inconsistent."""
         (ring_size,) = _SIZE.unpack_from(memory, offset) if size >= _RINGS_AT else (0,)
         if not 0 < ring_size <= (size - _RINGS_AT) // 2:
-            raise ValueError("the link's rings do not fit in its section")
+            raise ValueError("the model channel's rings do not fit in its section")
         self._shared = shared
         self._memory = memory
         self._offset = offset
@@ -134,7 +134,7 @@ class ModelChannel:
         self.asked = _atomics.Ring(memory, first, ring_size)
         self.answered = _atomics.Ring(memory, first + ring_size, ring_size)
         if self.asked.frame_size != self.answered.frame_size:
-            raise ValueError("the link's rings differ in size")
+            raise ValueError("the model channel's rings differ in size")
 
     @property
     def frame_size(self) -> int:
@@ -175,17 +175,17 @@ class ModelChannel:
         failed = fields[6] != Quality.GOOD
         return ModelAnswer(fields[11], fields[10] if failed else None)
 
-    # ---- the part of who writes for the model ----------------------------------------------------------------------
+    # ---- the part of the process that writes for the model ---------------------------------------------------------
 
     def join(self, name: str) -> bool:
         """Take the channel for a model; returns False if another process has it."""
         if not self._shared.try_lock(self._lock_byte):
             return False
-        self._tell(ConnectedModel(self._read().number + 1, os.getpid(), name), _COMPUTED if self.computed() else 0)
+        self._write(ConnectedModel(self._read().number + 1, os.getpid(), name), _COMPUTED if self.computed() else 0)
         self.answered.begin()
         return True
 
-    def _tell(self, joined: ConnectedModel, flags: int) -> None:
+    def _write(self, joined: ConnectedModel, flags: int) -> None:
         data = _JOINED.pack(joined.pid, flags, joined.number, cut(joined.name, MAX_NAME_BYTES))
         _atomics.cell_write(self._memory, self._offset + _JOINED_AT, data)
 
@@ -207,7 +207,7 @@ class ModelChannel:
     def answer(self, ask: ModelRequest, now_ns: int, image: bytes | bytearray, failure: str | None = None) -> None:
         """Answer a request. ``failure``: why it failed; ``now_ns``: CLOCK_MONOTONIC."""
         if failure is None and not self.computed():
-            self._tell(self._read(), _COMPUTED)
+            self._write(self._read(), _COMPUTED)
         self.answered.publish(
             image, None, ask.step, now_ns, ask.time_ns, 0, Quality.GOOD if failure is None else Quality.BAD,
             Provenance.SIMULATED, ask.number, 0, cut(failure or "", _atomics.REASON_SIZE),

@@ -197,7 +197,7 @@ class Playhead:
         self._clock = clock
         self._turn = threading.Lock()
 
-    # ---- for anybody ---------------------------------------------------------------------------------------------
+    # ---- for readers ---------------------------------------------------------------------------------------------
 
     def read(self) -> PlayState | None:
         """Return the state; None if the source has not started yet. SegmentError: it is corrupt."""
@@ -219,11 +219,11 @@ class Playhead:
 
     def came_now(self, number: int) -> bool:
         """Whether a frame was published in the present step of virtual time."""
-        play, state = self.read(), self._clock.told()
+        play, state = self.read(), self._clock.last_written()
         return play is not None and state.stepping and play.begun == state.step and number > play.head
 
     def clock_ns(self, publish_ns: int) -> int:
-        """Return the clock time of an entry that is published now with this publish time."""
+        """Return the instance's clock for an entry that is published now with this publish time."""
         play = self.read()
         return self._clock.present_ns() if play is None or not play.own_clock else publish_ns - play.base_ns
 
@@ -262,7 +262,7 @@ class Playhead:
         number, _, _, document = _ASK.unpack(data)
         return number, document
 
-    # ---- the part of who asks ------------------------------------------------------------------------------------
+    # ---- for programs that move it -------------------------------------------------------------------------------
 
     @contextmanager
     def held(self) -> Iterator[None]:

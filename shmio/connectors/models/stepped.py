@@ -237,7 +237,7 @@ class SteppedLoop:
 
     def _free_run(self) -> bool:
         """Wait for the next cycle of the schedule and compute it; return True if told to stop."""
-        state = self._page.told()
+        state = self._page.last_written()
         if state.virtual:
             return False
         if state.basis != self._basis:
@@ -255,11 +255,11 @@ class SteppedLoop:
                 wait_ns = min(wait_ns, self._output.next_ns - now_ns)
             if self._clock.wait_ns(wait_ns):
                 return True
-            if self._page.told().basis != self._basis:
+            if self._page.last_written().basis != self._basis:
                 return False
         if self._clock.wait_ns(0):
             return True
-        if self._page.told().basis != self._basis:  # read after the time: see Coordinator.take_over
+        if self._page.last_written().basis != self._basis:  # read after the time: see Coordinator.take_over
             return False
         if now_ns >= self._schedule.due_ns(due.cycle + 1):  # this thread was delayed while it waited
             self.counters.overruns += 1

@@ -124,7 +124,7 @@ def test_time_that_is_released_is_real_and_never_goes_back(instance: str) -> Non
             assert steps[0].number > number
             number = steps[-1].number
             coordinator.release()
-            state, real = segment.clock.told(), segment.clock.read()
+            state, real = segment.clock.last_written(), segment.clock.read()
             assert (state.mode, state.owner, state.note) == (ClockMode.WALL, 0, "")
             assert steps[-1].time_ns <= real.time_ns <= segment.clock.present_ns() < steps[-1].time_ns + 3_600_000 * MS
             for block in segment.blocks.values():
@@ -134,15 +134,15 @@ def test_time_that_is_released_is_real_and_never_goes_back(instance: str) -> Non
 
 def test_time_that_is_real_is_left_as_it_is_by_a_release(instance: str) -> None:
     with built(instance, spec("a"), stepped=False) as segment:
-        coordinator, before = Coordinator(segment), segment.clock.told()
+        coordinator, before = Coordinator(segment), segment.clock.last_written()
         coordinator.release()
-        assert segment.clock.told() == before
+        assert segment.clock.last_written() == before
         coordinator.take_over()
         coordinator.release()
-        before = segment.clock.told()
+        before = segment.clock.last_written()
         coordinator.release()
         coordinator.close()
-        assert segment.clock.told() == before
+        assert segment.clock.last_written() == before
 
 
 def test_time_is_released_by_its_owner_or_by_anybody_if_it_is_nobodys(instance: str) -> None:
@@ -418,7 +418,7 @@ coordinator.step()
             process.wait()
         state = segment.clock.read()
         assert (state.step, state.done, state.stepping, state.playing) == (1, 0, True, False)
-        assert segment.clock.told().playing
+        assert segment.clock.last_written().playing
         coordinator = Coordinator(segment)
         coordinator.take_over()
         state = coordinator.read()

@@ -65,7 +65,7 @@ def test_nobody_plays_time_when_its_owner_is_gone(segment: Segment, instance: st
         owner.clock.write(STATE)
         assert segment.clock.read() == STATE
     assert segment.clock.read() == STATE._replace(playing=False)
-    assert segment.clock.told() == STATE, "a successor knows that it was"
+    assert segment.clock.last_written() == STATE, "a successor knows that it was"
 
 
 def test_it_is_told_whether_time_was_stepped_from_the_start(segment: Segment, instance: str) -> None:
@@ -88,7 +88,7 @@ def test_released_time_goes_on_from_where_it_stood_for_all_who_read(segment: Seg
     real = Clock(step=12, done=11, resumed_ns=5_000_000_000, offset_ns=-7_000_000_000)
     segment.clock.write(real)
     with Segment.open(instance) as reader:
-        assert reader.clock.told() == real._replace(time_ns=5_000_000_000)
+        assert reader.clock.last_written() == real._replace(time_ns=5_000_000_000)
         before_ns = time.monotonic_ns()
         now_ns, state = reader.clock.now_ns(), reader.clock.read()
         after_ns = time.monotonic_ns()
@@ -108,7 +108,7 @@ def test_a_writer_that_died_half_way_hides_nothing(segment: Segment, copy: int) 
     at = entry.offset + copy
     odd = int.from_bytes(segment.memory[at : at + 8], "little") | 1
     segment.memory[at : at + 8] = odd.to_bytes(8, "little")
-    assert segment.clock.told() == STATE
+    assert segment.clock.last_written() == STATE
     segment.clock.write(STATE._replace(step=13))
     assert segment.clock.read().step == 13
 

@@ -165,5 +165,5 @@ def test_one_that_contradicts_itself_is_refused(segment: Segment, size: int) -> 
     entries = read_sections(segment.memory, segment.header, table_state(segment.memory)[1], "")
     (entry,) = [entry for entry in entries if entry.kind == SectionKind.LINK]
     segment.memory[entry.offset : entry.offset + 8] = struct.pack("<Q", size)
-    with pytest.raises(FormatError, match="block drive: the link's rings do not fit in its section"):
+    with pytest.raises(FormatError, match="block drive: the model channel's rings do not fit in its section"):
         Segment.open(segment.instance)

@@ -204,7 +204,7 @@ class Stepper:
         ``predecessor``: pid of the previous process of this endpoint; 0: none.
         """
         self.timeline.start()
-        state = self._segment.clock.told()
+        state = self._segment.clock.last_written()
         if state.playing and state.owner == predecessor:  # other programs' playing is not resumed
             try:
                 await self.play(state.dt_ns or None, state.rate)

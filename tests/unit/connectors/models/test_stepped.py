@@ -287,7 +287,7 @@ def test_real_time_that_is_released_goes_on_where_virtual_time_stood(instance: s
         source, coordinator, frames = Adder(), Coordinator(segment), []
 
         def free(sim: Running) -> None:
-            released = segment.clock.told()
+            released = segment.clock.last_written()
             while (frame := sim.next()).cycle < released.step + 3:
                 frames.append(frame)
             frames.append(frame)
