@@ -24,6 +24,7 @@ from shmio.layout.model import (
     Register,
     array_size,
     element_type,
+    shape_of,
 )
 from shmio.layout.topic import MAX_TOPIC, canonical_path
 
@@ -100,7 +101,7 @@ def _register(item: _Register) -> Register:
     dims: Dims = tuple(item.dims or ())
     if any(low > high for low, high in dims):
         raise LayoutError(f"layout: {item.path!r} has inverted bounds")
-    shape = tuple(high - low + 1 for low, high in dims)
+    shape = shape_of(dims)
     if item.count != math.prod(shape) or item.size != array_size(element, shape):
         raise LayoutError(f"layout: {item.path!r} has a size or count that does not fit its type")
     if (item.bit is None) != (element.base != "BOOL") or (dims and item.bit):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Dims, Register
+from shmio.layout.model import Dims, Register, flat_index, shape_of
 from shmio.layout.place import Field, Group, Leaf, Repeat
 from shmio.layout.report import Report
 from shmio.layout.source.constants import Constants
@@ -136,7 +136,7 @@ def _member_values(text: str, group: Group) -> dict[str, str]:
 
 def _element_values(text: str, dims: Dims) -> list[str | None]:
     """Return the text for each element of an array of structures; None for an element without one."""
-    shape = tuple(high - low + 1 for low, high in dims)
+    shape = shape_of(dims)
     values: list[str | None] = [None] * math.prod(shape)
     if text.strip().startswith("("):
         text = f"[{_inside_structure(text) or ''}]"
@@ -293,7 +293,7 @@ class _InitialTexts:
             self._elements.clear()
             self._parts.clear()
             return
-        self._elements[self._flat(index)] = text
+        self._elements[flat_index(self._register.dims, index)] = text
 
     def set_part(self, index: tuple[int, ...], part: str, text: str) -> bool:
         """Assign one member of a DTL; return False if the text is not a whole number."""
@@ -302,7 +302,7 @@ class _InitialTexts:
             return False
         parts = self._parts.get(index)
         if parts is None:
-            current = self._elements.get(self._flat(index)) if index else self._whole
+            current = self._elements.get(flat_index(self._register.dims, index)) if index else self._whole
             ns = calendar.parse_moment((current or "").rpartition("#")[2]) or 0
             moment = [int(field) for field in re.findall(r"[0-9]+", calendar.format_moment(ns, 9))]
             parts = dict(zip(_DTL_PARTS, [*moment[:3], 0, *moment[3:]], strict=True))
@@ -310,12 +310,6 @@ class _InitialTexts:
         self.set(index, _DTL.format(**parts))
         self._parts[index] = parts
         return True
-
-    def _flat(self, index: tuple[int, ...]) -> int:
-        flat = 0
-        for i, (low, high) in zip(index, self._register.dims, strict=True):
-            flat = flat * (high - low + 1) + i - low
-        return flat
 
     def __str__(self) -> str:
         if not self._elements:

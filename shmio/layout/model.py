@@ -162,7 +162,7 @@ class Register:
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of elements in each dimension."""
-        return tuple(high - low + 1 for low, high in self.dims)
+        return shape_of(self.dims)
 
     @property
     def element(self) -> ElementType:
@@ -235,10 +235,7 @@ class Layout:
             raise PathError(f"{register.path}: index {list(index)} is outside [{bounds}]")
         if not index:
             return register
-        flat = 0
-        for i, (low, high) in zip(index, register.dims, strict=True):
-            flat = flat * (high - low + 1) + i - low
-        byte, bit = element_position(register.element, register.shape, flat)
+        byte, bit = element_position(register.element, register.shape, flat_index(register.dims, index))
         return Register(
             path=f"{register.path}/{'/'.join(map(str, index))}",
             type=register.type,
@@ -300,6 +297,28 @@ class _Sorted:
             if at < len(self._paths) and f"{self._paths[at]}/".startswith(f"{path}/"):
                 return self._indices[at]
         return None
+
+
+def shape_of(dims: Dims) -> tuple[int, ...]:
+    """Return the number of elements in each dimension."""
+    return tuple(high - low + 1 for low, high in dims)
+
+
+def flat_index(dims: Dims, index: tuple[int, ...]) -> int:
+    """Return the place of an array element, given its declared indices; the last index runs fastest."""
+    flat = 0
+    for i, (low, high) in zip(index, dims, strict=True):
+        flat = flat * (high - low + 1) + i - low
+    return flat
+
+
+def index_at(dims: Dims, flat: int) -> tuple[int, ...]:
+    """Return the declared indices of an array element, given its place: the reverse of :func:`flat_index`."""
+    index: tuple[int, ...] = ()
+    for low, high in reversed(dims):
+        flat, place = divmod(flat, high - low + 1)
+        index = (low + place, *index)
+    return index
 
 
 def bit_positions(register: Register) -> list[tuple[int, int]]:

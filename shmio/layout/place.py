@@ -30,6 +30,7 @@ from shmio.layout.model import (
     ElementType,
     array_size,
     element_type,
+    shape_of,
     string_limit,
 )
 from shmio.layout.report import Report
@@ -58,7 +59,7 @@ class Leaf:
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of elements in each dimension."""
-        return tuple(high - low + 1 for low, high in self.dims)
+        return shape_of(self.dims)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +137,7 @@ def _extent_of(placed: Leaf | Group | Repeat) -> _Extent:
         return _Extent(placed.size, placed.element.align, cost, 0)
     if isinstance(placed, Group):
         return _Extent(placed.size, 2, Cost(structures=1).plus(placed.cost, 1, 0), placed.height)
-    group, count = placed.group, math.prod(high - low + 1 for low, high in placed.dims)
+    group, count = placed.group, math.prod(shape_of(placed.dims))
     index_text = sum(1 + max(len(str(low)), len(str(high))) for low, high in placed.dims)
     cost = Cost(elements=count, structures=count).plus(group.cost, count, index_text)
     return _Extent(count * group.size, 2, cost, group.height)

@@ -42,6 +42,7 @@ from shmio.layout.model import (
     Register,
     array_size,
     element_type,
+    shape_of,
 )
 from shmio.layout.report import Report, TooManyErrors
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
@@ -259,7 +260,7 @@ class _Placer:
             self._complain(key, f"expected at most {MAX_REGISTERS} registers, structures' members included")
             raise TooManyErrors
         element, dims = _type(tag.type)
-        shape = tuple(high - low + 1 for low, high in dims)
+        shape = shape_of(dims)
         bit = 0 if element.base == "BOOL" else None
         size, align = array_size(element, shape), _align(element)
         offset = -(-self._end // align) * align
@@ -319,7 +320,7 @@ def _type(text: str) -> tuple[ElementType, Dims]:
         if len(dims) > MAX_DIMENSIONS:
             raise ValueError(f"expected at most {MAX_DIMENSIONS} dimensions, found {len(dims)}")
         text = array[2]
-    if math.prod(high - low + 1 for low, high in dims) > MAX_ELEMENTS:
+    if math.prod(shape_of(tuple(dims))) > MAX_ELEMENTS:
         raise ValueError(f"expected at most {MAX_ELEMENTS} elements")
     element = element_type(text.strip())
     if element is None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from shmio.errors import PathError
 from shmio.layout.glob import Glob
-from shmio.layout.model import INTEGERS, ByteOrder, Layout, Register, element_position
+from shmio.layout.model import INTEGERS, ByteOrder, Layout, Register, element_position, index_at
 from shmio.layout.topic import find_each, names_part, part_of, slice_of
 from shmio.layout.values.codec import codec
 
@@ -204,7 +204,7 @@ def path_at(layout: Layout, offset: int) -> str:
         register = layout.registers[index]
         if not register.dims or register.bit is not None:
             return register.path
-        place = _index_of(register, (offset - register.offset) // register.element.stride)
+        place = index_at(register.dims, (offset - register.offset) // register.element.stride)
         return "/".join((register.path, *map(str, place)))
     return ""
 
@@ -248,20 +248,11 @@ def _touched_elements(array: Register, share: bytes) -> range:
     return range(array.count)
 
 
-def _index_of(array: Register, flat: int) -> tuple[int, ...]:
-    """Return the declared indices of an element; the last index runs fastest."""
-    index: tuple[int, ...] = ()
-    for low, high in reversed(array.dims):
-        flat, place = divmod(flat, high - low + 1)
-        index = (low + place, *index)
-    return index
-
-
 def _element_paths(layout: Layout, array: Register, share: bytes, bits: bytearray) -> Iterator[str]:
     """Yield the paths of an array's elements; neighbours within its last dimension form a slice."""
     run: list[tuple[int, ...]] = []
     for flat in _touched_elements(array, share):
-        index = _index_of(array, flat)
+        index = index_at(array.dims, flat)
         element = layout.element(array, index)
         whole = _share(element, bits) == bits_of(element)
         if run and (not whole or index[:-1] != run[-1][:-1]):

@@ -16,14 +16,14 @@ from shmio.endpoints.grpc.server.limits import time_sliced
 from shmio.endpoints.grpc.shmio_v1.clock import clock
 from shmio.endpoints.grpc.shmio_v1.columns import KINDS, DecodedImage, pack
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_ELEMENTS, MAX_REGISTERS
-from shmio.endpoints.grpc.shmio_v1.values import FIELDS, MAX_VALUES, index_of, plain
+from shmio.endpoints.grpc.shmio_v1.values import FIELDS, MAX_VALUES, plain
 from shmio.endpoints.grpc.shmio_v1.views import Selection
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.wakeups import WakeUp
 from shmio.errors import CommandError, ConflictError, PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.layout.image import initial_frame
-from shmio.layout.model import Register
+from shmio.layout.model import Register, index_at
 from shmio.layout.topic import find, holders, parse_topic, shorten
 from shmio.layout.values.codec import RegisterCodec, codec
 from shmio.logs import printable
@@ -103,7 +103,7 @@ class OutputEncoder:
                 raise ValueRangeError(f"{FIELDS[column]}: the table has no slot {slot}")
             register = self._selection.registers[place]
             if register.dims:
-                register = layout.element(register, tuple(index_of(register, slot - columns.places[place][1])))
+                register = layout.element(register, index_at(register.dims, slot - columns.places[place][1]))
             found = self._slots[column, slot] = register.path, codec(register, layout.byte_order)
         return found
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, Final
 
 from shmio.endpoints.grpc.commands.topics import Topics
 from shmio.endpoints.grpc.server.limits import time_sliced
 from shmio.endpoints.grpc.shmio_v1.views import Selection
 from shmio.errors import CommandError, ValueRangeError
-from shmio.layout.model import Register
+from shmio.layout.model import Register, index_at
 from shmio.layout.topic import shorten
 from shmio.layout.values.text import from_text, wire_type
 from shmio.messages import value_from_wire
@@ -101,13 +100,4 @@ def _path(selection: Selection, column: Column, slot: int) -> str:
     if not register.dims:
         return register.path
     flat = slot - selection.columns.places[place][1]
-    return "/".join((register.path, *map(str, index_of(register, flat))))
-
-
-def index_of(register: Register, flat: int) -> Iterator[int]:
-    """Return the declared indices of an array element."""
-    indices = []
-    for low, high in reversed(register.dims):
-        flat, rest = divmod(flat, high - low + 1)
-        indices.append(low + rest)
-    return reversed(indices)
+    return "/".join((register.path, *map(str, index_at(register.dims, flat))))
