@@ -164,9 +164,9 @@ def ns(dt_s: float | None) -> int:
     return max(1, round(dt_s * 1e9))
 
 
-def read_request(patterns: Iterable[str], *, originals: bool, tables: Iterable[int]) -> Any:
+def read_request(patterns: Iterable[str], *, originals: bool) -> Any:
     """Return the request for Read."""
-    return wire.ReadRequest(patterns=patterns, originals=originals, tables=tables)
+    return wire.ReadRequest(patterns=patterns, originals=originals)
 
 
 def subscribe_request(

@@ -144,13 +144,6 @@ class Update:
         return Provenance.INJECTED if self.table.injected[self.table.place(path)] else self.provenance
 
 
-def end_of(table: Table, reason: str) -> Update:
-    """Return the last update of a source that a reload has removed."""
-    update = Update(table, _NOTHING)
-    update.reason, update.ended = reason, True
-    return update
-
-
 _NOTHING = SubscribeResponse.FromString(b"\x12\x00").updates[0]
 _QUALITIES = {int(quality): quality for quality in Quality}
 _PROVENANCES = {int(provenance): provenance for provenance in Provenance}
@@ -178,17 +171,15 @@ class Tables:
             yield Update(table, update)
 
     def all_of(self, found: Any) -> Iterator[Update]:
-        """Yield all updates of a stream's message, including those of removed sources."""
+        """Yield all updates of a stream's message; those of sources that a reload has removed come last."""
         yield from self.updates(found)
-        yield from self.ended(found)
-
-    def ended(self, found: Any) -> Iterator[Update]:
-        """Yield the last updates of removed sources in a message."""
         for end in found.ended:
             direction = "in" if end.direction == wire.DIRECTION_IN else "out"
             for table in list(self.known.values()):
                 if (table.source, table.direction) == (end.source, direction):
-                    yield end_of(table, end.reason)
+                    update = Update(table, _NOTHING)
+                    update.reason, update.ended = end.reason, True
+                    yield update
 
 
 def _same(old: Table, news: Table) -> bool:

@@ -110,9 +110,8 @@ class Client:
             PathError: A pattern names nothing.
             ValueRangeError: The registers are too many for one call.
         """
-        tables = Tables()
-        request = calls.read_request(patterns, originals=originals, tables=())
-        return Snapshot(tables.updates(await self._call(self._read, request)))
+        request = calls.read_request(patterns, originals=originals)
+        return Snapshot(Tables().updates(await self._call(self._read, request)))
 
     async def __getitem__(self, path: str) -> Any:
         """Return a register's value; PathError, or QualityError with the reason if it is bad."""
