@@ -1,21 +1,19 @@
-"""``shmio-dump``: record a running instance, and examine recordings.
-
-Each verb is a module of ``shmio.cli.recordings``.
-"""
+"""``shmio-dump``: record a running instance, and examine recordings. The verbs are in ``shmio.cli.recordings``."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shmio.cli.run import add_full, add_json, complete, ended_by_interrupt, exit_on_signals, run
+from shmio.cli.run import add_full, add_json, complete, exit_on_signals, load, run
 from shmio.version import __version__
 
 PROGRAM = "shmio-dump"
+MODULES = {"info": "examine", "verify": "examine", "cut": "rewrite", "merge": "rewrite", "recover": "rewrite"}
+"""The modules of verbs that are not in one of their own name."""
 SOME_FILES = "print JSON: one object, or a list for several files"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
 """What ``diff`` can ignore, as in shmio.recording.compare, which only that verb imports."""
@@ -35,15 +33,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if around and arguments.when is None:
         parser.error("--before and --after need --when: without a condition, everything is recorded from now on")
 
-    with ended_by_interrupt():
-        verb = importlib.import_module(f"shmio.cli.recordings.{arguments.verb}")  # each needs other parts of shmio
-
-    def command() -> int:
-        status: int = verb.execute(arguments)
-        return status
-
+    module = MODULES.get(arguments.verb, arguments.verb)
+    execute = load(f"shmio.cli.recordings.{module}:{arguments.verb}")
     with exit_on_signals():  # a file that is being made is removed again
-        return run(PROGRAM, command, arguments)
+        return run(PROGRAM, lambda: execute(arguments), arguments)
 
 
 def _parser() -> argparse.ArgumentParser:

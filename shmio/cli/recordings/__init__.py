@@ -1,1 +1,1 @@
-"""Verbs of ``shmio-dump``, one module each, with ``execute(arguments) -> exit status``."""
+"""Verbs of ``shmio-dump``: functions that take the arguments and return the exit status."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from shmio.cli.recordings.damage_report import DamageReport
+from shmio.cli.recordings.common import DamageReport
 from shmio.cli.run import say
 from shmio.config.declaration import check_declarations
 from shmio.errors import ConfigError, RecordingError
@@ -18,7 +18,7 @@ from shmio.recording.campaign import derive
 from shmio.recording.rewriting import new_file
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def campaign(arguments: argparse.Namespace) -> int:
     """Write the injections of files of one run; report those that cannot be declared."""
     report = DamageReport()
     with report.open(arguments.files) as dump:

@@ -1,34 +1,44 @@
-"""``shmio-dump cat``: print a recording line by line."""
+"""``shmio-dump cat``: print a recording line by line, as text, JSON or CSV."""
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
+from typing import Any, Final, Protocol
 
-from shmio.cli.recordings.damage_report import DamageReport
-from shmio.cli.recordings.each import not_closed
-from shmio.cli.recordings.printers import Csv, JsonLines, Printer, Table, View
-from shmio.cli.recordings.progress import Progress
-from shmio.cli.recordings.times import time_range
-from shmio.cli.run import room
+import msgspec
+
+from shmio.cli.read import shown
+from shmio.cli.recordings.common import DamageReport, Progress, not_closed, time_range
+from shmio.cli.run import dumps, room
 from shmio.errors import PathError, RecordingError
 from shmio.layout.glob import named
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import parse_topic
+from shmio.layout.values.codec import codec
+from shmio.layout.values.text import json_value, to_text
 from shmio.logs import printable
+from shmio.recording.columns import heading
 from shmio.recording.format.channels import Channel
-from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
+from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, Gap, ProcessChange, StepMark
 from shmio.recording.reading.reader import Message, Reader
 from shmio.recording.reading.survey import Survey, survey
-from shmio.recording.times import span
-from shmio.segment import Event, Frame
-from shmio.segment.explain import Explainer
+from shmio.recording.times import iso, local, span
+from shmio.segment import Event, EventKind, Frame, Quality
+from shmio.segment.changed_registers import ChangeScan
+from shmio.segment.explain import ABOUT, Explained, Explainer, cells_of, kind_of, object_of
+
+MAX_PLACES: Final = 4
+"""The most registers of one event that are printed for people."""
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def cat(arguments: argparse.Namespace) -> int:
     """Print a line for each frame in which a chosen value or the quality changed.
 
     Events, gaps and steps have lines, too. Damage is reported where it occurs; then the exit status
@@ -155,3 +165,243 @@ def _lines(
         yield printer.process(time_ns, item)
     elif item.source in sources:
         yield printer.gap(time_ns, item)
+
+
+class View:
+    """The chosen registers of one block, and their last printed values."""
+
+    def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
+        self.source = channel.source
+        self.registers = registers
+        self.codecs = [codec(register, layout.byte_order) for register in registers]
+        self._scan = ChangeScan(registers)
+        self._shown: Frame | None = None
+
+    def news(self, frame: Frame) -> bool:
+        """Return whether a value or the quality differs from the last printed frame.
+
+        If so, this frame becomes the last printed one.
+        """
+        shown = self._shown
+        same = shown is not None and (shown.quality, shown.reason) == (frame.quality, frame.reason)
+        if shown is not None and same and not self._scan.changed(shown.image, frame.image):
+            return False
+        self._shown = frame
+        return True
+
+
+class Printer(Protocol):
+    """Formats entries of a recording as lines."""
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """Format the chosen values of a frame."""
+
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """Format an event with its registers and values."""
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """Format a gap."""
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """Format the end of a step."""
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """Format a change of a process."""
+
+
+def _where(event: Event, explained: Explained, room: int | None) -> str:
+    """Return an event's registers with direction and values as text; bytes without a name as bytes."""
+    if not explained.places:
+        return f"{event.size} bytes at {event.offset}" if event.size and not event.data.startswith(b"{") else ""
+    way = f"/{explained.direction}" if explained.direction else ""
+    texts = [
+        f"{printable(place.path)}{way}{f' = {shown(place.value, place.register, room)}' if place.valued else ''}"
+        for place in explained.places[:MAX_PLACES]
+    ]
+    more = len(explained.places) - MAX_PLACES
+    return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
+
+
+def _laid(laid: dict[str, Any]) -> str:
+    """Return an injection's definition as text, without what the event already says."""
+    return ", ".join(f"{key} = {dumps(value)}" for key, value in laid.items() if key not in ("name", "direction"))
+
+
+class JsonLines:
+    """Formats entries as one JSON object per line, with times in UTC."""
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """Format a frame with ``values`` by path; all are null if the source never had any."""
+        known = frame.source_ns != 0
+        values = {
+            register.path: json_value(decode.decode(frame.image), register.element) if known else None
+            for register, decode in zip(view.registers, view.codecs, strict=True)
+        }
+        yield self._line(
+            time_ns,
+            view.source,
+            frame=frame.number,
+            cycle=frame.cycle,
+            quality=str(frame.quality),
+            reason=frame.reason,
+            provenance=str(frame.provenance),
+            values=values,
+        )
+
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """Format an event; ``event`` is its number."""
+        fields = {name: getattr(event, name) for name in ("cycle", "incarnation", "writer")}
+        return self._line(
+            time_ns,
+            source,
+            event=event.number,
+            kind=kind_of(event),
+            after_frame=event.frame,
+            quality=str(event.quality),
+            **fields,
+            **object_of(event, explained),
+        )
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """Format a gap; ``missed`` is the number of missing frames or events."""
+        return self._line(
+            time_ns, gap.source, missed=gap.count, what=gap.what, first=gap.first, last=gap.last, why=str(gap.reason)
+        )
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """Format a step: ``step`` is its number, ``clock_ns`` the time after it; no source."""
+        return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """Format a change of a process with the fields of the recording."""
+        return dumps({"time": iso(time_ns), "process": msgspec.to_builtins(change)})
+
+    def _line(self, time_ns: int, source: str, **fields: Any) -> str:
+        return dumps({"time": iso(time_ns), "source": source, **fields})
+
+
+class Table:
+    """Formats entries as lines with columns; prints headings when the block changes."""
+
+    def __init__(self, room: int | None) -> None:
+        """Take the maximum number of characters of a value; None for no limit."""
+        self._room = room
+        self._view: View | None = None
+        self._widths: list[int] = []
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """Format a frame's values, with the quality unless it is good."""
+        known = frame.source_ns != 0
+        cells = [
+            shown(decode.decode(frame.image) if known else None, register, self._room)
+            for register, decode in zip(view.registers, view.codecs, strict=True)
+        ]
+        if view is not self._view:
+            self._view = view
+            names = [printable(register.path) for register in view.registers]
+            self._widths = [max(map(len, pair)) for pair in zip(names, cells, strict=True)]
+            yield f"{'time':<23}  {view.source}  frame  {self._row(names)}".rstrip()
+        quality = "" if frame.quality is Quality.GOOD else f"  {frame.quality}: {printable(frame.reason)}"
+        yield f"{local(time_ns)}  {view.source}  {frame.number:<5}  {self._row(cells)}{quality}".rstrip()
+
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """Format an event: kind, reason, and the details of a command or an injection."""
+        what = f"{kind_of(event)} {event.quality}" if event.kind == EventKind.QUALITY else kind_of(event)
+        if where := _where(event, explained, self._room):
+            what += f" {where}"
+        if explained.by:
+            what += f" by {explained.by}"
+        if event.command and event.kind != EventKind.NOTED:
+            what += f", command {event.command}.{event.item}"
+        text = f": {printable(event.text)}" if event.text else ""
+        laid = f" {printable(_laid(explained.laid))}" if explained.laid else ""
+        return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}{laid}"
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """Format a gap: how many are missing, which, and why."""
+        source = printable(gap.source)
+        return f"{local(time_ns)}  {source}  {gap.count} {gap.what} missed, {gap.first} to {gap.last}: {gap.reason}"
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """Format a step: its number, and the time after it."""
+        return f"{local(time_ns)}  step {mark.step} of {mark.dt_ns / 1e6:g} ms is done: {mark.time_ns / 1e9:g} s"
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """Format a change of a process: name, change and reason."""
+        pid = f", pid {change.pid}" if change.pid else ""
+        why = f": {printable(change.why)}" if change.why else ""
+        return f"{local(time_ns)}  process {printable(change.name)} {change.what}{pid}{why}"
+
+    def _row(self, cells: Sequence[str]) -> str:
+        return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))
+
+
+class Csv:
+    """Formats entries as CSV rows (RFC 4180) under one heading, with times in UTC.
+
+    Each register of any block has a column, named with its source if there are several sources or
+    another column has the same name. Arrays are JSON. A cell is empty if the source never had a
+    value, or the register belongs to another block.
+    """
+
+    OWN = ("time", "source", "what", "number", "quality", "text", *ABOUT)
+
+    def __init__(self, views: Sequence[View]) -> None:
+        several = len({view.source for view in views}) > 1
+        self._names = [
+            [
+                f"{view.source}/{register.path}" if several else heading(view.source, register.path, self.OWN)
+                for register in view.registers
+            ]
+            for view in views
+        ]
+        self._columns = {name: place for place, name in enumerate(dict.fromkeys(chain(*self._names)))}
+        self._views = list(views)
+        self._begun = False
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """Format a frame: ``what`` is frame, ``text`` the reason."""
+        values = [""] * len(self._columns)
+        if frame.source_ns != 0:
+            names = self._names[self._views.index(view)]
+            for name, register, decode in zip(names, view.registers, view.codecs, strict=True):
+                values[self._columns[name]] = to_text(decode.decode(frame.image), register)
+        yield self._row(time_ns, view.source, "frame", frame.number, str(frame.quality), frame.reason, values)
+
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """Format an event: ``what`` is its kind."""
+        row = time_ns, source, kind_of(event), event.number, str(event.quality), event.text
+        return self._row(*row, about=cells_of(explained, dumps))
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """Format a gap: ``number`` is the first missing one."""
+        return self._row(time_ns, gap.source, f"missed {gap.count} {gap.what}", gap.first, "", str(gap.reason))
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """Format a step, which has no source."""
+        return self._row(time_ns, "", "step", mark.step, "", "")
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """Format a change of a process: ``number`` is its pid, ``text`` its name and the reason."""
+        text = f"{change.name}: {change.why}" if change.why else change.name
+        return self._row(time_ns, "", f"process {change.what}", change.pid, "", text)
+
+    def _row(
+        self,
+        time_ns: int,
+        source: str,
+        what: str,
+        number: int,
+        quality: str,
+        text: str,
+        values: Sequence[str] = (),
+        about: Sequence[str] = ("",) * len(ABOUT),
+    ) -> str:
+        lines = io.StringIO(newline="")
+        writer = csv.writer(lines, lineterminator="\n")
+        if not self._begun:
+            self._begun = True
+            writer.writerow([*self.OWN, *self._columns])
+        filled = values or [""] * len(self._columns)
+        writer.writerow([iso(time_ns), source, what, number, quality, text, *about, *filled])
+        return lines.getvalue().removesuffix("\n")

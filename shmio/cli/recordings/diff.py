@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from shmio.cli.recordings.progress import Progress
+from shmio.cli.recordings.common import Progress
 from shmio.cli.run import dumps
 from shmio.errors import RecordingError
 from shmio.layout.values.codec import Value
@@ -19,7 +19,7 @@ MAX_SHOWN = 50
 """Registers and elements, and things of the first difference, that are printed; with --json all."""
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def diff(arguments: argparse.Namespace) -> int:
     """Compare source by source; return 1 if anything differs."""
     first, second = arguments.files
     ignore = [word for words in arguments.ignore for word in words.split(",")]

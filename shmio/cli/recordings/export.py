@@ -8,9 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from shmio.cli.recordings.damage_report import DamageReport
-from shmio.cli.recordings.progress import Progress
-from shmio.cli.recordings.times import time_range
+from shmio.cli.recordings.common import DamageReport, Progress, time_range
 from shmio.cli.run import dumps, say
 from shmio.errors import PathError, RecordingError
 from shmio.recording.dump import Dump
@@ -31,7 +29,7 @@ OTHERS: Final = frozenset(
 """A folder with such a name is not meant."""
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def export(arguments: argparse.Namespace) -> int:
     """Write tables, a file for each block, or one MCAP file for viewers."""
     report = DamageReport()
     named, form = _form(arguments.output, arguments.format)

@@ -16,7 +16,7 @@ from shmio.supervisor import control
 WHERE_S = 2.0
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def note(arguments: argparse.Namespace) -> int:
     """Send the note, and wait until the source has published it."""
     with Attachment(target(arguments).open(writable=True)) as cell:
         source = arguments.source if arguments.source is not None else _default_source(cell.instance)

@@ -29,7 +29,7 @@ LOOK_S = 0.5
 """How often it is looked whether the instance still is, and the disk well."""
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def record(arguments: argparse.Namespace) -> int:
     """Record until Ctrl-C, the end of the time, or the end of the instance."""
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     with target(arguments).open() as segment, stop_on_signals() as stopping:

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 
 import shmio
 from shmio.cli.dump import main
-from shmio.cli.recordings.progress import Progress
+from shmio.cli.recordings.common import Progress
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import codec
 from shmio.segment import Quality

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from shmio.cli.dump import main
-from shmio.cli.recordings import progress
+from shmio.cli.recordings import common
 from tests.unit.recording.build import plain
 
 
@@ -23,7 +23,7 @@ def test_a_terminal_is_told_and_left_clean(monkeypatch: pytest.MonkeyPatch) -> N
     terminal, now_s = Terminal(), [0.0]
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
-    with progress.Progress("reading a\x1bb") as work:
+    with common.Progress("reading a\x1bb") as work:
         work.total = 200
         work.at(10)
         assert terminal.getvalue() == "", "what is soon done says nothing"
@@ -38,8 +38,8 @@ def test_a_terminal_is_told_and_left_clean(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_file_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     file = io.StringIO()
     monkeypatch.setattr(sys, "stderr", file)
-    monkeypatch.setattr(progress, "FIRST_S", -1.0)
-    with progress.Progress("reading") as work:
+    monkeypatch.setattr(common, "FIRST_S", -1.0)
+    with common.Progress("reading") as work:
         work.total = 2
         work.at(1)
     assert file.getvalue() == ""
@@ -53,6 +53,6 @@ def test_who_prints_to_a_file_sees_how_far_it_is(
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(sys, "stdout", Terminal() if to_a_terminal else io.StringIO())
-    monkeypatch.setattr(progress, "FIRST_S", -1.0)
+    monkeypatch.setattr(common, "FIRST_S", -1.0)
     assert main(["cat", str(file)]) == 0
     assert ("reading" in terminal.getvalue()) != to_a_terminal

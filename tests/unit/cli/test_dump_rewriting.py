@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 
 import shmio
 from shmio.cli.dump import main
-from shmio.cli.recordings.progress import Progress
+from shmio.cli.recordings.common import Progress
 from shmio.recording.check import check
 from shmio.recording.format.encoding import Gap, Reason, StepMark
 from shmio.recording.format.records import MAGIC

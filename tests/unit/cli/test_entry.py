@@ -74,7 +74,7 @@ sys.exit(entry.{name}())
     [
         ("shmio", ["step", "--instance", "not-there"], "msgspec"),
         ("shmio", ["get", "--host", "unix:no.sock", "cell/a"], "grpc"),
-        ("shmio_dump", ["info", "no.mem"], "shmio.cli.recordings.info"),
+        ("shmio_dump", ["info", "no.mem"], "shmio.cli.recordings.examine"),
         ("shmio_supervisor", ["status", "--instance", "not-there"], "shmio.cli.instance.status"),
         ("shmio_supervisor", ["up", "-c", "no.toml"], "shmio.cli.instance.up"),
     ],

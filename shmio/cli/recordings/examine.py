@@ -1,26 +1,30 @@
-"""``shmio-dump info``: describe recordings."""
+"""``shmio-dump info`` and ``verify``: examine recordings, file by file."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from shmio.cli.recordings.each import each, ended
+from shmio.cli.recordings.common import Progress, not_closed
+from shmio.cli.run import dumps
 from shmio.errors import RecordingError
+from shmio.logs import printable
+from shmio.recording.check import check
 from shmio.recording.format.encoding import EVENT, FRAME, SUPERVISED
 from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import Survey, Track, survey
-from shmio.recording.times import iso, local
+from shmio.recording.times import iso, local, lost
 
 
-def execute(arguments: argparse.Namespace) -> int:
+def info(arguments: argparse.Namespace) -> int:
     """Describe each file; return 1 if one is damaged or not a recording."""
-    return each(arguments, _look, lambda found: _folded(_lines(found)))
+    return _each(arguments, _look, lambda found: _folded(_lines(found)))
 
 
 def _look(file: Path) -> dict[str, Any]:
@@ -119,7 +123,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
     if found["made_by"]:
         by += f"; converted by {found['made_by']}"
     lines = [
-        f"{found['file']}: {size}, {ended(found)}",
+        f"{found['file']}: {size}, {_ended(found)}",
         f"  instance {found['instance']}, mode {found['mode']}, started {found['started']}; {by}",
         f"  {found['from']} to {found['to']}, {found['duration_s']:.1f} s{rate}"
         if found["from"]
@@ -152,3 +156,72 @@ def _folded(lines: list[str]) -> Iterator[str]:
 def _gap(gap: dict[str, Any]) -> str:
     when = local(gap["before_ns"] or gap["after_ns"]) if gap["before_ns"] or gap["after_ns"] else "-"
     return f"{when}  {gap['source']}: {gap['count']} {gap['what']}, {gap['first']} to {gap['last']}: {gap['reason']}"
+
+
+def verify(arguments: argparse.Namespace) -> int:
+    """Read each file completely; return 1 if one is damaged or not a recording."""
+    return _each(arguments, checked, checked_lines)
+
+
+def checked(file: Path) -> dict[str, Any]:
+    """Return the result of reading a file completely; OSError, RecordingError: not a recording."""
+    with Progress(f"verifying {file}") as progress, Reader(file) as reader:
+        progress.total = reader.records.size
+        found = check(reader, progress.at)
+        texts = [lost(damage) for damage in found.damage] + found.problems
+        if found.count > len(texts):
+            texts.append(f"and {found.count - len(texts)} more such places")
+        return {
+            "file": str(file),
+            "size": reader.records.size,
+            "closed": reader.records.closed,
+            "end": reader.records.damage,
+            "chunks": found.chunks,
+            "messages": found.messages,
+            "damage": texts,
+        }
+
+
+def checked_lines(found: dict[str, Any]) -> list[str]:
+    """Return the result as lines of text."""
+    whole = f"{found['chunks']} chunks and {found['messages']} messages are whole"
+    if not found["chunks"]:
+        whole = "nothing is recorded in it"
+    return [f"{found['file']}: {_ended(found)}; {whole}{'' if found['damage'] else ', no damage'}"] + [
+        f"  damage: {text}" for text in found["damage"]
+    ]
+
+
+def _each(
+    arguments: argparse.Namespace,
+    look: Callable[[Path], dict[str, Any]],
+    lines: Callable[[dict[str, Any]], Iterable[str]],
+) -> int:
+    """Print what ``look`` finds in each file, as ``lines`` or JSON.
+
+    ``look`` raises OSError or RecordingError for a file that is not a recording; in JSON the error
+    takes the place of the result. Returns 1 if a file is damaged or not a recording.
+    """
+    found: list[dict[str, Any]] = []
+    failed = False
+    for file in arguments.files:
+        try:
+            described = look(file)
+        except (RecordingError, OSError) as error:
+            text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+            print(printable(text), file=sys.stderr)
+            found.append({"error": text})
+            failed = True
+            continue
+        failed = failed or bool(described["damage"])
+        found.append(described)
+        if not arguments.json:
+            print("\n".join(map(printable, lines(described))), flush=True)
+    if arguments.json:
+        print(dumps(found[0] if len(arguments.files) == 1 else found, indent=2))
+    return int(failed)
+
+
+def _ended(found: dict[str, Any]) -> str:
+    """Return how a file ends, as text: by its ``closed`` and ``end``."""
+    return "closed" if found["closed"] else not_closed(found["end"])

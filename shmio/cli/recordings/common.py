@@ -1,0 +1,117 @@
+"""What several verbs of ``shmio-dump`` need: damage reports, progress, and the options ``--from`` and ``--to``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from shmio.errors import RecordingError
+from shmio.local.replays import moment_ns
+from shmio.logs import printable
+from shmio.recording.dump import Dump, open_dump
+from shmio.recording.format.damage import Damage
+from shmio.recording.reading.part import MAX_NS
+from shmio.recording.times import lost
+
+FIRST_S = 1.0
+"""Shorter work shows no progress."""
+EACH_S = 0.2
+"""Interval at which the progress changes."""
+
+
+class DamageReport:
+    """Reports the damaged parts of a recording on standard error, between the lines of the output."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    @property
+    def any(self) -> bool:
+        """Whether anything was reported."""
+        return bool(self.texts)
+
+    def open(self, files: Sequence[Path]) -> Dump:
+        """Open a recording and report its damage; OSError, RecordingError as ``open_dump``."""
+        dump = open_dump(files, self.damage)
+        for text in dump.damage:
+            self.say(text)
+        return dump
+
+    def damage(self, file: Path, damage: Damage) -> None:
+        """Report that a part of a file is lost."""
+        self.say(f"{file}: {lost(damage)}")
+
+    def say(self, text: str) -> None:
+        """Report a line of text; the exit status will be 1."""
+        self.texts.append(text)
+        sys.stdout.flush()
+        print(printable(text), file=sys.stderr, flush=True)
+
+
+def not_closed(end: str) -> str:
+    """Return the text about a file that was not closed, because of ``end``."""
+    return f"not closed ({end}): still being written, or its recorder was killed"
+
+
+class Progress:
+    """Progress line on standard error, if that is a terminal; removed at the end.
+
+    Use it as a context manager.
+    """
+
+    def __init__(self, what: str, *, silent: bool = False) -> None:
+        """Begin; ``silent`` shows nothing, because the terminal has other output."""
+        self.total = 0
+        """How much there is to do: bytes, or ns of a recording."""
+        self._what = what
+        self._shown = False
+        self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() and not silent else float("inf")
+
+    def at(self, done: int) -> None:
+        """Show how much is done."""
+        if time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + EACH_S
+            share = f"{min(done / self.total, 1):4.0%}" if self.total else ""
+            self._show(f"\r{printable(self._what)} {share}\x1b[K")
+            self._shown = True
+
+    def _show(self, text: str) -> None:
+        with suppress(OSError):
+            sys.stderr.write(text)
+            sys.stderr.flush()
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            self._show("\r\x1b[K")
+
+
+def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
+    """Return the log times of ``--from`` and ``--to`` in ns; without them, everything.
+
+    They are seconds from the recording's start, or ISO 8601, in local time without an offset.
+
+    Raises:
+        RecordingError: A time is invalid, or the end is before the beginning.
+    """
+    begin, end = arguments.begin, arguments.end
+    from_ns = 0 if begin is None else _parse("--from", begin, start_ns)
+    to_ns = MAX_NS if end is None else _parse("--to", end, start_ns)
+    if from_ns > to_ns:
+        raise RecordingError(f"--to {end} is before --from {begin}")
+    return from_ns, to_ns
+
+
+def _parse(option: str, text: str, start_ns: int) -> int:
+    try:
+        return min(max(0, moment_ns(text, start_ns)), MAX_NS)
+    except (ValueError, TypeError):  # argparse makes a list of --from=--
+        raise RecordingError(
+            f"{option}: {text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds of the recording"
+        ) from None
