@@ -8,12 +8,16 @@ import msgspec
 import numpy as np
 
 from shmio.config import Config, Declaration, Source
+from shmio.connectors import registry
+from shmio.connectors.base import Connector
+from shmio.connectors.injection_layers import MAX_INJECTIONS
+from shmio.connectors.output import GROWTH
 from shmio.errors import ConfigError
 from shmio.injection import Program, compile_program
 from shmio.layout.model import Layout
 from shmio.layout.values.write import cover
 from shmio.model.injection import Running
-from shmio.segment import NO_WRITER
+from shmio.segment import NO_WRITER, Provenance
 from shmio.segment.standing_injections import StandingInjection, declared_document, encode, ranges_of
 
 
@@ -44,10 +48,6 @@ def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dic
 
 
 def _check_in(program: Program, source: Source, layout: Layout) -> None:
-    from shmio.connectors import registry  # noqa: PLC0415  as in prepare
-    from shmio.connectors.base import Connector  # noqa: PLC0415
-    from shmio.segment import Provenance  # noqa: PLC0415
-
     connector = registry.load(source.connector)
     device = issubclass(connector, Connector) and connector.provenance is Provenance.LIVE
     if issubclass(connector, Connector) and not connector.can_write:
@@ -62,9 +62,6 @@ def _check_in(program: Program, source: Source, layout: Layout) -> None:
 
 
 def _document(source: str, programs: list[Program]) -> bytes:
-    from shmio.connectors.injection_layers import MAX_INJECTIONS  # noqa: PLC0415
-    from shmio.connectors.output import GROWTH  # noqa: PLC0415
-
     declarations: Iterable[Declaration] = [program.declaration for program in programs]
     try:
         if len(programs) > MAX_INJECTIONS:

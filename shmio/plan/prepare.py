@@ -14,20 +14,21 @@ from shmio.config import Address, Config, Emulator, Mqtt, Source
 from shmio.config.credentials import read_accounts
 from shmio.config.faults import Faults, meant
 from shmio.config.read import examine
+from shmio.emulators.programs import IDLE, program
 from shmio.errors import ConfigError, PathError
+from shmio.injection.program import compile_condition
 from shmio.layout.glob import Glob
 from shmio.layout.image import initial_value_warnings
 from shmio.layout.model import Layout
 from shmio.layout.spelling import block_path, topic_path
 from shmio.layout.topic import find, look_up, names_part, near, parse_topic
 from shmio.layout.values.write import chosen
-from shmio.plan.exposure import exposure
-from shmio.plan.host import check_host
+from shmio.plan.host import check_host, exposure
+from shmio.plan.injections import check_injections
 from shmio.plan.layouts import LayoutFiles
 from shmio.plan.ports import check_listening
 from shmio.plan.processes import Plan, make_plan
-from shmio.plan.recordings import Recordings
-from shmio.plan.replay import replayed
+from shmio.plan.replay import Recordings, replayed
 from shmio.plan.sources import check_sources, note_options
 from shmio.recording.selection import Selection
 
@@ -101,7 +102,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         config = _spelled(config, layouts)
     declared, described = dict[str, bytes](), tuple[str, ...]()
     with faults.catching():
-        declared, described = _check_injections(config, layouts)
+        declared, described = check_injections(config, layouts)
     if config.recorder and config.recorder.trigger:
         with faults.catching():
             _check_trigger(config.recorder.trigger.when, layouts)
@@ -181,17 +182,7 @@ def peer(source: Source) -> str:
     return str(Address(host, port)) if host and port else str(host or "")
 
 
-def _check_injections(config: Config, layouts: dict[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
-    if not config.injection:
-        return {}, ()
-    from shmio.plan.injections import check_injections  # noqa: PLC0415
-
-    return check_injections(config, layouts)
-
-
 def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
-    from shmio.injection.program import compile_condition  # noqa: PLC0415
-
     try:
         compile_condition(when, layouts)
     except ConfigError as error:
@@ -200,8 +191,6 @@ def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
 
 def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:
     """Return the blocks that an emulator serves: its program's block, or all if it has none."""
-    from shmio.emulators.programs import IDLE, program  # noqa: PLC0415
-
     key = f"emulator[{index}]"
     if emulator.kind not in EMULATOR_KINDS:
         raise ConfigError(

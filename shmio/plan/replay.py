@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
@@ -11,8 +11,10 @@ from shmio.config import Config, Mqtt, MqttTopic, Source
 from shmio.config.model import NAME_RULE, Replay
 from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, convert
 from shmio.errors import ConfigError, RecordingError
-from shmio.plan.recordings import Recordings
 from shmio.segment import Origin
+
+if TYPE_CHECKING:
+    from shmio.connectors.replay.recording import Recording
 
 LEAD_NS: Final = 2_000_000_000
 """Lead of the clock's start over the recording's, if possible, for the processes to start."""
@@ -25,6 +27,38 @@ class Replayed(NamedTuple):
     origin: Origin
     notices: list[str]
     """Lines about what was removed from or added to the configuration."""
+
+
+class Recordings:
+    """Opens the recordings that a configuration plays: each once for all sources that follow one another.
+
+    It keeps the one that was requested last open. Use it as a context manager.
+    """
+
+    def __init__(self) -> None:
+        self._files: Sequence[str] = ()
+        self._recording: Recording | None = None
+
+    def get(self, files: Sequence[str]) -> Recording:
+        """Return the recording of these files, valid until another is requested; RecordingError."""
+        from shmio.connectors.replay.recording import Recording  # noqa: PLC0415  most configurations play none
+
+        if self._recording is None or files != self._files:
+            self.close()
+            self._recording, self._files = Recording(files), files
+        return self._recording
+
+    def close(self) -> None:
+        """Close the open recording, if any."""
+        if self._recording is not None:
+            self._recording.close()
+            self._recording = None
+
+    def __enter__(self) -> Recordings:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) -> Replayed:

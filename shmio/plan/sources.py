@@ -1,10 +1,10 @@
-"""Check a configuration's sources with their connectors, and find their layouts.
-
-Connectors are imported on use, because commands such as status do not need them.
-"""
+"""Check a configuration's sources with their connectors and models, and find their layouts."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -12,12 +12,21 @@ import msgspec
 from shmio.config import Config, Source
 from shmio.config.faults import Faults, near
 from shmio.config.read import unknown_option
-from shmio.errors import ConfigError, RecordingError
+from shmio.connectors import registry
+from shmio.connectors.base import Computed, Replayed
+from shmio.connectors.models.simulation import Answer, Request, Simulation
+from shmio.errors import ConfigError, PathError, RecordingError, ShmioError, ValueRangeError
+from shmio.layout.document import load_layout
+from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
+from shmio.layout.topic import find, parse_topic, shorten
+from shmio.layout.values.codec import codec
 from shmio.plan.layouts import LayoutFiles
-from shmio.plan.recordings import Recordings
+from shmio.plan.replay import Recordings
 
 NEEDED: Final = "this key is needed"
+PATIENCE_S: Final = 60.0
+"""The longest time that the import of a model may take."""
 
 
 class Sources(NamedTuple):
@@ -44,11 +53,9 @@ def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, fa
             _check_source(index, source, found, inputs, config, files, recordings, faults)
     if not faults:
         for index, paths in inputs.items():
-            from shmio.plan.models import check_connections  # noqa: PLC0415
-
             source, key = config.source[index], f"source[{index}]"
             with faults.catching():
-                check_connections(key, source.name, source.options.get("connections", {}), paths, found.layouts)
+                _check_connections(key, source.name, source.options.get("connections", {}), paths, found.layouts)
     return found
 
 
@@ -62,9 +69,6 @@ def _check_source(
     recordings: Recordings,
     faults: Faults,
 ) -> None:
-    from shmio.connectors import registry  # noqa: PLC0415
-    from shmio.connectors.base import Computed, Replayed  # noqa: PLC0415
-
     key = f"source[{index}]"
     options = _options(key, source, faults)
     try:
@@ -101,8 +105,6 @@ def _check_source(
 
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
     """Add the faults of a source's connector keys; ``index`` is the source's place in the file."""
-    from shmio.connectors import registry  # noqa: PLC0415
-
     key = f"source[{index}]"
     try:
         known = [field.encode_name for field in msgspec.structs.fields(registry.options_type(connector))]
@@ -121,8 +123,6 @@ def note_options(index: int, connector: str, options: dict[str, Any], texts: dic
 
 def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
     """Return the connector's checked options, or add faults and return None."""
-    from shmio.connectors import registry  # noqa: PLC0415
-
     before = faults.count
     note_options(int(key[7:-1]), source.connector, source.options, source.texts, faults)
     if faults.count > before:
@@ -173,9 +173,69 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
     """Return a simulation's layout, of its files or as its model declares it, and its inputs."""
-    from shmio.connectors.models.simulation import Simulation  # noqa: PLC0415
-    from shmio.plan.models import describe  # noqa: PLC0415
-
     source.options["folder"] = str(config.path(source.options["folder"]))
     layout = None if source.layout is None else files.get(key, source, None)
-    return describe(key, msgspec.convert(source.options, Simulation.Options), layout)
+    return _describe(key, msgspec.convert(source.options, Simulation.Options), layout)
+
+
+def _describe(key: str, options: Simulation.Options, layout: Layout | None) -> tuple[Layout, tuple[str, ...]]:
+    """Return the layout of a model's block, and the inputs that can be connected.
+
+    A separate process imports the model.
+
+    Raises:
+        ConfigError: The model cannot be imported or described; the message begins with ``key``.
+
+    """
+    request = Request(options, None if layout is None else layout.to_json().decode())
+    command = [sys.executable, "-m", "shmio.connectors.models.simulation"]
+    try:
+        done = subprocess.run(
+            command, input=msgspec.json.encode(request), capture_output=True, timeout=PATIENCE_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise ConfigError(f"{key}.model: importing {options.model} takes more than {PATIENCE_S:g} s") from None
+    try:
+        answer = msgspec.json.decode(done.stdout, type=Answer)
+    except msgspec.MsgspecError:
+        last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise ConfigError(
+            f"{key}.model: the process that imports {options.model} ended with status {done.returncode}: {last}"
+        ) from None
+    if answer.error:
+        raise ConfigError(f"{key}.{answer.error}")
+    return load_layout(answer.layout.encode()), answer.inputs
+
+
+def _check_connections(
+    key: str,
+    source: str,
+    connections: Mapping[str, str],
+    inputs: tuple[str, ...],
+    layouts: Mapping[str, Layout],
+) -> None:
+    """Raise ConfigError unless each connection goes from a source's register to a fitting input."""
+    for path, topic in connections.items():
+        try:
+            _check_connection(source, path, topic, inputs, layouts)
+        except ShmioError as error:
+            raise ConfigError(f"{key}.connections.{path}: {error}") from None
+
+
+def _check_connection(
+    source: str, path: str, text: str, inputs: tuple[str, ...], layouts: Mapping[str, Layout]
+) -> None:
+    if path not in inputs:
+        raise PathError(f"the model has no such input; there are: {shorten(', '.join(inputs), 400) or 'none'}")
+    topic = parse_topic(text, layouts, source)
+    if topic.source not in layouts:
+        raise PathError(f"{text}: no source {topic.source!r}; there are: {', '.join(layouts)}")
+    if topic.direction == "in":
+        raise PathError(f"{text}: an input reads an output of a source; leave out /in")
+    register, own = find(layouts[topic.source], topic.path), find(layouts[source], path)
+    value = codec(register).decode(bytes(layouts[topic.source].size))
+    try:
+        codec(own).encode_into(value, initial_frame(layouts[source])[0])
+    except ValueRangeError:
+        kinds = [f"{kind.type}{'[]' * len(kind.dims)}" for kind in (own, register)]
+        raise ValueRangeError(f"{text} is {kinds[1]}, which does not fit an input of {kinds[0]}") from None

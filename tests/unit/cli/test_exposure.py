@@ -11,7 +11,7 @@ import pytest
 
 from shmio.cli.supervisor import main
 from shmio.config import load
-from shmio.plan import exposure
+from shmio.plan.host import exposure, other_users
 
 BASE = """
 [instance]
@@ -71,7 +71,7 @@ def test_ways_in_that_ask_nobody_who_it_is(
     Path("accounts").chmod(0o600)
     file = Path("supervisor.toml")
     file.write_text(BASE.format(writable=writable) + sections)
-    line = exposure.exposure(load(file))
+    line = exposure(load(file))
     assert (line is None) == (said is None)
     if line is not None:
         assert said is not None
@@ -94,9 +94,9 @@ def test_who_else_can_log_in(monkeypatch: pytest.MonkeyPatch) -> None:
     own = user("own", os.geteuid())
     system = user("postgres", 101), user("nobody", 65534), user("backup", 5000, "/usr/sbin/nologin"), user("root", 0)
     host_of(monkeypatch, own, *system)
-    assert exposure.other_users() == []
+    assert other_users() == []
     host_of(monkeypatch, own, *system, user("eve", 70_000), user("mallory", 70_001, "/bin/zsh"))
-    assert exposure.other_users() == ["eve", "mallory"]
+    assert other_users() == ["eve", "mallory"]
 
 
 def test_check_says_it_and_does_not_count_it(
