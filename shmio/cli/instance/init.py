@@ -1,20 +1,46 @@
-"""``shmio-supervisor init``: write a first configuration."""
+"""``shmio-supervisor init``: write a first configuration, the A50 example or one for the files of a controller."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import re
 import sys
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from importlib import resources
+from itertools import chain, count, islice
 from pathlib import Path
+from typing import Final, NamedTuple
 
 from shmio.cli.target import config_file, option_for
-from shmio.errors import ConfigError
+from shmio.config import Address
+from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, read_properties, read_tables
+from shmio.errors import ConfigError, LayoutError
+from shmio.layout.compiler import Program
+from shmio.layout.model import Layout
+from shmio.layout.source.file import HEAD_BYTES, foreign
 from shmio.logs import printable
-from shmio.plan.new_config import new_config, vacant_name
+from shmio.plan.layouts import read_program, summarize
+from shmio.plan.ports import in_use
+from shmio.segment import instances
 
 EXAMPLE = ("supervisor.toml", "db201.db")
 EXAMPLE_NAME = "a50"
+SOURCES = (".db", ".udt", ".scl", ".awl")
+GRPC_PORTS = range(8089, 8189)
+S7_PORTS = range(1102, 1202)
+MAX_SOURCES = 50
+"""Most sources of one configuration; of more data blocks the user chooses one."""
+RESERVED = RESERVED_SOURCES | SECTION_PROCESSES | {"plc"}
+_DB_NUMBER = re.compile(r"[0-9]{1,5}", re.ASCII)
+_UMLAUTS: Final = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
+_NAME = re.compile(r"[^A-Za-z0-9_-]+")
+MAX_LENGTH: Final = 40
+MAX_FILES: Final = 500
+"""Most configurations nearby that are looked at."""
 
 
 def init(arguments: argparse.Namespace) -> int:
@@ -46,7 +72,7 @@ def init(arguments: argparse.Namespace) -> int:
 
 def _example(file: Path) -> dict[Path, str]:
     """Return the files of the A50 cell with its emulated controller, by path."""
-    folder = resources.files("shmio.cli.a50")
+    folder = resources.files("shmio.cli") / "a50"
     config, layout = ((folder / name).read_text(encoding="utf-8") for name in EXAMPLE)
     return {file: config, file.parent / EXAMPLE[1]: layout}
 
@@ -65,3 +91,236 @@ def _write(files: dict[Path, str]) -> None:
         if not path.exists():
             with path.open("x", encoding="utf-8") as stream:
                 stream.write(content)
+
+
+class NewConfig(NamedTuple):
+    """A first configuration."""
+
+    text: str
+    missing: dict[Path, list[str]]
+    """The keys that are left to fill in, by file: the configuration or the properties file."""
+    warnings: list[str]
+    """What the layout compiler warns of, and the data blocks that cannot be used."""
+
+
+def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, emulated: bool = False) -> NewConfig:
+    """Make a configuration for a controller's files.
+
+    Args:
+        file: Where the configuration will be.
+        files: Sources of data blocks and tags, and at most one properties file.
+        name: The one data block that is wanted; None: by the properties file's number, else all.
+        emulated: Whether a process takes the controller's place and holds the blocks.
+
+    Raises:
+        ConfigError: The files do not fit together, or are not of these kinds.
+        LayoutError: A source cannot be compiled.
+
+    """
+    sources = [path for path in files if path.suffix.lower() in SOURCES]
+    others = [path for path in files if path not in sources]
+    for path in others:
+        _refuse_foreign(path)
+    if not sources or len(others) > 1:
+        raise ConfigError(
+            f"init takes the sources of one controller ({', '.join(SOURCES)}) and at most one properties file such as "
+            "plc.ini, or no file"
+        )
+    properties = {key: text for key, (text, _) in read_properties(others[0], "init").items()} if others else {}
+    number = properties.get("dbNumber", "")
+    program = read_program(sources)
+    blocks, warnings = _compile(program, name, number)
+    paths = [_relative(path, file) for path in sources]
+    layout = f"layout = {_toml(paths if len(paths) > 1 else paths[0])}"
+    held = ", ".join(block.name for block in program.blocks) if len(program.blocks) > 1 else ""
+    names = _source_names(blocks)
+    missing: dict[Path, list[str]] = {}
+    lines = ["[instance]", f"name = {_toml(vacant_name(_instance(blocks[0]), file))}", ""]
+    addresses, emulators = _emulators(layout, blocks, len(program.blocks), number) if emulated else ([], [])
+    for index, block in enumerate(blocks):
+        if emulated:
+            device, writable = _emulated(block, number, addresses[index]), '["**"]                     # all of it'
+        else:
+            device = []
+            for key, comment in _unknown(block, properties):
+                # The properties file is that of all blocks, and each block has a number of its own.
+                place = others[0] if others and (key == "host" or len(blocks) == 1) else file
+                device += [comment] if place == file else []
+                left = missing.setdefault(place, [])
+                left += [key] if key not in left else []
+            writable = "[]                         # nothing is writable unless named"
+        lines += [
+            "[[source]]",
+            f"name = {_toml(names[index])}",
+            'connector = "s7"',
+            layout,
+            *([f"block = {_toml(block.name)}  # of {printable(held)}"] if held else []),
+            *([f"properties = {_toml(_relative(others[0], file))}"] if others else []),
+            *device,
+            "period_ms = 20",
+            f"writable = {writable}",
+            "armed = false                         # whether an injection may reach the device",
+            "",
+        ]
+    lines += [
+        *emulators,
+        "[grpc]",
+        f"default_source = {_toml(names[0])}",
+        "",
+        *_addresses(["read", "write", "inject", "control"] if emulated else ["read"]),
+        "# [recorder]                          # without the first #: everything, to files that shmio-dump reads",
+        '# directory = "dumps"',
+        "",
+    ]
+    return NewConfig("\n".join(lines), missing, warnings)
+
+
+def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layout], list[str]]:
+    """Return the data blocks to use as sources, and warnings.
+
+    The one of this name is used, else that of this number, else all that can be compiled.
+    """
+    held = ", ".join(block.name for block in program.blocks)
+    if name is not None:
+        wanted = [block.name for block in program.blocks if block.name.lower() == name.lower()]
+        if not wanted:
+            raise ConfigError(f"--block: no data block {name!r}; there are: {held}")
+    else:
+        wanted = [block.name for block in program.blocks if str(block.number) == number]
+    if not wanted and len(program.blocks) > 1 and number:
+        raise ConfigError(f"no data block has the number {number} ({held}); choose one by --block NAME")
+    if not wanted and len(program.blocks) > MAX_SOURCES:
+        raise ConfigError(f"there are {len(program.blocks)} data blocks ({held}); choose one by --block NAME")
+    if wanted or len(program.blocks) <= 1:
+        compiled = program.compile(wanted or None)
+        return list(compiled.layouts[:1]), summarize(compiled.warnings)
+    found: list[Layout] = []
+    warnings: list[str] = []
+    refused: list[LayoutError] = []
+    for block in program.blocks:
+        try:
+            compiled = program.compile((block.name,))
+        except LayoutError as error:
+            refused.append(error)
+            continue
+        warnings += summarize(compiled.warnings)
+        found += compiled.layouts
+    if not found:
+        raise refused[0]
+    return found, warnings + [f"left out: {why.diagnostics[0]}" for why in refused]
+
+
+def _refuse_foreign(path: Path) -> None:
+    """Raise ConfigError if a file is an export of TIA Portal, but not a source."""
+    with suppress(OSError), path.open("rb") as stream:  # unreadable files are reported with the others
+        if what := foreign(path.name, stream.read(HEAD_BYTES)):
+            raise ConfigError(f"{path}: {what}")
+
+
+def _source_names(blocks: Sequence[Layout]) -> list[str]:
+    """Return a name for each source: ``cell`` for the only one, else after their blocks."""
+    if len(blocks) == 1:
+        return ["cell"]
+    names: list[str] = []
+    for block in blocks:
+        name = first = _instance(block)
+        count = 2
+        while name in names or name in RESERVED:
+            name, count = f"{first[:36]}-{count}", count + 1
+        names.append(name)
+    return names
+
+
+def _unknown(block: Layout, properties: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield each key about the real controller that is not known, and a comment line for it."""
+    if "host" not in properties:
+        yield "host", '# host = ""                           # needed: the address of your controller'
+    if block.number is None and "dbNumber" not in properties:
+        yield "dbNumber", "# dbNumber =                          # needed: the number of the data block"
+
+
+def _number(block: Layout, number: str) -> int:
+    return int(number) if _DB_NUMBER.fullmatch(number) else block.number or 1
+
+
+def _emulated(block: Layout, number: str, address: Address) -> list[str]:
+    """Return a source's lines about its emulated controller."""
+    return [
+        f"host = {_toml(address.host):<31}# the emulator below; for a real controller: its address",
+        f"port = {address.port:<31}# for a real controller: without this line",
+        f"dbNumber = {_number(block, number):<27}# for a real controller: the number of its data block",
+    ]
+
+
+def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) -> tuple[list[Address], list[str]]:
+    """Return the address of each block's emulator, and the emulators' sections: one for all if possible."""
+    together = len(blocks) == held > 1 and all(block.number is not None for block in blocks)
+    ports = _free(S7_PORTS, 1 if together else len(blocks))
+    if not together and len(ports) < len(blocks):
+        raise ConfigError(f"there are {len(blocks)} data blocks and fewer free ports; choose one by --block NAME")
+    lines: list[str] = []
+    for index, block in enumerate(blocks[: len(ports)]):
+        key = [f"block = {_toml(block.name)}"] if held > 1 else []
+        lines += [
+            "[[emulator]]                          # a process that plays the controller; for a real one: without it",
+            f"name = {_toml('plc' if index == 0 else f'plc-{index + 1}')}",
+            'kind = "s7"',
+            layout,
+            *([] if together else [*key, f"dbNumber = {_number(block, number)}"]),
+            f"listen = {_toml(str(ports[index]))}",
+            "",
+        ]
+    return [ports[0]] * len(blocks) if together else ports, lines
+
+
+def _instance(block: Layout) -> str:
+    """Return a name for the instance, after its block."""
+    plain = unicodedata.normalize("NFKD", unicodedata.normalize("NFC", block.name.lower()).translate(_UMLAUTS))
+    letters = "".join(char for char in plain if not unicodedata.combining(char))
+    return _NAME.sub("-", letters).strip("-_")[:40] or "cell"
+
+
+def _addresses(roles: list[str]) -> list[str]:
+    """Return the sections of the gRPC addresses, with the roles of everybody who reaches them."""
+    others = "all that there are" if len(roles) > 1 else "there are write, inject and control, too"
+    comment = f"# what every user of this host may do here; {others}"
+    lines = []
+    for address in _free(GRPC_PORTS, 2):
+        lines += ["[[grpc.address]]", f"listen = {_toml(str(address))}", f"roles = {_toml(roles)}  {comment}", ""]
+    return lines
+
+
+def _free(ports: range, count: int) -> list[Address]:
+    """Return free addresses to listen on, beginning with the usual one."""
+    free = (address for port in ports if not in_use(address := Address("127.0.0.1", port)))
+    return list(islice(free, count)) or [Address("127.0.0.1", 0)]
+
+
+def _relative(path: Path, file: Path) -> str:
+    """Return a path for the configuration: relative if it lies below the configuration's folder."""
+    absolute, folder = path.resolve(), file.resolve().parent
+    return str(absolute.relative_to(folder)) if absolute.is_relative_to(folder) else str(absolute)
+
+
+def _toml(value: str | list[str]) -> str:
+    """Return a TOML basic string, or an array of them; JSON's escapes are a subset of TOML's."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def vacant_name(name: str, file: Path) -> str:
+    """Return a name that no instance and no configuration nearby has: ``name``, ``name-2`` and so on.
+
+    ``file``: where the new configuration will be.
+    """
+    taken = {*instances(), *_configured(file)}
+    numbered = (f"{name[: MAX_LENGTH - len(end)]}{end}" for end in (f"-{number}" for number in count(2)))
+    return next(found for found in chain([name], numbered) if found not in taken)
+
+
+def _configured(file: Path) -> Iterator[str]:
+    """Yield instance names of the configurations in this folder, its neighbours and its parent."""
+    folder = file.resolve().parent
+    found = chain(folder.glob("*.toml"), folder.parent.glob("*/supervisor.toml"), folder.parent.glob("*.toml"))
+    for other in islice(found, MAX_FILES):
+        with suppress(ConfigError, OSError, KeyError, TypeError):
+            yield str(read_tables(other)["instance"]["name"])

@@ -1,4 +1,4 @@
-"""A configuration to start from, made by a program; what ``init`` prints is in tests/unit/cli."""
+"""``shmio-supervisor init``: the configuration that it makes; what it prints is in test_supervisor.py."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from shmio.cli.instance.init import new_config, vacant_name
 from shmio.config import load
 from shmio.errors import ConfigError
-from shmio.plan.new_config import new_config, vacant_name
 
 DB = """DATA_BLOCK "Cell"
 STRUCT

@@ -1,1 +1,0 @@
-"""The A50 example that ``shmio-supervisor init`` writes; data only."""
