@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any, Literal
 
 import msgspec
-import numpy as np
 
 from shmio.errors import ValueRangeError
 from shmio.layout.model import ElementType, Register
@@ -76,6 +75,8 @@ def shortest(value: float, element: ElementType) -> float:
 
 
 def _shortest_real(value: float) -> float:
+    import numpy as np  # noqa: PLC0415  the command line prints and reads other values without it
+
     return float(str(np.float32(value)))
 
 
