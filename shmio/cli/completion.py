@@ -72,7 +72,7 @@ def _nothing(**_: object) -> list[str]:
 
 
 def _instances(**_: object) -> list[str]:
-    from shmio.segment import running_instances  # noqa: PLC0415  what this one needs alone, for it is waited for
+    from shmio.segment import running_instances  # noqa: PLC0415  nothing else: the user waits for the shell
 
     return running_instances()
 
@@ -98,7 +98,7 @@ def _registers(prefix: str, parsed_args: argparse.Namespace, **_: object) -> lis
     found = _paths(parsed_args)
     paths = [f"{source}/{path}" for source, ones in found.items() for path in ones]
     if len(found) == 1 and not any(path.startswith(prefix) for path in paths):
-        paths = [path for ones in found.values() for path in ones]  # its name may be left out
+        paths = [path for ones in found.values() for path in ones]  # the only source's name may be left out
     ends = ((path, path.find("/", len(prefix)) + 1) for path in paths if path.startswith(prefix))
     return sorted({path[:end] if end else path for path, end in ends})
 

@@ -29,7 +29,7 @@ from shmio.model.cell import Campaign, Cell
 from shmio.model.injection import Happening
 
 TURN_S: Final = 0.2
-"""Interval between looks for a campaign's events, signals and the end of the time."""
+"""Interval at which a campaign's events, signals and the end of the time are checked."""
 SEED_BITS: Final = 32
 
 
@@ -132,7 +132,7 @@ def _list(cell: Cell, *, as_json: bool) -> None:
         bits = (Write(offset, mask, bytes(size)) for offset, size, mask in one.ranges)
         over = [f"{one.source}/{path}" for path in paths_of(layouts[one.source], bits)]
         fields = msgspec.to_builtins(one)
-        if one.running is not None:  # the keys in one order, whatever the cell
+        if one.running is not None:  # the same order of keys from a local and a remote cell
             declaration = msgspec.convert(one.running.declaration, Declaration)
             fields["running"]["declaration"] = msgspec.to_builtins(declaration)
         found.append(
@@ -176,7 +176,7 @@ def _running(running: dict[str, Any] | None) -> str:
 
 
 def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
-    """Run a campaign until all of it is over, the time is up, or Ctrl-C.
+    """Run a campaign until all its injections are over, the time is up, or Ctrl-C.
 
     With ``keep``, return as soon as it has started. ConfigError, CommandError: nothing was started.
     """
@@ -205,7 +205,7 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
     deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
     names = {(one.source, one.number): one.name for one in campaign.declared}
     unheard = set(names)
-    while unheard:  # the record begins with the injections' start
+    while unheard:  # the events begin with the start of each injection
         happening = next(campaign)
         unheard.discard((happening.source, happening.number))
         _print_event(happening, names, as_json=options.json)

@@ -61,13 +61,13 @@ def _size(text: str) -> tuple[str, int]:
 def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], *, as_json: bool) -> int:
     program = Program([_read(name) for name in names])
     if block is not None and block.lower() not in {held.name.lower() for held in program.blocks}:
-        program.compile(())  # which says so if the sources are damaged
+        program.compile(())  # reports damaged sources first
         held = ", ".join(held.name for held in program.blocks)
         raise ConfigError(f"--block: no data block {block!r}; there are: {held}")
     try:
         compiled = program.compile(None if block is None else (block,), sizes)
     except LayoutError as error:
-        _complain(one for one in error.diagnostics if one.severity == "warning")  # its text has the errors
+        _complain(one for one in error.diagnostics if one.severity == "warning")  # the error's own text has the others
         raise
     _complain(compiled.warnings)
     _complain(f"warning: --type-bytes: nothing has the type {name!r}" for name in compiled.unused)

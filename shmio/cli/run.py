@@ -78,7 +78,7 @@ def load(command: str) -> Callable[[argparse.Namespace], int]:
 def complete(parser: argparse.ArgumentParser) -> None:
     """Answer a shell's request for completion and exit; otherwise do nothing."""
     if "_ARGCOMPLETE" in os.environ:
-        from shmio.cli.completion import answer  # noqa: PLC0415  not for those who run a command
+        from shmio.cli.completion import answer  # noqa: PLC0415  only for a shell
 
         answer(parser)
 

@@ -90,7 +90,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         if options.json and outcomes:
             raise PartlyDoneError(str(error), _described(outcomes)) from error
         raise
-    finally:  # also of what was written before a later source took nothing
+    finally:  # also what was written before a later source accepted nothing
         if not options.json:
             _print(outcomes, failed[0][1].text if failed else "")
     if options.json:

@@ -83,7 +83,7 @@ def _play(cell: Cell, rate: float, dt_s: float | None) -> None:
     with stop_on_signals() as over:
         cell.play(rate, dt_s)
         while not over.wait(LOOK_S) and cell.clock().playing:
-            pass  # until it is told to stop, or a step fails
+            pass  # until a signal comes, or a step fails
         cell.pause()
 
 

@@ -81,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
-    """Open the instance that the options of ``shmio`` name, here or, with ``--host``, behind an endpoint.
+    """Open the instance that the options name: on this host, or with ``--host`` behind an endpoint.
 
     Raises:
         ConfigError: ``--host`` comes with options for an instance here, or the address is invalid.
@@ -96,9 +96,9 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
         return
     if arguments.config is not None or arguments.instance is not None:
         raise ConfigError("--host names the instance already: leave out -c and --instance")
-    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what is wrong it tells us, too
-    with ended_by_interrupt():  # gRPC crashes when it is broken off while it is loaded
-        from shmio.client import connect  # noqa: PLC0415  for those who ask for it alone
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # the errors that it raises say the same
+    with ended_by_interrupt():  # gRPC crashes if an exception interrupts its import
+        from shmio.client import connect  # noqa: PLC0415  only for --host
     if not arguments.host.startswith(UNIX):
         Address.parse(arguments.host)
     token = arguments.token_file.read_text().strip() if arguments.token_file else None

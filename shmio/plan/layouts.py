@@ -26,7 +26,7 @@ class LayoutFiles:
         self._compiled: dict[object, compiler.Compiled | LayoutError] = {}
         self.warnings: list[str] = []
         self.odd: list[str] = []
-        """What is odd about the sections' keys, each beginning with the key."""
+        """Remarks on keys that are probably mistakes; each begins with the key."""
 
     def get(self, key: str, section: Source | Emulator, number: int | None) -> Layout:
         """Return the layout of a section's data block.

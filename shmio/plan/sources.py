@@ -73,7 +73,7 @@ def _check_source(
     options = _options(key, source, faults)
     try:
         connector = registry.load(source.connector)
-    except ConfigError:  # which is told with the options
+    except ConfigError:  # reported with the options
         return
     if issubclass(connector, Computed | Replayed):
         found.computed.append(source.name)
@@ -87,7 +87,7 @@ def _check_source(
             found.layouts[source.name], inputs[index] = _model(key, source, config, files)
         return
     layout = found.layouts[source.name] = files.get(key, source, source.options.get("dbNumber"))
-    if options is None:  # its faults are told; what else the connector would say is told with them
+    if options is None:  # its faults are reported, and so are those that the connector finds
         options = _filled(connector.Options, source)
         if options is None:
             return

@@ -56,9 +56,9 @@ def _taken(file: Path, plan: Plan) -> list[str]:
 
 
 def _unserved(prepared: Prepared) -> list[str]:
-    """Return a note for each S7 source that reads this host where nobody listens, nor will.
+    """Return a note for each S7 source that reads from this host where nothing listens.
 
-    If the file has emulators, that is a warning.
+    If the file has emulators, ``prepare`` warns instead.
     """
     notes = []
     for source in prepared.config.source if not prepared.config.emulator else ():

@@ -25,7 +25,7 @@ from shmio.segment import PREFIX
 from shmio.supervisor.process import child_environment
 
 DETACH_S = 120.0
-"""The longest time that the start of a detached instance is waited for."""
+"""Time-out of the start of a detached instance."""
 _OPTIONS: Final = ("from", "start", "end", "speed", "injections")
 _FLAGS: Final = ("loop", "paused", "record")
 
@@ -98,7 +98,7 @@ def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path)
 
 
 def replay_keys(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the command line's options as keys of ``[replay]``; ConfigError in other modes."""
+    """Return the options of the command line as keys of ``[replay]``; ConfigError in other modes."""
     found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}
     if found and arguments.mode != "replay":
         raise ConfigError(f"--{next(iter(found))} goes with --mode replay only")
@@ -122,13 +122,13 @@ def _await(fd: int) -> tuple[str, Started]:
     """Wait for the start; return the log file and the message, or raise ControlError."""
     log_file = ""
     for line in _lines(fd):
-        told = msgspec.json.decode(line, type=StartMessage)
-        if isinstance(told, Started):
-            return log_file, told
-        if isinstance(told, Failed):
-            raise ControlError(told.error)
-        log_file = told.log_file
-        for warning in told.warnings:
+        message = msgspec.json.decode(line, type=StartMessage)
+        if isinstance(message, Started):
+            return log_file, message
+        if isinstance(message, Failed):
+            raise ControlError(message.error)
+        log_file = message.log_file
+        for warning in message.warnings:
             say(warning, sys.stderr)
     raise ControlError(f"the supervisor died while it started; see {log_file or 'above'}")
 

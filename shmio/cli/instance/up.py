@@ -95,7 +95,7 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
     except OSError as error:
         tell(Failed(printable(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
         return 1
-    tell(Failed("it was told to stop while it started"))
+    tell(Failed("it was stopped while it started"))
     return 0
 
 

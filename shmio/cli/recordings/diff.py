@@ -16,7 +16,7 @@ from shmio.recording.dump import open_dump
 from shmio.recording.times import iso, local
 
 MAX_SHOWN = 50
-"""Registers and elements, and things of the first difference, that are printed; with --json all."""
+"""The most registers, and details of a first difference, that are printed; ``--json`` prints all."""
 
 
 def diff(arguments: argparse.Namespace) -> int:

@@ -26,7 +26,7 @@ SHEETS: Final = frozenset({"ods", "xls", "xlsx"})
 OTHERS: Final = frozenset(
     {"arrow", "db", "duckdb", "feather", "h5", "hdf5", "json", "jsonl", "mat", "mem", "tsv", "txt"}
 )
-"""A folder with such a name is not meant."""
+"""Endings that ``export`` does not write; a name with one is not taken for a folder."""
 
 
 def export(arguments: argparse.Namespace) -> int:

@@ -26,7 +26,7 @@ from shmio.supervisor import control
 BY = "shmio-dump"
 WHERE_S = 2.0
 LOOK_S = 0.5
-"""How often it is looked whether the instance still is, and the disk well."""
+"""Interval at which the instance and the disk are checked."""
 
 
 def record(arguments: argparse.Namespace) -> int:
@@ -102,7 +102,7 @@ def _record(
 
 
 def _attachments(segment: Segment, news: Reporter) -> AttachedFiles:
-    """Return the files of the configuration, if the supervisor knows its place."""
+    """Return what attaches the configuration's files; if their place is unknown, report that and attach nothing."""
     try:
         return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
     except (ControlError, KeyError) as error:
