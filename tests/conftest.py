@@ -58,7 +58,7 @@ START_PROCESSES = (
     "tests/unit/cli/test_supervisor.py::test_a_fault_that_a_detached_one_finds_is_told_here",
     "tests/unit/client/test_generated.py",
     "tests/unit/endpoints/mqtt/broker/",
-    "tests/unit/plan/test_models.py",
+    "tests/unit/plan/test_sources_models.py",
     "tests/unit/simulation/test_a50.py::test_runs_as_a_source_on_db201",
     "tests/unit/simulation/test_howto.py",
 )

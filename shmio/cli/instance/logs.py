@@ -23,6 +23,14 @@ from shmio.logs import printable
 from shmio.plan.processes import process_names
 from shmio.supervisor import control
 
+WHERE_S = 5.0
+SUPERVISOR = "supervisor"
+
+_LINE = re.compile(
+    r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
+)
+"""As shmio.logs writes it."""
+
 MAX_LINE_BYTES: Final = 65536
 _STAMP = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z ")
 
@@ -31,6 +39,62 @@ _IN_MODIFY: Final = 0x0002
 _IN_MOVED_TO: Final = 0x0080
 _IN_CREATE: Final = 0x0100
 _EVENT_ROOM: Final = 65536
+
+
+def logs(arguments: argparse.Namespace) -> int:
+    """Print the last lines, and with ``-f`` new lines until Ctrl-C."""
+    folder, processes = _where(arguments)
+    names = [SUPERVISOR, *processes]
+    if arguments.name is not None:
+        if arguments.name not in names:
+            raise ConfigError(f"no process {arguments.name!r}; there are: {', '.join(names)}")
+        names = [arguments.name]
+    files = [folder / f"{name}.log" for name in names]
+    if not any(file.exists() for file in files):
+        raise ConfigError(f"no log file in {folder} yet")
+    if not arguments.follow:
+        _print(last_lines(files, arguments.lines), as_json=arguments.json)
+        return 0
+    with Follower(files) as follower:
+        _print(last_lines(files, arguments.lines), as_json=arguments.json)
+        while True:
+            _print(follower.wait(), as_json=arguments.json)
+
+
+def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
+    """Return the log folder and the process names.
+
+    They come from the configuration, or else from the running instance, whose file may be gone.
+    Running processes that are not in the file, such as a replay's sources, are included.
+    """
+    wanted = target(arguments)
+    if wanted.file is not None:
+        config = load(wanted.file)
+        return config.log_dir, list(dict.fromkeys([*process_names(config), *_running(wanted)]))
+    with wanted.open_supervised() as segment:
+        names = [slot.name for slot in segment.processes]
+        return Path(ask(segment, control.Where(), WHERE_S)["log_dir"]), names
+
+
+def _running(wanted: Target) -> list[str]:
+    with suppress(SegmentError), wanted.open() as segment:
+        return [slot.name for slot in segment.processes]
+    return []
+
+
+def _print(lines: Iterable[bytes], *, as_json: bool) -> None:
+    for line in lines:
+        text = line.decode(errors="replace")
+        print(dumps(_parsed(text)) if as_json else printable(text))
+    sys.stdout.flush()
+
+
+def _parsed(line: str) -> dict[str, Any]:
+    """Split a line; a continuation, such as a line of a traceback, has only text."""
+    found = _LINE.fullmatch(line)
+    if found is None:
+        return {"time": None, "level": None, "process": None, "pid": None, "text": line}
+    return {**found.groupdict(), "pid": int(found["pid"])}
 
 
 def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
@@ -140,68 +204,3 @@ def _watch(folders: Iterable[Path]) -> int:
             hint = "too many watches (fs.inotify.max_user_watches)" if number == errno.ENOSPC else os.strerror(number)
             raise OSError(number, hint, str(folder))
     return fd
-
-
-WHERE_S = 5.0
-SUPERVISOR = "supervisor"
-
-_LINE = re.compile(
-    r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
-)
-"""As shmio.logs writes it."""
-
-
-def logs(arguments: argparse.Namespace) -> int:
-    """Print the last lines, and with ``-f`` new lines until Ctrl-C."""
-    folder, processes = _where(arguments)
-    names = [SUPERVISOR, *processes]
-    if arguments.name is not None:
-        if arguments.name not in names:
-            raise ConfigError(f"no process {arguments.name!r}; there are: {', '.join(names)}")
-        names = [arguments.name]
-    files = [folder / f"{name}.log" for name in names]
-    if not any(file.exists() for file in files):
-        raise ConfigError(f"no log file in {folder} yet")
-    if not arguments.follow:
-        _print(last_lines(files, arguments.lines), as_json=arguments.json)
-        return 0
-    with Follower(files) as follower:
-        _print(last_lines(files, arguments.lines), as_json=arguments.json)
-        while True:
-            _print(follower.wait(), as_json=arguments.json)
-
-
-def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
-    """Return the log folder and the process names.
-
-    They come from the configuration, or else from the running instance, whose file may be gone.
-    Running processes that are not in the file, such as a replay's sources, are included.
-    """
-    wanted = target(arguments)
-    if wanted.file is not None:
-        config = load(wanted.file)
-        return config.log_dir, list(dict.fromkeys([*process_names(config), *_running(wanted)]))
-    with wanted.open_supervised() as segment:
-        names = [slot.name for slot in segment.processes]
-        return Path(ask(segment, control.Where(), WHERE_S)["log_dir"]), names
-
-
-def _running(wanted: Target) -> list[str]:
-    with suppress(SegmentError), wanted.open() as segment:
-        return [slot.name for slot in segment.processes]
-    return []
-
-
-def _print(lines: Iterable[bytes], *, as_json: bool) -> None:
-    for line in lines:
-        text = line.decode(errors="replace")
-        print(dumps(_parsed(text)) if as_json else printable(text))
-    sys.stdout.flush()
-
-
-def _parsed(line: str) -> dict[str, Any]:
-    """Split a line; a continuation, such as a line of a traceback, has only text."""
-    found = _LINE.fullmatch(line)
-    if found is None:
-        return {"time": None, "level": None, "process": None, "pid": None, "text": line}
-    return {**found.groupdict(), "pid": int(found["pid"])}
