@@ -112,8 +112,7 @@ def _loop_of(worker: Worker) -> _LoopHandle:
 def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
     """Create the loop that plays a recording."""
     from shmio.connectors.replay.loop import ReplayLoop  # noqa: PLC0415  the other sources read no recordings
-    from shmio.connectors.replay.source import Replay  # noqa: PLC0415
-    from shmio.connectors.replay.start import begin  # noqa: PLC0415
+    from shmio.connectors.replay.source import Replay, begin  # noqa: PLC0415
 
     segment = worker.segment
     source = Replay(options, worker.name)

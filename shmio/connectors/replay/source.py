@@ -1,19 +1,19 @@
-"""The replay source: its keys, and its recording."""
+"""The replay source: its keys, its recording, and how it starts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Iterable, Sequence
+from typing import Annotated, NamedTuple
 
 import msgspec
 
 from shmio.config.model import ReplayedInjections
 from shmio.connectors.base import Replayed
-from shmio.connectors.replay.recorded_source import RecordedSource
-from shmio.connectors.replay.recording import Recording, Span
-from shmio.errors import ConfigError, RecordingError
+from shmio.connectors.replay.recording import RecordedSource, Recording, Span
+from shmio.errors import ConfigError, RecordingError, SegmentError
 from shmio.layout.model import Layout
-from shmio.segment.playhead import MAX_SPEED, MIN_SPEED
+from shmio.segment import NO_WRITER, Block, Stamp
+from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Playhead, PlayState
 
 File = Annotated[str, msgspec.Meta(min_length=1)]
 
@@ -90,3 +90,97 @@ def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Sp
         return span, recording.recorded(options.source or name, span)
     except RecordingError as error:
         raise ConfigError(f"source: {error}") from None
+
+
+class ReplayStart(NamedTuple):
+    """How a source plays from now on.
+
+    ``done_ns`` is the position up to which the previous process has published the same recording;
+    None if there was none.
+    """
+
+    play: PlayState
+    done_ns: int | None
+
+    @property
+    def at(self) -> Stamp:
+        """The stamp of the process's start: that of the next entry, however long the start took."""
+        play, done_ns = self
+        position_ns = play.begin_ns if done_ns is None else done_ns
+        return stamp(play, position_ns, position_ns)
+
+
+def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> ReplayStart:
+    """Set the playhead of a block, unless it is set for this recording already.
+
+    Args:
+        source: The recording to play.
+        block: The block of the source.
+        started_ns: When the segment was created.
+        blocks: All blocks of the instance.
+
+    Raises:
+        SegmentError: The block has no playhead.
+
+    """
+    heads = [other.playhead for other in blocks if other.playhead is not None]
+    if block.playhead is None or not heads:
+        raise SegmentError(f"the block of source {block.source} has no playhead")
+    own = block.playhead.read()
+    if own is not None and _is_of(source, own):  # without the lock: its holder may wait for this process
+        return ReplayStart(own, _done_ns(block, own))
+    with heads[0].held():  # sources that begin at the same time begin together
+        others = as_others(source, heads)
+        play = _as_configured(source, block, started_ns) if others is None else others
+        play = play._replace(step=0, asked=block.playhead.asked(), answer="")  # earlier requests were for others
+        block.playhead.write(play)
+        return ReplayStart(play, None)
+
+
+def _done_ns(block: Block, play: PlayState) -> int | None:
+    """Return the position of the last frame, or of the last event without an owner behind it."""
+    last = block.latest()
+    if last is None:
+        return None
+    event = block.events.read(block.events.head())
+    behind = event is not None and event.frame == last.number and event.writer == NO_WRITER
+    return max(last.publish_ns, event.publish_ns if event is not None and behind else 0) - play.base_ns
+
+
+def _is_of(source: Replay, play: PlayState) -> bool:
+    return (play.begin_ns, play.end_ns, play.utc_ns) == (*source.span, source.recording.utc_ns)
+
+
+def as_others(source: Replay, heads: Iterable[Playhead]) -> PlayState | None:
+    """Return the replay state of the other sources of the same recording, as last requested.
+
+    None if there are no other sources.
+    """
+    plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
+    return max(plays, key=lambda play: play.anchor_ns, default=None)
+
+
+def _as_configured(source: Replay, block: Block, started_ns: int) -> PlayState:
+    span, options = source.span, source.options
+    recorded = options.own_clock
+    now_ns = block.clock.read().present_ns
+    return PlayState(
+        span.begin_ns,
+        span.end_ns,
+        anchor_ns=span.begin_ns if recorded else now_ns,
+        position_ns=span.begin_ns,
+        until_ns=span.end_ns,
+        base_ns=started_ns + (0 if recorded else now_ns - span.begin_ns),
+        utc_ns=source.recording.utc_ns,
+        speed=options.speed,
+        paused=options.paused,
+        loop=options.loop,
+        own_clock=recorded,
+    )
+
+
+def stamp(play: PlayState, position_ns: int, clock_ns: int) -> Stamp:
+    """Return the stamp of a position; ``clock_ns`` is the recorded clock."""
+    if not play.own_clock:
+        clock_ns = play.due_ns(max(position_ns, play.position_ns))
+    return Stamp(play.base_ns + position_ns, clock_ns)

@@ -14,8 +14,7 @@ from typing import Any
 from shmio.connectors.injection_layers import Owner
 from shmio.connectors.models.stepped import PageClock
 from shmio.connectors.replay.loop import ReplayLoop
-from shmio.connectors.replay.source import Replay
-from shmio.connectors.replay.start import begin
+from shmio.connectors.replay.source import Replay, begin
 from shmio.layout.model import Layout, Register
 from shmio.segment import (
     Attributes,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.connectors.replay.player import GOES_ON, OVER, STOPPED
+from shmio.connectors.replay.loop import GOES_ON, OVER, STOPPED
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.local import replays
 from shmio.local.attach import Attachment, attach

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from shmio.connectors.replay.loop import Search
-from shmio.connectors.replay.player import NOTHING, Player
-from shmio.connectors.replay.recorded_source import Entry, RecordedSource
-from shmio.connectors.replay.recording import Recording
+from shmio.connectors.replay.loop import NOTHING, Player, Search
+from shmio.connectors.replay.recording import Entry, RecordedSource, Recording
 from shmio.connectors.replay.source import Replay
 from shmio.errors import CommandError, ConfigError, RecordingError
 from shmio.local.attach import attach

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.connectors.replay.player import OVER, STOPPED
+from shmio.connectors.replay.loop import OVER, STOPPED
 from shmio.local.attach import attach
 from shmio.local.time_control import Coordinator
 from shmio.local.writer import SourceWriter
