@@ -55,9 +55,11 @@ GROUPS: Final = {
     ),
     "streams": Group(
         (
+            "shmio/endpoints/grpc/encoding.py",
+            "shmio/endpoints/grpc/wakeups.py",
             "shmio/endpoints/grpc/streams/*.py",
-            "shmio/endpoints/grpc/commands/followers.py",
-            "shmio/endpoints/grpc/commands/publish.py",
+            "shmio/endpoints/grpc/commands/injections.py",
+            "shmio/endpoints/grpc/services/publish.py",
             "shmio/endpoints/grpc/services/simlog_v2.py",
         ),
         (
@@ -69,6 +71,7 @@ GROUPS: Final = {
             "tests/unit/endpoints/grpc/test_limits.py",
             "tests/unit/endpoints/grpc/test_stepping.py",
             "tests/unit/endpoints/grpc/test_structures.py",
+            "tests/unit/endpoints/grpc/test_wakeups.py",
         ),
     ),
     "recorder": Group(

@@ -17,9 +17,8 @@ from shmio.endpoints.grpc.server import limits
 from shmio.endpoints.grpc.server.access import Listeners
 from shmio.endpoints.grpc.server.server import Server
 from shmio.endpoints.grpc.services.services import Services
-from shmio.endpoints.grpc.streams.feed import Feeds
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
-from shmio.endpoints.grpc.time.virtual_time import VirtualTime
+from shmio.endpoints.grpc.streams.feed import Feeds, VirtualTime
+from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.errors import SegmentError, ShmioError
 from shmio.logs import LogRateLimit, fields
 from shmio.worker import BEAT_S, Worker

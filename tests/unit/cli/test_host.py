@@ -18,7 +18,7 @@ from shmio.cli.user import main
 from shmio.segment import Segment
 from shmio.testing.cell import BIN
 from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
-from tests.unit.endpoints.grpc.commands.test_publish import with_plant
+from tests.unit.endpoints.grpc.services.test_publish import with_plant
 from tests.unit.endpoints.harness import Endpoint
 from tests.unit.endpoints.plant import Plant
 from tests.unit.endpoints.stepped import Model, simulate, stepped_segment

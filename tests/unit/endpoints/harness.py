@@ -19,9 +19,8 @@ from shmio.endpoints.grpc.server.access import Keys, Listener, ListenerAccess
 from shmio.endpoints.grpc.server.call_guard import CallLimits, OpenCalls
 from shmio.endpoints.grpc.server.server import Server
 from shmio.endpoints.grpc.services.services import Services
-from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
-from shmio.endpoints.grpc.time.virtual_time import VirtualTime
+from shmio.endpoints.grpc.streams.feed import Feed, VirtualTime
+from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockWriter, Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire

@@ -18,7 +18,7 @@ from shmio.wire import shmio_v1_pb2 as ours
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as simserver
-from tests.unit.endpoints.grpc.commands.test_publish import plant
+from tests.unit.endpoints.grpc.services.test_publish import plant
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, endpoint, message, value
 from tests.unit.endpoints.plant import Plant
 

@@ -1,1 +1,1 @@
-"""Commands from gRPC clients: paths resolved, values sent to sources, outcomes returned."""
+"""Commands to a block's source: values sent, outcomes returned, and the events about both."""

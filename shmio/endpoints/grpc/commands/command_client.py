@@ -12,9 +12,9 @@ from typing import Any, Final, Unpack
 import msgspec
 
 from shmio.config import Declaration
-from shmio.endpoints.grpc.commands.followers import InjectionFollower, InjectionFollowers
+from shmio.endpoints.grpc.commands.injections import InjectionFollower, InjectionFollowers
 from shmio.endpoints.grpc.commands.write_subscriptions import WriteSubscriptions
-from shmio.endpoints.grpc.streams.wakeups import BatchReader, WakeUps
+from shmio.endpoints.grpc.wakeups import BatchReader, WakeUps
 from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, Done, InFlightTable
 from shmio.errors import CommandError
 from shmio.layout.model import Register

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sized
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
-from shmio.endpoints.grpc.streams.channel import Subject
+from shmio.endpoints.grpc.encoding import ShownImage, Subject
 from shmio.layout.values.write import Write, covering
 from shmio.segment import Block, Event, EventKind
 from shmio.segment.commands import NO_COMMAND, apply
@@ -71,14 +71,6 @@ class InChannel:
 
 
 Message = tuple[InChannel, Sized]
-
-
-class _Written(NamedTuple):
-    """A :class:`BlockImage` that has the accepted writes in it."""
-
-    number: int
-    clock_ns: int
-    image: bytes
 
 
 class WriteSubscriptions:
@@ -189,6 +181,6 @@ class WriteSubscriptions:
         return messages
 
     def _show(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
-        message = channel.encode(_Written(*self._stamp(event), bytes(self._pending_image.image)))
+        message = channel.encode(ShownImage(*self._stamp(event), bytes(self._pending_image.image)))
         if message is not None:
             messages.append((channel, message))

@@ -7,18 +7,17 @@ from typing import Any
 
 import grpc
 
-from shmio.endpoints.grpc.commands.publish import Publisher
-from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.injection.injections import Shadows
+from shmio.endpoints.grpc.services.injection import Shadows
+from shmio.endpoints.grpc.services.publish import Publisher
 from shmio.endpoints.grpc.services.simlog_v1 import SimlogV1
 from shmio.endpoints.grpc.services.simlog_v2 import SimlogV2
 from shmio.endpoints.grpc.services.simserver import SimServer
 from shmio.endpoints.grpc.shmio_v1.service import ShmioV1
-from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.feed import Feed, VirtualTime
 from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.endpoints.grpc.time.stepper import Stepper
-from shmio.endpoints.grpc.time.virtual_time import VirtualTime
+from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.segment import ProcessSlot, Segment
 
 
@@ -51,7 +50,7 @@ class Services:
         self._shadows = Shadows(topics)
         self._publisher = Publisher(topics, self._shadows)
         self.stepper = Stepper(
-            segment, slot, virtual_time, wake_ups, feeds, self._outboxes, self._publisher, open_streams
+            segment, slot, virtual_time, wake_ups, feeds, self._outboxes, self._publisher.settle, open_streams
         )
         """Moves the instance's time for all services."""
         self._shmio_v1 = ShmioV1(topics, feeds, wake_ups, segment, self.stepper, open_streams)

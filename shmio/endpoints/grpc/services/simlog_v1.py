@@ -11,16 +11,15 @@ from typing import Any, Final
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.commands.publish import Publisher, Request
-from shmio.endpoints.grpc.commands.topics import Shape, TimeTopic, Topics, shape
-from shmio.endpoints.grpc.injection.injection import Injection
-from shmio.endpoints.grpc.injection.injections import ShadowKind, Shadows, shadow_path
+from shmio.endpoints.grpc.encoding import Subject
 from shmio.endpoints.grpc.server.error_status import Context, refuse
+from shmio.endpoints.grpc.services.injection import Injection, ShadowKind, Shadows, shadow_path
+from shmio.endpoints.grpc.services.publish import Publisher, Request
 from shmio.endpoints.grpc.services.simlog_v1_values import encoder, message_type, read, time_stamp
-from shmio.endpoints.grpc.streams.channel import Subject
+from shmio.endpoints.grpc.streams.feed import Moment
 from shmio.endpoints.grpc.streams.outbox import EventLane, Lane, Outbox, Outboxes, StateLane
 from shmio.endpoints.grpc.time.stepper import Stepper
-from shmio.endpoints.grpc.time.virtual_time import Moment
+from shmio.endpoints.grpc.topics import Shape, TimeTopic, Topics, shape
 from shmio.errors import PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields

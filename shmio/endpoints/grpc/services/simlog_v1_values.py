@@ -12,9 +12,8 @@ from typing import Any, Final
 
 from google.protobuf.message import Message
 
-from shmio.endpoints.grpc.commands.topics import Shape
-from shmio.endpoints.grpc.streams.channel import BlockImage, Encode
-from shmio.endpoints.grpc.streams.encoding import delimited, varint
+from shmio.endpoints.grpc.encoding import BlockImage, Encode, delimited, varint
+from shmio.endpoints.grpc.topics import Shape
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.layout.structures import CONTENTS, Found, recognise

@@ -13,12 +13,11 @@ from typing import Any, Final
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.commands.publish import Publisher, Request
-from shmio.endpoints.grpc.commands.topics import Shape, TimeTopic, Topics, shape
-from shmio.endpoints.grpc.injection.injections import Shadow, ShadowKind, Shadows, shadow_paths
 from shmio.endpoints.grpc.server.access import holder_of
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.server.limits import time_sliced
+from shmio.endpoints.grpc.services.injection import Shadow, ShadowKind, Shadows, shadow_paths
+from shmio.endpoints.grpc.services.publish import Publisher, Request
 from shmio.endpoints.grpc.services.simlog_v2_values import (
     MAX_ELEMENTS,
     MAX_MEMBERS,
@@ -34,7 +33,8 @@ from shmio.endpoints.grpc.services.simlog_v2_values import (
     value_type,
 )
 from shmio.endpoints.grpc.streams.outbox import EventLane, Finish, Lane, Outbox, Outboxes, StateLane
-from shmio.endpoints.grpc.time.time_topics import TimeTopics
+from shmio.endpoints.grpc.time.timeline import TimeTopics
+from shmio.endpoints.grpc.topics import Shape, TimeTopic, Topics, shape
 from shmio.errors import ConflictError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields

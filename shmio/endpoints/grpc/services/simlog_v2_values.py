@@ -14,10 +14,9 @@ import numpy as np
 from google.protobuf.struct_pb2 import NULL_VALUE, ListValue
 from google.protobuf.struct_pb2 import Value as WireValue
 
-from shmio.endpoints.grpc.commands.topics import Shape, TimeTopic
-from shmio.endpoints.grpc.streams.channel import BlockImage, Subject
-from shmio.endpoints.grpc.streams.encoding import delimited, varint
-from shmio.endpoints.grpc.time.virtual_time import Moment
+from shmio.endpoints.grpc.encoding import BlockImage, Subject, delimited, varint
+from shmio.endpoints.grpc.streams.feed import Moment
+from shmio.endpoints.grpc.topics import Shape, TimeTopic
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import decode_segment, encode_segment, shorten

@@ -12,7 +12,7 @@ from google.protobuf.empty_pb2 import Empty
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.streams.outbox import Outboxes, StateLane
 from shmio.endpoints.grpc.time.stepper import Stepper
-from shmio.endpoints.grpc.time.virtual_time import TimeStatus
+from shmio.endpoints.grpc.time.timeline import TimeStatus
 from shmio.errors import ShmioError
 from shmio.wire import simserver_pb2 as wire
 

@@ -9,10 +9,10 @@ from typing import Any, Final
 
 import grpc
 
+from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.server.error_status import Context, refuse
-from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.time.stepper import Stepper
-from shmio.endpoints.grpc.time.virtual_time import TimeStatus
+from shmio.endpoints.grpc.time.timeline import TimeStatus
 from shmio.errors import EndpointError, ShmioError, ValueRangeError
 from shmio.model.clock import Clock
 from shmio.segment import Segment

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from shmio.endpoints.grpc.streams.encoding import field
+from shmio.endpoints.grpc.encoding import field
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values.codec import Buffer, Scalar, scalar_codec
 from shmio.model.values import Column

@@ -9,7 +9,6 @@ from typing import Any, Final
 import grpc
 
 from shmio.endpoints.grpc.commands import command_client
-from shmio.endpoints.grpc.commands.topics import Topics
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1 import describe
 from shmio.endpoints.grpc.shmio_v1.declare import DeclareCall
@@ -17,7 +16,8 @@ from shmio.endpoints.grpc.shmio_v1.inject import InjectCall
 from shmio.endpoints.grpc.shmio_v1.selection import Selections
 from shmio.endpoints.grpc.shmio_v1.values import assigned, outcome
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.segment import Block

@@ -14,8 +14,8 @@ from shmio.config.campaign import parse_campaign
 from shmio.config.declaration import MAX_DECLARATIONS
 from shmio.endpoints.grpc.commands import command_client
 from shmio.endpoints.grpc.commands.command_client import CommandClient
-from shmio.endpoints.grpc.commands.followers import InjectionFollower
-from shmio.endpoints.grpc.streams.encoding import field
+from shmio.endpoints.grpc.commands.injections import InjectionFollower
+from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import SendQueue
 from shmio.errors import CommandError, ValueRangeError

@@ -9,16 +9,15 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from shmio.endpoints.grpc.commands import command_client
-from shmio.endpoints.grpc.commands.followers import InjectionFollower
-from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.injection.injection_base import InjectionBase
+from shmio.endpoints.grpc.commands.injections import InjectionBase, InjectionFollower
+from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.shmio_v1.columns import Array, pack, pack_slots
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_PATTERNS, Selections, SourceDirection
 from shmio.endpoints.grpc.shmio_v1.values import MAX_VALUES, assigned, outcome, packed
 from shmio.endpoints.grpc.shmio_v1.views import VALUES, head, head_of
-from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.streams.outbox import SendQueue
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.layout.values.write import Write, covering, merge

@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 from weakref import WeakValueDictionary
 
 from shmio.endpoints.grpc.commands.command_client import CommandClient
-from shmio.endpoints.grpc.commands.topics import Topics
 from shmio.endpoints.grpc.shmio_v1.views import RawFrames, Selection, View
+from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import EndpointError, PathError, ValueRangeError
 from shmio.layout.glob import named
 from shmio.layout.model import Register

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import grpc
 
-from shmio.endpoints.grpc.commands.topics import Topics
+from shmio.endpoints.grpc.encoding import field, number
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1 import describe
 from shmio.endpoints.grpc.shmio_v1.clock import TimeCalls
@@ -19,12 +19,12 @@ from shmio.endpoints.grpc.shmio_v1.selection import Selections
 from shmio.endpoints.grpc.shmio_v1.simulate import SimulateCalls
 from shmio.endpoints.grpc.shmio_v1.subscribe import SubscribeCall
 from shmio.endpoints.grpc.shmio_v1.views import AGE_NS, ORIGINALS, Selection, View, stale_fields
-from shmio.endpoints.grpc.streams.encoding import field, number
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import OpenStreams
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
-from shmio.endpoints.grpc.time.delivery import PATIENCE_S
 from shmio.endpoints.grpc.time.stepper import Stepper
+from shmio.endpoints.grpc.time.timeline import PATIENCE_S
+from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.errors import EndpointError, ShmioError
 from shmio.local.time_control import Step
 from shmio.segment import Segment

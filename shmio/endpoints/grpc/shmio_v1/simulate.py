@@ -11,6 +11,7 @@ from typing import Any
 import grpc
 import numpy as np
 
+from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.server.limits import time_sliced
 from shmio.endpoints.grpc.shmio_v1.clock import clock
@@ -18,9 +19,8 @@ from shmio.endpoints.grpc.shmio_v1.columns import KINDS, DecodedImage, pack
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_ELEMENTS, MAX_REGISTERS
 from shmio.endpoints.grpc.shmio_v1.values import FIELDS, MAX_VALUES, plain
 from shmio.endpoints.grpc.shmio_v1.views import Selection
-from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import WakeUp
+from shmio.endpoints.grpc.wakeups import WakeUp
 from shmio.errors import CommandError, ConflictError, PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Register, index_at

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Final, Protocol
 
 from shmio.endpoints.grpc.commands.command_client import CommandClient
+from shmio.endpoints.grpc.encoding import field, number
 from shmio.endpoints.grpc.shmio_v1.columns import DecodedImage
 from shmio.endpoints.grpc.shmio_v1.selection import Selections, SourceDirection
 from shmio.endpoints.grpc.shmio_v1.views import (
@@ -21,10 +22,9 @@ from shmio.endpoints.grpc.shmio_v1.views import (
     head,
     stale_fields,
 )
-from shmio.endpoints.grpc.streams.encoding import field, number
+from shmio.endpoints.grpc.streams.feed import VirtualTime
 from shmio.endpoints.grpc.streams.outbox import SendQueue
-from shmio.endpoints.grpc.streams.wakeups import Callback, WakeUps
-from shmio.endpoints.grpc.time.virtual_time import VirtualTime
+from shmio.endpoints.grpc.wakeups import Callback, WakeUps
 from shmio.errors import EndpointError, PathError, SegmentError, ValueRangeError
 from shmio.local.time_control import Step
 from shmio.segment import Event, Frame, FrameFollower

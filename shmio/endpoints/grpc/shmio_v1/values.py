@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from shmio.endpoints.grpc.commands.topics import Topics
 from shmio.endpoints.grpc.server.limits import time_sliced
 from shmio.endpoints.grpc.shmio_v1.views import Selection
+from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import CommandError, ValueRangeError
 from shmio.layout.model import Register, index_at
 from shmio.layout.topic import shorten

@@ -10,8 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from shmio.endpoints.grpc.commands.write_subscriptions import PendingImage, ones
+from shmio.endpoints.grpc.encoding import field, number
 from shmio.endpoints.grpc.shmio_v1.columns import Columns, DecodedImage, column_of, merge, pack, pack_slots
-from shmio.endpoints.grpc.streams.encoding import field, number
 from shmio.layout.model import Register
 from shmio.layout.values.write import covering
 from shmio.model.values import Column

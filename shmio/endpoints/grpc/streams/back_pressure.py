@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Sized
-from typing import Final
+from typing import Final, Protocol
 
-from shmio.endpoints.grpc.streams.channel import Stream
 from shmio.segment import Block, FrameFollower
 
 WINDOW_S: Final = 0.25
@@ -110,6 +109,24 @@ FEW_FRAMES: Final = 8
 """A client that is behind gets this many frames, if they are new, so that it need not wait."""
 LOOK_S: Final = 0.02
 """Frames are read at least this often, even if all clients are busy: quality may be bad."""
+
+
+class Stream(Protocol):
+    """A client's stream, as back-pressure sees it."""
+
+    refills: dict[Callable[[], object], None]
+    """Functions that are called once, as soon as the stream has nothing to send."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether messages wait, or the client is still taking the last one."""
+
+    @property
+    def behind(self) -> bool:
+        """Whether the client loses so many values that it is far behind."""
+
+    def skip(self, frames: int, topics: int) -> None:
+        """Count frames that were not delivered to ``topics`` topics of a slow client."""
 
 
 class BackPressure:

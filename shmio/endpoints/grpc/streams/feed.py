@@ -3,16 +3,101 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sized
+from typing import Final, NamedTuple, Protocol
 
 from shmio.endpoints.grpc.commands.command_client import CommandClient
-from shmio.endpoints.grpc.streams.back_pressure import BackPressure
-from shmio.endpoints.grpc.streams.channel import Channel, ChannelTable, Listener, Subject
-from shmio.endpoints.grpc.streams.wakeups import BatchReader, WakeUps
-from shmio.endpoints.grpc.time.virtual_time import DeliveredImage, Moment, VirtualTime
+from shmio.endpoints.grpc.encoding import Subject
+from shmio.endpoints.grpc.streams.back_pressure import BackPressure, Stream
+from shmio.endpoints.grpc.wakeups import BatchReader, WakeUps
 from shmio.segment import Block, Event, Frame, FrameFollower, Quality, QualityChange, Segment
+from shmio.segment.changed_registers import ChangeScan, entries
 
-TURN_FRAMES = 8
+
+class Moment(NamedTuple):
+    """A step's number, and the simulation time after it, in ns since the instance's start."""
+
+    number: int
+    clock_ns: int
+
+
+class DeliveredImage(NamedTuple):
+    """A block's image after a step; ``raw``: as the source delivered it, without injections."""
+
+    number: int
+    clock_ns: int
+    image: bytes
+    raw: bytes
+
+
+class VirtualTime:
+    """Whether time is virtual (``on``), and the step that was delivered last (``moment``).
+
+    In virtual time, values of blocks on the instance's clock are delivered step by step.
+    For the event loop's thread.
+    """
+
+    def __init__(self) -> None:
+        self.on = False
+        self.look: Callable[[], object] = lambda: None
+        """Adopts steps that other programs have made; set by the timeline."""
+        self.moment = Moment(0, 0)
+
+
+class Listener(Protocol):
+    """A stream's subscription to one subject; called in the event loop's thread."""
+
+    @property
+    def stream(self) -> Stream:
+        """The stream that this listener belongs to."""
+
+    since: int
+    """Number of the frame whose value the stream already has."""
+
+    def deliver(self, message: Sized, at_s: float | None = None) -> None:
+        """Take one message. ``at_s``: its time by the topic's clock, in s; default: now."""
+
+    def keep(self, message: Sized) -> None:
+        """Queue a message of a step; such a message must not be dropped."""
+
+    def lose(self) -> None:
+        """Drop the messages that were not sent yet, because quality has turned bad."""
+
+
+class _Channel:
+    """A subject that has listeners: how a frame becomes a message, and who gets it."""
+
+    def __init__(self, subject: Subject, slot: int) -> None:
+        """``slot``: the channel's index in the feed's table."""
+        self.encode = subject.encode
+        self.listeners: dict[Listener, None] = {}  # in the order in which they came
+        self.slot = slot
+        first = subject.registers[0]
+        self.order = first.offset, first.bit or 0, subject.path, subject.wire
+        """Sort key: the channels that a step has changed are delivered in the block's order."""
+        self.changed = subject.changed
+        self.entries = b"" if self.changed else entries(subject.registers, slot)
+
+
+class _ChannelTable(NamedTuple):
+    """All channels of a block, and the change scan over them."""
+
+    slots: tuple[_Channel | None, ...]
+    scan: ChangeScan
+    apart: tuple[_Channel, ...]
+    """Channels that decide by a function of their own whether they have changed."""
+
+    @classmethod
+    def of(cls, channels: Collection[_Channel], slots: int) -> _ChannelTable:
+        """Build the table of these channels. ``slots``: its length; some slots may be free."""
+        places: list[_Channel | None] = [None] * slots
+        for channel in channels:
+            places[channel.slot] = channel
+        apart = tuple(channel for channel in channels if channel.changed)
+        return cls(tuple(places), ChangeScan.joined(channel.entries for channel in channels), apart)
+
+
+TURN_FRAMES: Final = 8
 """Frames that are delivered before the event loop serves the streams."""
 
 
@@ -43,12 +128,12 @@ class Feed:
         self._good = False  # as last reported
         self._loop = asyncio.get_running_loop()
         self._on_quality = on_quality
-        self._channels: dict[Subject, Channel] = {}
+        self._channels: dict[Subject, _Channel] = {}
         self._back_pressure = BackPressure(block, self._refill)
         self._free: list[int] = []  # slots
-        self._table = ChannelTable.of((), 0)
+        self._table = _ChannelTable.of((), 0)
         self._outdated = False
-        self._owed: dict[Listener, Channel] = {}  # listeners that wait for a good value
+        self._owed: dict[Listener, _Channel] = {}  # listeners that wait for a good value
         _ = block.layout.members("")  # builds the index of paths before the first client needs it
         self._follower = FrameFollower(block, notice_gaps=True)
         self._reader = BatchReader(block, wake_ups, self._read, passes=self._passes)
@@ -81,7 +166,7 @@ class Feed:
         channel = self._channels.get(subject)
         if channel is None:
             slot = self._free.pop() if self._free else len(self._channels)
-            channel = self._channels[subject] = Channel(subject, slot)
+            channel = self._channels[subject] = _Channel(subject, slot)
             self._rebuild()
         channel.listeners[listener] = None
         self._back_pressure.join(listener.stream)
@@ -184,7 +269,7 @@ class Feed:
         self._tell(good=False)
 
     def _rebuild(self) -> None:
-        self._table = ChannelTable.of(self._channels.values(), len(self._channels) + len(self._free))
+        self._table = _ChannelTable.of(self._channels.values(), len(self._channels) + len(self._free))
         self._outdated = False
 
     # ---- what the source publishes -----------------------------------------------------------------------------
@@ -224,7 +309,8 @@ class Feed:
         if self._shown is not None and (bad or change is QualityChange.GAP):
             self._turn_bad(frame.number)
         if not bad:
-            self._tell(good=True)
+            if not self._good:
+                self._tell(good=True)
             self._show(self._shown, frame)
             self._shown = frame
 
@@ -252,7 +338,7 @@ class Feed:
         if self._owed:
             self._settle()
 
-    def _changes(self, shown: Frame | DeliveredImage | None, frame: Frame) -> list[Channel]:
+    def _changes(self, shown: Frame | DeliveredImage | None, frame: Frame) -> list[_Channel]:
         """Return the channels whose bytes have changed since ``shown``; all, if that is None."""
         slots, scan, apart = self._table
         if shown is None:

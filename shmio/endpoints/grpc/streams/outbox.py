@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
 
+from shmio.endpoints.grpc.encoding import Subject
 from shmio.endpoints.grpc.streams.back_pressure import LATE_S, Backlog, LossMonitor, TotalBacklog
-from shmio.endpoints.grpc.streams.channel import Subject
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.segment.events import EVENT_SLOTS
 

@@ -10,12 +10,10 @@ from contextlib import asynccontextmanager, closing, suppress
 from functools import partial
 from typing import Any, Final, TypeVar
 
-from shmio.endpoints.grpc.commands.publish import Publisher
-from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.feed import Feed, VirtualTime
 from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
-from shmio.endpoints.grpc.streams.wakeups import WakeUp, WakeUps
-from shmio.endpoints.grpc.time.timeline import Timeline
-from shmio.endpoints.grpc.time.virtual_time import TimeStatus, VirtualTime
+from shmio.endpoints.grpc.time.timeline import Timeline, TimeStatus
+from shmio.endpoints.grpc.wakeups import WakeUp, WakeUps
 from shmio.errors import ShmioError, TimeError
 from shmio.local.time_control import Coordinator, Step, StepWait, check_step
 from shmio.segment import ProcessSlot, Segment
@@ -175,15 +173,15 @@ class Stepper:
         wake_ups: WakeUps,
         feeds: Mapping[str, Feed],
         outboxes: Outboxes,
-        publisher: Publisher,
+        settle: Callable[[str], Awaitable[None]],
         open_streams: OpenStreams,
     ) -> None:
-        """Create the timeline; ``publisher`` completes a client's writes before its step.
+        """Create the timeline; ``settle`` completes a client's writes before its step.
 
         ``wake_ups`` are those of the feeds. The other arguments are those of :class:`Timeline`.
         """
         self._segment = segment
-        self._publisher = publisher
+        self._settle = settle
         self._loop = asyncio.get_running_loop()
         self._coordinator = Coordinator(segment)
         self._driver = StepDriver(self._coordinator, segment.clock, wake_ups)
@@ -308,7 +306,7 @@ class Stepper:
     async def _step(self, dt_ns: int | None, peer: str) -> Step:
         _check(dt_ns)
         if peer:
-            await self._publisher.settle(peer)
+            await self._settle(peer)
         if self._player.on:
             raise TimeError("time is playing: pause it before you step it")
         return await self._make(dt_ns)

@@ -3,19 +3,214 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Callable, Mapping, Sized
 from functools import partial
-from typing import Any
+from typing import Any, Final, NamedTuple, Protocol
 
-from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.feed import Feed, Moment, VirtualTime
 from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
-from shmio.endpoints.grpc.streams.wakeups import WakeUp
-from shmio.endpoints.grpc.time.delivery import Delivery, StepReceiver, before
-from shmio.endpoints.grpc.time.time_topics import TimeTopics
-from shmio.endpoints.grpc.time.virtual_time import Moment, TimeStatus, VirtualTime
+from shmio.endpoints.grpc.topics import TimeTopic
+from shmio.endpoints.grpc.wakeups import WakeUp
+from shmio.errors import SegmentError
 from shmio.local.time_control import Step
 from shmio.model.clock import Clock
 from shmio.segment import ProcessSlot, Segment
+
+PATIENCE_S: Final = 3.0
+"""Time that clients have to take a step's values, and again to take its marker.
+
+Clients of shmio.v1 have their turn after the others. The total is less than a step's own
+time-out. A stream that is the only one has this time for values and marker together.
+"""
+
+log = logging.getLogger("shmio.grpc")
+
+
+class TimeStatus(NamedTuple):
+    """The state of the instance's time.
+
+    ``dt_ns`` is the size of the step that the status reports, otherwise the present step size.
+    ``alive`` is False after a client has said that time goes on no more.
+    """
+
+    clock_ns: int
+    dt_ns: int
+    alive: bool
+    playing: bool
+
+
+class Listener(Protocol):
+    """A stream's subscription to a topic of time; called in the event loop's thread."""
+
+    def deliver(self, message: Sized) -> None:
+        """Take one message."""
+
+    def keep(self, message: Sized) -> None:
+        """Take one message of a step, which must not be dropped."""
+
+
+Encode = Callable[[TimeTopic, Moment], Sized]
+"""Encodes a moment as a message of one service."""
+
+
+class TimeTopics:
+    """Sends step numbers and simulation time to listeners.
+
+    While time is real, the simulation time is sent once per step size.
+    """
+
+    def __init__(self, virtual_time: VirtualTime, now: Callable[[], Moment], tick_s: Callable[[], float]) -> None:
+        """``now`` returns the present simulation time, ``tick_s`` the step size."""
+        self._virtual_time = virtual_time
+        self._now = now
+        self._tick_s = tick_s
+        self._listeners: dict[tuple[TimeTopic, Encode], dict[Listener, None]] = {}
+        self._timer: asyncio.TimerHandle | None = None
+
+    def listen(self, topic: TimeTopic, encode: Encode, listener: Listener) -> Callable[[], None]:
+        """Add a listener and return the function that removes it.
+
+        The simulation time is sent at once, a step's number only after that step.
+        """
+        listeners = self._listeners.setdefault((topic, encode), {})
+        listeners[listener] = None
+        if topic is TimeTopic.CLOCK:
+            message = encode(topic, self._now())
+            if self._virtual_time.on:
+                listener.keep(message)
+            else:
+                listener.deliver(message)
+                self._set_timer()
+        return partial(self._leave, topic, encode, listener)
+
+    def _leave(self, topic: TimeTopic, encode: Encode, listener: Listener) -> None:
+        listeners = self._listeners[topic, encode]
+        del listeners[listener]
+        if not listeners:
+            del self._listeners[topic, encode]
+
+    def tell(self) -> None:
+        """Send number and time of the step that was delivered."""
+        for (topic, encode), listeners in self._listeners.items():
+            message = encode(topic, self._virtual_time.moment)
+            for listener in listeners:
+                listener.keep(message)
+
+    def _set_timer(self) -> None:
+        if self._timer is None:
+            self._timer = asyncio.get_running_loop().call_later(self._tick_s(), self._tick)
+
+    def _tick(self) -> None:
+        """Send the simulation time while time is real, as long as there is a listener."""
+        self._timer = None
+        if self._virtual_time.on:
+            return
+        for (topic, encode), listeners in self._listeners.items():
+            if topic is TimeTopic.CLOCK:
+                message = encode(topic, self._now())
+                for listener in listeners:
+                    listener.deliver(message)
+                self._set_timer()
+
+    def resume(self) -> None:
+        """Send the simulation time periodically again, because time is real."""
+        if any(topic is TimeTopic.CLOCK for topic, _ in self._listeners):
+            self._set_timer()
+
+    def stop(self) -> None:
+        """Stop sending the simulation time periodically."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+
+class StepReceiver(Protocol):
+    """A service that delivers steps to its own streams."""
+
+    @property
+    def streams(self) -> int:
+        """Number of the service's open streams."""
+
+    async def deliver(self, step: Step) -> None:
+        """Send what a step has changed, then its marker, and wait until all streams have both."""
+
+    def release(self) -> None:
+        """Send values as they come, because time is real again."""
+
+
+class _Delivery:
+    """Delivers steps in order to all streams, whichever program has made them.
+
+    A step's delivery begins with the writes before it. The changed values follow, of all blocks
+    on the instance's clock in the segment's order. When all streams have taken these, they get
+    the step's marker, and when they have taken that, the delivery is over. A single stream is
+    in order anyway, so nothing is awaited before its marker. For the event loop's thread.
+    """
+
+    def __init__(self, virtual_time: VirtualTime, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
+        self._virtual_time = virtual_time
+        self._feeds = feeds
+        self._outboxes = outboxes
+        self._turn = asyncio.Lock()
+        self.receivers: list[StepReceiver] = []
+
+    def begin(self, moment: Moment) -> None:
+        """Switch to virtual time; ``moment`` counts as delivered."""
+        self._virtual_time.on = True
+        self._virtual_time.moment = moment
+        for feed in self._feeds.values():
+            feed.hold()
+
+    def end(self) -> None:
+        """Switch back to real time; only while not :attr:`busy`."""
+        self._virtual_time.on = False
+        for feed in list(self._feeds.values()):
+            try:
+                feed.release()
+            except SegmentError as error:
+                log.warning("time is real again: %s", str(error))
+        for receiver in self.receivers:
+            receiver.release()
+
+    async def deliver(self, step: Step, mark: Callable[[], None]) -> bool:
+        """Deliver a step, with its marker by ``mark``; return False if it was delivered already.
+
+        The stream of a client that does not read fails after ``PATIENCE_S``.
+        """
+        async with self._turn:
+            if step.number <= self._virtual_time.moment.number:
+                return False
+            self._show(step)
+            if len(self._outboxes) + sum(receiver.streams for receiver in self.receivers) > 1:
+                await self._outboxes.taken(PATIENCE_S)
+            for receiver in self.receivers:
+                await receiver.deliver(step)
+            mark()
+            await self._outboxes.taken(PATIENCE_S)
+            return True
+
+    @property
+    def busy(self) -> bool:
+        """Whether a step is being delivered now."""
+        return self._turn.locked()
+
+    def pass_over(self, step: Step, mark: Callable[[], None]) -> None:
+        """Deliver a step without waiting, as no stream is open; only while not :attr:`busy`."""
+        if step.number > self._virtual_time.moment.number:
+            self._show(step)
+            mark()
+
+    def _show(self, step: Step) -> None:
+        for feed in list(self._feeds.values()):
+            if feed.block.attributes.stepped:
+                feed.commands.catch_up()
+        self._virtual_time.moment = Moment(step.number, step.time_ns)
+        for feed in list(self._feeds.values()):
+            try:
+                feed.step()
+            except SegmentError as error:
+                log.warning("step %d: %s", step.number, str(error))
 
 
 class Timeline:
@@ -57,7 +252,7 @@ class Timeline:
         self._open_streams = open_streams
         self._play_dt_ns = play_dt_ns
         self._loop = asyncio.get_running_loop()
-        self._delivery = Delivery(virtual_time, feeds, outboxes)
+        self._delivery = _Delivery(virtual_time, feeds, outboxes)
         self._watchers: list[Callable[[TimeStatus], None]] = []
         self._delivering: set[asyncio.Task[Any]] = set()
         self._page: WakeUp | None = None  # when the clock page is written
@@ -125,7 +320,7 @@ class Timeline:
         """
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
-            self._delivery.begin(before(state))
+            self._delivery.begin(_before(state))
         elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # else at the next call
             self._end(state)
         if state.virtual and state.done > self.virtual_time.moment.number and not self.steered:
@@ -174,3 +369,12 @@ class Timeline:
 
     def _now(self) -> Moment:
         return self.virtual_time.moment if self.virtual_time.on else Moment(0, self._clock.read().time_ns)
+
+
+def _before(state: Clock) -> Moment:
+    """Return the moment that counts as delivered when time is first seen to be virtual.
+
+    On a busy machine the first step may have ended already, and still has to be delivered.
+    """
+    first = bool(state.dt_ns) and state.step == state.done
+    return Moment(state.done - first, state.present_ns - first * state.dt_ns)

@@ -14,8 +14,8 @@ from grpc_health.v1 import health_pb2
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from shmio.config import Address, Tls
+from shmio.endpoints.grpc.encoding import Subject
 from shmio.endpoints.grpc.server.server import Server
-from shmio.endpoints.grpc.streams.channel import Subject
 from shmio.endpoints.grpc.streams.outbox import Outbox
 from shmio.errors import ConfigError, EndpointError
 from shmio.segment import Quality, Segment

@@ -17,7 +17,7 @@ from shmio.segment import Segment
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
-from tests.unit.endpoints.grpc.commands.test_publish import counted, with_plant
+from tests.unit.endpoints.grpc.services.test_publish import counted, with_plant
 from tests.unit.endpoints.grpc.services.test_simlog_v1 import everything, inject, laid, lifted, publish, standing
 from tests.unit.endpoints.grpc.services.test_simlog_v2 import read, request, write
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, message, plain, refusal
@@ -201,13 +201,13 @@ def test_a_client_without_a_stream_holds_it_by_its_connection(segment: Segment) 
 def test_whose_connection_cannot_be_seen_has_a_while_to_subscribe(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.injection.injections.connected", frozenset)
+    monkeypatch.setattr("shmio.endpoints.grpc.services.injection.connected", frozenset)
 
     async def test(served: Endpoint, device: Plant) -> None:
         stream = await served.subscriber("injector")
         _, path_out = await shadow(served, "cell/step/in")
         await served.add("injector", path_out)
-        monkeypatch.setattr("shmio.endpoints.grpc.injection.injections.UNSEEN_S", 0.0)
+        monkeypatch.setattr("shmio.endpoints.grpc.services.injection.UNSEEN_S", 0.0)
         await shadow(served, "cell/running/in")
 
         async def one_left() -> bool:

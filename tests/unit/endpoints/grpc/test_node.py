@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from shmio.segment import Segment
-from tests.unit.endpoints.grpc.commands.test_publish import counted, with_plant
+from tests.unit.endpoints.grpc.services.test_publish import counted, with_plant
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint
 from tests.unit.endpoints.plant import Plant
 from tests.unit.endpoints.rude import CALLS, Polite, beside_a_polite_one

@@ -11,7 +11,7 @@ import pytest
 from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.shmio_v1 import service
-from shmio.endpoints.grpc.time import delivery
+from shmio.endpoints.grpc.time import timeline
 from shmio.local.time_control import Coordinator
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as ours
@@ -334,7 +334,7 @@ def test_a_first_step_that_is_over_before_the_endpoint_looks_is_delivered_too(in
 
 
 def test_one_that_does_not_read_ends_and_the_others_go_on(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(delivery, "PATIENCE_S", 2.0)
+    monkeypatch.setattr(timeline, "PATIENCE_S", 2.0)
 
     async def test(served: Endpoint, models: Models) -> None:
         options = [("grpc.http2.bdp_probe", 0), ("grpc.use_local_subchannel_pool", 1)]  # 64 KiB wait for a client
@@ -372,7 +372,7 @@ def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
     instance: str, monkeypatch: pytest.MonkeyPatch, wire: str
 ) -> None:
     def patience(for_s: float) -> None:
-        for module in (delivery, service):
+        for module in (timeline, service):
             monkeypatch.setattr(module, "PATIENCE_S", for_s)
 
     async def test(served: Endpoint, models: Models) -> None:

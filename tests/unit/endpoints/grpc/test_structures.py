@@ -16,8 +16,8 @@ from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
 from shmio.wire import simlog_v1_pb2 as wire
-from tests.unit.endpoints.grpc.commands.test_publish import counted, counts, publish, with_plant
-from tests.unit.endpoints.grpc.commands.test_publish import message as request
+from tests.unit.endpoints.grpc.services.test_publish import counted, counts, publish, with_plant
+from tests.unit.endpoints.grpc.services.test_publish import message as request
 from tests.unit.endpoints.grpc.services.test_simlog_v2 import write
 from tests.unit.endpoints.harness import STALE_NS, TIMEOUT_S, Endpoint, message, refusal, serve
 from tests.unit.endpoints.plant import Plant

@@ -13,7 +13,7 @@ import shmio
 from shmio.local.writer import CommandSender
 from shmio.segment import EventKind, Record, Segment, Write
 from shmio.segment.events import EVENT_SLOTS
-from tests.unit.endpoints.grpc.commands.test_publish import message, publish
+from tests.unit.endpoints.grpc.services.test_publish import message, publish
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, endpoint, image, listening, serve, value
 from tests.unit.endpoints.plant import Plant
 

@@ -13,7 +13,7 @@ from shmio.config import Declaration
 from shmio.local.writer import SourceWriter
 from shmio.segment import Direction, Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
-from tests.unit.endpoints.grpc.commands.test_publish import counted, counts, message, with_plant
+from tests.unit.endpoints.grpc.services.test_publish import counted, counts, message, with_plant
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, code, refusal, serve, value
 from tests.unit.endpoints.plant import GUEST, Plant
 
@@ -460,7 +460,7 @@ def test_a_source_that_does_not_answer_refuses_it_and_lays_nothing_later(
 
 
 def test_at_most_so_many_at_once(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.injection.injections.MAX_INJECTIONS", 2)
+    monkeypatch.setattr("shmio.endpoints.grpc.services.injection.MAX_INJECTIONS", 2)
 
     async def test(served: Endpoint, device: Plant) -> None:
         streams = [await laid(served, f"cell/inputs/{place}", f"s{place}") for place in range(2)]

@@ -15,7 +15,7 @@ from google.protobuf.struct_pb2 import Value
 
 from shmio.segment import Quality, Segment
 from shmio.wire import simlog_v2_pb2 as v2
-from tests.unit.endpoints.grpc.commands.test_publish import counted, counts, with_plant
+from tests.unit.endpoints.grpc.services.test_publish import counted, counts, with_plant
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, image, message, plain, refusal, serve
 from tests.unit.endpoints.plant import Plant
 

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from google.protobuf.struct_pb2 import Value
 
-from shmio.endpoints.grpc.commands.topics import Shape, shape
 from shmio.endpoints.grpc.services.simlog_v1_values import time_stamp as time_stamp_v1
 from shmio.endpoints.grpc.services.simlog_v2_values import (
     MAX_LEVELS,
@@ -19,6 +18,7 @@ from shmio.endpoints.grpc.services.simlog_v2_values import (
     time_stamp,
     to_wire,
 )
+from shmio.endpoints.grpc.topics import Shape, shape
 from shmio.errors import ValueRangeError
 from shmio.layout.model import ByteOrder, Layout, Register, array_size, element_type
 from shmio.layout.topic import Topic

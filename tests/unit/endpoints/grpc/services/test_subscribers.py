@@ -15,8 +15,8 @@ from shmio.endpoints.grpc.streams import outbox
 from shmio.layout.model import Layout
 from shmio.segment import Attributes, BlockSpec, Quality, Segment
 from shmio.wire import simlog_v2_pb2 as v2
-from tests.unit.endpoints.grpc.commands.test_publish import with_plant
 from tests.unit.endpoints.grpc.commands.test_write_subscriptions import accept
+from tests.unit.endpoints.grpc.services.test_publish import with_plant
 from tests.unit.endpoints.grpc.services.test_simlog_v2 import write
 from tests.unit.endpoints.harness import (
     LAYOUT,

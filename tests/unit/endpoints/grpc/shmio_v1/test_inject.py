@@ -16,7 +16,7 @@ from shmio.errors import CommandError, PathError, RemoteError, ValueRangeError
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.client.both import BOTH, Connect
-from tests.unit.endpoints.grpc.commands.test_publish import with_plant
+from tests.unit.endpoints.grpc.services.test_publish import with_plant
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint
 from tests.unit.endpoints.plant import Plant

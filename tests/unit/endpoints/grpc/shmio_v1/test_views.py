@@ -13,7 +13,7 @@ from shmio.endpoints.grpc.streams import outbox
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, EventKind, ProcessSpec, Segment
 from shmio.wire import shmio_v1_pb2 as wire
-from tests.unit.endpoints.grpc.commands.test_publish import message, publish, with_plant
+from tests.unit.endpoints.grpc.services.test_publish import message, publish, with_plant
 from tests.unit.endpoints.grpc.shmio_v1.harness import Stream, stub, subscribe
 from tests.unit.endpoints.grpc.shmio_v1.test_write import write
 from tests.unit.endpoints.harness import STALE_NS, TIMEOUT_S, Endpoint, refusal

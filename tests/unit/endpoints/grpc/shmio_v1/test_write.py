@@ -13,7 +13,7 @@ import pytest
 from shmio.messages import value_to_wire
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
-from tests.unit.endpoints.grpc.commands.test_publish import with_plant
+from tests.unit.endpoints.grpc.services.test_publish import with_plant
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, refusal
 from tests.unit.endpoints.plant import Plant

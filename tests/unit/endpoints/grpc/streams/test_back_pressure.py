@@ -8,11 +8,12 @@ from contextlib import closing
 
 import pytest
 
-from shmio.endpoints.grpc.streams import back_pressure, outbox, wakeups
+from shmio.endpoints.grpc import wakeups
+from shmio.endpoints.grpc.streams import back_pressure, outbox
 from shmio.endpoints.grpc.streams.back_pressure import BEHIND_S, WINDOW_S, LossMonitor
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import Outbox, StateLane
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
 from shmio.segment.block import Stamp
 from tests.unit.endpoints.grpc.test_grpc import STEP

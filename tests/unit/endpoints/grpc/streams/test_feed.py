@@ -9,12 +9,11 @@ import weakref
 
 import pytest
 
+from shmio.endpoints.grpc import wakeups as ringing
+from shmio.endpoints.grpc.encoding import Subject
 from shmio.endpoints.grpc.streams import back_pressure
-from shmio.endpoints.grpc.streams import wakeups as ringing
-from shmio.endpoints.grpc.streams.channel import Subject
-from shmio.endpoints.grpc.streams.feed import Feeds
-from shmio.endpoints.grpc.streams.wakeups import WakeUps
-from shmio.endpoints.grpc.time.virtual_time import Moment, VirtualTime
+from shmio.endpoints.grpc.streams.feed import Feeds, Moment, VirtualTime
+from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.segment import Attributes, BlockSpec, Quality, Segment
 from tests.unit.endpoints.grpc.test_grpc import STEP, Recorder
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from shmio.endpoints.grpc.streams.wakeups import WakeUp, WakeUps
+from shmio.endpoints.grpc.wakeups import WakeUp, WakeUps
 from shmio.segment import Segment
 from tests.unit.endpoints.harness import TIMEOUT_S, image
 
@@ -64,7 +64,7 @@ def test_who_leaves_while_it_rings_takes_nobody_with_him(segment: Segment) -> No
 
 
 def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.streams.wakeups.REST_S", 1000.0)
+    monkeypatch.setattr("shmio.endpoints.grpc.wakeups.REST_S", 1000.0)
 
     async def test() -> None:
         block, writer, wake_ups = segment.blocks["cell"], segment.writer("cell"), WakeUps()
@@ -116,7 +116,7 @@ def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypat
 def test_a_bell_that_has_rested_rings_for_what_was_left_and_goes_on(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.streams.wakeups.REST_S", 0.001)
+    monkeypatch.setattr("shmio.endpoints.grpc.wakeups.REST_S", 0.001)
 
     async def test() -> None:
         writer, heard = segment.writer("cell"), asyncio.Event()

@@ -1,11 +1,15 @@
-"""Passes the events of one block to the injections on it, and to listeners of writes."""
+"""Injections on one block: who receives their events, and the image beneath one."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final, Protocol
 
-from shmio.segment import Event, EventKind
-from shmio.segment.commands import CommandAssembler, CommandWrites
+import numpy as np
+
+from shmio.layout.values.write import Write
+from shmio.segment import Block, Event, EventKind
+from shmio.segment.commands import CommandAssembler, CommandWrites, apply
 
 _STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.ACTIVATED, EventKind.DEACTIVATED})
 
@@ -117,3 +121,41 @@ class InjectionFollowers:
         followers, self._followers = self._followers, {}
         for follower in followers.values():
             follower.lifted(reason)
+
+
+class InjectionBase:
+    """The image beneath one injection: the source's bytes with inner injections applied."""
+
+    def __init__(self, block: Block, image: bytes = b"") -> None:
+        """``image``: the initial values of inner injections; default: zeros."""
+        self.number = 0
+        """The injection's number, once it is known; 0 before."""
+        self.given = bytearray(image or bytes(block.layout.size))
+        """The values that were diverted to the injection so far, as an image."""
+        self._block = block
+        self._inner: tuple[bytes, bytes] | None = None  # bits that inner injections set, and their values
+
+    def divert(self, writes: Iterable[Write]) -> None:
+        """Apply values that were diverted to the injection."""
+        apply(self.given, writes)
+
+    def restack(self) -> bool:
+        """Read which inner injections stand; return whether the image beneath has changed."""
+        before = self._inner
+        bits = np.zeros(len(self.given), np.uint8)
+        for one in self._block.standing.read() if self.number else ():
+            if one.number == self.number:
+                break
+            if one.direction == "out" and one.active:
+                for offset, size, mask in one.ranges:
+                    bits[offset : offset + size] |= mask
+        self._inner = (bits.tobytes(), bytes(self.given)) if bits.any() else None
+        return self._inner != before
+
+    def image(self, raw: bytes) -> bytes:
+        """Return the image beneath the injection, given what the source delivered."""
+        inner = self._inner
+        if inner is None:
+            return raw
+        delivered, bits, values = (np.frombuffer(part, np.uint8) for part in (raw, *inner))
+        return (delivered ^ (delivered ^ values) & bits).tobytes()

@@ -1,0 +1,105 @@
+"""How images of blocks become messages: subjects, and Protobuf's wire format.
+
+Serialised fields may be concatenated to a message (protobuf.dev, "Encoding"), so messages are
+assembled from parts that all listeners share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sized
+from dataclasses import dataclass
+from dataclasses import field as attribute
+from typing import Final, NamedTuple, Protocol
+
+from shmio.layout.model import Register
+
+
+class BlockImage(Protocol):
+    """An image of a block with its number and time: a frame, or a future one."""
+
+    @property
+    def number(self) -> int:
+        """Number of the frame, or of the step."""
+
+    @property
+    def clock_ns(self) -> int:
+        """Time of the instance's clock, in ns."""
+
+    @property
+    def image(self) -> bytes:
+        """The block's bytes as consumers see them."""
+
+
+class ShownImage(NamedTuple):
+    """A :class:`BlockImage` that is not a frame's: with writes in it, or of an injection."""
+
+    number: int
+    clock_ns: int
+    image: bytes
+
+
+class SourceImage(BlockImage, Protocol):
+    """An image together with the bytes that the source delivered."""
+
+    @property
+    def raw(self) -> bytes:
+        """The block's bytes as the source delivered them, without injections."""
+
+
+Encode = Callable[[BlockImage], Sized | None]
+"""Encodes an image as a message, whose ``len`` is in bytes; None: the bytes hold no value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A register, an array's element or a structure in the encoding of one service.
+
+    Equal subjects are encoded once for all listeners.
+
+    Attributes:
+        wire: Name of the encoding.
+        path: Canonical path in the block.
+        registers: The registers it shows.
+        encode: Makes a message of an image.
+        changed: Returns whether two images differ in the subject; None: compare the registers
+            as consumers see them.
+
+    """
+
+    wire: str
+    path: str
+    registers: tuple[Register, ...] = attribute(compare=False)
+    encode: Encode = attribute(compare=False)
+    changed: Callable[[SourceImage, SourceImage], bool] | None = attribute(default=None, compare=False)
+
+
+_SHORT: Final = [bytes((number,)) for number in range(0x80)]
+
+
+def varint(number: int) -> bytes:
+    """Encode a number that is not negative."""
+    if number < 0x80:
+        return _SHORT[number]
+    if number < 0x4000:
+        return bytes((number & 0x7F | 0x80, number >> 7))
+    data = bytearray()
+    while number > 0x7F:
+        data.append(number & 0x7F | 0x80)
+        number >>= 7
+    data.append(number)
+    return bytes(data)
+
+
+def delimited(data: bytes) -> bytes:
+    """Encode bytes with their length in front."""
+    return varint(len(data)) + data
+
+
+def field(field_number: int, data: bytes) -> bytes:
+    """Encode a field that is bytes, text, a message, or packed numbers."""
+    return varint(field_number << 3 | 2) + varint(len(data)) + data
+
+
+def number(field_number: int, value: int) -> bytes:
+    """Encode a field that is an enum or a whole number that is not negative."""
+    return varint(field_number << 3) + varint(value)

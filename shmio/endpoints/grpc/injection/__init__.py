@@ -1,1 +1,0 @@
-"""Injections by gRPC clients of all wire versions."""
