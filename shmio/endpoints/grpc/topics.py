@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import Enum
 from typing import Final, NamedTuple
 
@@ -10,6 +10,7 @@ from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Topic, look_up, parse_topic, shorten
+from shmio.segment import Block
 
 
 class TimeTopic(Enum):
@@ -67,6 +68,13 @@ class Topics:
         if source not in self._feeds:
             raise PathError(f"source {source} was removed by a reload")
         return self._feeds[source]
+
+    def blocks(self, sources: Collection[str]) -> list[Block]:
+        """Return the blocks of these sources, or of all. PathError: no such source."""
+        for source in sources:
+            if source not in self._feeds:
+                raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
+        return [self._feeds[source].block for source in dict.fromkeys(sources) or self._feeds]
 
     def layout(self, topic: Topic) -> Layout:
         """Return the layout of a topic's source. PathError as for :meth:`feed`."""

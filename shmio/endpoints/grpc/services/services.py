@@ -69,13 +69,13 @@ class Services:
     @property
     def counters(self) -> tuple[int, int, int, int]:
         """Open streams, messages dropped on slow ones, messages published, and messages refused."""
-        streams = len(self._outboxes) + self._shmio_v1.streams
+        streams = len(self._outboxes) + self._shmio_v1.subscribe_calls.streams
         return streams, self._outboxes.dropped, self._publisher.published, self._publisher.refused
 
     @property
     def updates(self) -> int:
         """Number of updates sent by ``shmio.v1`` since the start; feeds count theirs."""
-        return self._shmio_v1.updates
+        return self._shmio_v1.subscribe_calls.updates
 
     @property
     def waiting_bytes(self) -> int:

@@ -10,10 +10,10 @@ from typing import Any, Final
 
 import grpc
 
+from shmio.endpoints.grpc.encoding import field, number
 from shmio.endpoints.grpc.server.error_status import Context, refuse
-from shmio.endpoints.grpc.streams.encoding import field, number
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import BatchReader, Callback, WakeUps
+from shmio.endpoints.grpc.wakeups import BatchReader, Callback, WakeUps
 from shmio.errors import EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.local.events import EventReader

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 from weakref import WeakValueDictionary
 
 from shmio.endpoints.grpc.commands.command_client import CommandClient
-from shmio.endpoints.grpc.shmio_v1.views import RawFrames, Selection, View
+from shmio.endpoints.grpc.shmio_v1.tables import RawFrames, Selection, View
 from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import EndpointError, PathError, ValueRangeError
 from shmio.layout.glob import named

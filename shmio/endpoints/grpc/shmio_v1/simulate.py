@@ -15,10 +15,9 @@ from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.server.limits import time_sliced
 from shmio.endpoints.grpc.shmio_v1.clock import clock
-from shmio.endpoints.grpc.shmio_v1.columns import KINDS, DecodedImage, pack
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_ELEMENTS, MAX_REGISTERS
-from shmio.endpoints.grpc.shmio_v1.values import FIELDS, MAX_VALUES, plain
-from shmio.endpoints.grpc.shmio_v1.views import Selection
+from shmio.endpoints.grpc.shmio_v1.tables import KINDS, DecodedImage, Selection, pack
+from shmio.endpoints.grpc.shmio_v1.write import FIELDS, MAX_VALUES, plain
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.wakeups import WakeUp
 from shmio.errors import CommandError, ConflictError, PathError, SegmentError, ShmioError, ValueRangeError

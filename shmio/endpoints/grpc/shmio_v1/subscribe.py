@@ -7,14 +7,17 @@ import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Collection
 from functools import partial
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
+
+import grpc
 
 from shmio.endpoints.grpc.commands.command_client import CommandClient
 from shmio.endpoints.grpc.encoding import field, number
-from shmio.endpoints.grpc.shmio_v1.columns import DecodedImage
+from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1.selection import Selections, SourceDirection
-from shmio.endpoints.grpc.shmio_v1.views import (
+from shmio.endpoints.grpc.shmio_v1.tables import (
     MISSED,
+    DecodedImage,
     Selection,
     UpdateMessage,
     View,
@@ -23,13 +26,16 @@ from shmio.endpoints.grpc.shmio_v1.views import (
     stale_fields,
 )
 from shmio.endpoints.grpc.streams.feed import VirtualTime
-from shmio.endpoints.grpc.streams.outbox import SendQueue
+from shmio.endpoints.grpc.streams.outbox import OpenStreams, SendQueue
+from shmio.endpoints.grpc.time.timeline import PATIENCE_S, Timeline
 from shmio.endpoints.grpc.wakeups import Callback, WakeUps
-from shmio.errors import EndpointError, PathError, SegmentError, ValueRangeError
+from shmio.errors import EndpointError, PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.local.time_control import Step
 from shmio.segment import Event, Frame, FrameFollower
 from shmio.wire import shmio_v1_pb2 as wire
 
+MAX_STREAMS: Final = 256
+"""Bound of the open Subscribe calls."""
 BATCH_BYTES: Final = 1 << 18
 """Size up to which the updates of all blocks are sent in one message."""
 BATCH_UPDATES: Final = 256
@@ -383,3 +389,79 @@ class SubscribeCall:
 def _set(sent: asyncio.Future[None]) -> None:
     if not sent.done():
         sent.set_result(None)
+
+
+class SubscribeCalls:
+    """The call Subscribe; has all open ones follow steps and reloads."""
+
+    def __init__(
+        self, selections: Selections, wake_ups: WakeUps, timeline: Timeline, open_streams: OpenStreams
+    ) -> None:
+        """``open_streams`` counts these streams together with those of other services."""
+        self._selections = selections
+        self._wake_ups = wake_ups
+        self._virtual_time = timeline.virtual_time
+        self._open_streams = open_streams
+        self._open: set[SubscribeCall] = set()
+        self._ended_updates = 0
+        timeline.add_receiver(self)
+
+    @property
+    def streams(self) -> int:
+        """Number of open Subscribe calls."""
+        return len(self._open)
+
+    @property
+    def updates(self) -> int:
+        """Number of updates sent by Subscribe calls since the start."""
+        return self._ended_updates + sum(subscription.updates for subscription in self._open)
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Return the handler of the call, by name. Values are serialised where they are made."""
+        return {"Subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, wire.SubscribeRequest.FromString)}
+
+    async def subscribe(self, request: wire.SubscribeRequest, context: Context) -> AsyncIterator[bytes]:
+        """Stream the present values, then their changes or every frame.
+
+        Statuses:
+            NOT_FOUND: No such register.
+            INVALID_ARGUMENT: Too many registers, or options that are not valid.
+            RESOURCE_EXHAUSTED: Too many streams, too many registers of all clients together, or
+                the client is too slow for steps or writes.
+        """
+        try:
+            if len(self._open) >= MAX_STREAMS:
+                raise EndpointError(f"{MAX_STREAMS} calls of Subscribe are open, the maximum: one takes many patterns")
+            subscription = SubscribeCall(self._selections, self._wake_ups, self._virtual_time, request)
+        except ShmioError as error:
+            await refuse(context, error)
+        self._open.add(subscription)
+        try:
+            with self._open_streams.joined():
+                yield await subscription.open()
+                async for message in subscription.messages():
+                    yield message
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            self._open.discard(subscription)
+            self._ended_updates += subscription.updates
+            subscription.close()
+
+    async def deliver(self, step: Step) -> None:
+        """Send a step's changes and its marker on all streams, and wait until they are sent."""
+        marks = {subscription.mark(step): subscription for subscription in self._open}
+        if marks:
+            _, late = await asyncio.wait(marks, timeout=PATIENCE_S)
+            for mark in late:
+                marks[mark].give_up()
+
+    def release(self) -> None:
+        """Wake all streams to send values as they come, because time is real again."""
+        for subscription in self._open:
+            subscription.wake()
+
+    def move(self, sources: Collection[str]) -> None:
+        """Switch the streams of these sources to their present blocks, after a reload."""
+        for subscription in self._open:
+            subscription.move(sources)

@@ -11,7 +11,7 @@ from shmio.client import calls
 from shmio.endpoints import in_flight
 from shmio.endpoints.grpc.server import server
 from shmio.endpoints.grpc.server.call_guard import CallLimits
-from shmio.endpoints.grpc.services import simlog_v2, simlog_v2_values
+from shmio.endpoints.grpc.services import simlog_v2
 from shmio.endpoints.grpc.streams import back_pressure, outbox
 
 PAGE = Path(__file__).parents[4] / "docs/reference/grpc-access.md"
@@ -38,8 +38,8 @@ SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc
         ("topics of a subscriber", simlog_v2.MAX_TOPICS),
         ("topics of all subscribers", simlog_v2.MAX_ALL_TOPICS),
         ("characters of a subscriber's name or uuid", simlog_v2.MAX_NAME),
-        ("elements of a value of version 2, or of one `Read`", simlog_v2_values.MAX_ELEMENTS),
-        ("registers of a value of version 2, or of one `Read`", simlog_v2_values.MAX_MEMBERS),
+        ("elements of a value of version 2, or of one `Read`", simlog_v2.MAX_ELEMENTS),
+        ("registers of a value of version 2, or of one `Read`", simlog_v2.MAX_MEMBERS),
         ("events of a source under way for what clients write", in_flight.MAX_OPEN),
         ("a client whose host is silent", SILENT_MS // 1000),
     ],

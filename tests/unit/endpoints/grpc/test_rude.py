@@ -9,7 +9,7 @@ import grpc
 import pytest
 
 from shmio.endpoints.grpc.server.server import MAX_REQUEST_BYTES
-from shmio.endpoints.grpc.shmio_v1.service import MAX_STREAMS
+from shmio.endpoints.grpc.shmio_v1.subscribe import MAX_STREAMS
 from shmio.endpoints.grpc.streams import outbox
 from shmio.endpoints.grpc.streams.back_pressure import BOUND_BYTES
 from shmio.segment import Segment

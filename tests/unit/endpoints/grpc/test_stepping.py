@@ -10,7 +10,7 @@ import grpc
 import pytest
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.shmio_v1 import service
+from shmio.endpoints.grpc.shmio_v1 import subscribe
 from shmio.endpoints.grpc.time import timeline
 from shmio.local.time_control import Coordinator
 from shmio.segment import Segment
@@ -372,7 +372,7 @@ def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
     instance: str, monkeypatch: pytest.MonkeyPatch, wire: str
 ) -> None:
     def patience(for_s: float) -> None:
-        for module in (timeline, service):
+        for module in (timeline, subscribe):
             monkeypatch.setattr(module, "PATIENCE_S", for_s)
 
     async def test(served: Endpoint, models: Models) -> None:
@@ -382,7 +382,7 @@ def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
         reader = await served.subscriber("reader", "sim/count")
 
         def given_up() -> bool:
-            streams = served.service._shmio_v1._open
+            streams = served.service._shmio_v1.subscribe_calls._open
             return any(outbox.failure for outbox in served.service._outboxes._open) or any(one.late for one in streams)
 
         number = 0
@@ -395,7 +395,7 @@ def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
         got = await messages(reader, number + 4)
         assert got == [("sim/count", float(n)) for n in range(number + 4)]
         assert {subject.path for subject in served.feeds["sim"]._channels} == {"count"}
-        assert not any(one._blocks for one in served.service._shmio_v1._open)
+        assert not any(one._blocks for one in served.service._shmio_v1.subscribe_calls._open)
         await connection.drop(reset=True)
 
     simulate(instance, test)

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from google.protobuf.struct_pb2 import Value
 
-from shmio.endpoints.grpc.services.simlog_v1_values import time_stamp as time_stamp_v1
-from shmio.endpoints.grpc.services.simlog_v2_values import (
+from shmio.endpoints.grpc.services.simlog_v1 import time_stamp as time_stamp_v1
+from shmio.endpoints.grpc.services.simlog_v2 import (
     MAX_LEVELS,
     EncodedMessage,
     encoder,

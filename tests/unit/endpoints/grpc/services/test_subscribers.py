@@ -366,7 +366,7 @@ def test_a_deadline_or_a_cancelled_call_ends_one_stream(segment: Segment) -> Non
 
 
 def test_a_structure_that_no_message_can_hold_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.services.simlog_v2_values.MAX_MEMBERS", 1)
+    monkeypatch.setattr("shmio.endpoints.grpc.services.simlog_v2.MAX_MEMBERS", 1)
 
     async def test(served: Endpoint) -> None:
         stream = await served.subscriber("one")

@@ -184,7 +184,7 @@ def test_a_stream_that_takes_long_to_open_holds_up_no_step(instance: str, monkey
 def test_a_stream_that_is_not_read_does_not_hold_up_steps_for_ever(
     instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.service.PATIENCE_S", 0.2)
+    monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.subscribe.PATIENCE_S", 0.2)
 
     async def test(served: Endpoint, models: Models) -> None:
         async with grpc.aio.insecure_channel(

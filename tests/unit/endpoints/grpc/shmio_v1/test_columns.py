@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.client.table import Table, Values
-from shmio.endpoints.grpc.shmio_v1.columns import KINDS, Columns, merge, pack
-from shmio.endpoints.grpc.shmio_v1.views import describe
+from shmio.endpoints.grpc.shmio_v1.tables import KINDS, Columns, describe, merge, pack
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
 from shmio.model.values import Column

@@ -7,8 +7,8 @@ import asyncio
 import pytest
 
 from shmio.endpoints.grpc.shmio_v1.simulate import OutputEncoder
-from shmio.endpoints.grpc.shmio_v1.values import MAX_VALUES
-from shmio.endpoints.grpc.shmio_v1.views import Selection
+from shmio.endpoints.grpc.shmio_v1.tables import Selection
+from shmio.endpoints.grpc.shmio_v1.write import MAX_VALUES
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.messages import value_to_wire

@@ -10,7 +10,7 @@ import grpc
 import msgspec
 import pytest
 
-from shmio.endpoints.grpc.shmio_v1 import describe, selection
+from shmio.endpoints.grpc.shmio_v1 import selection, service
 from shmio.segment import Activity, Quality, Report, Segment
 from shmio.segment.standing_injections import StandingInjection, encode
 from shmio.wire import shmio_v1_pb2 as wire
@@ -171,7 +171,7 @@ def test_limits(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_layouts(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(describe, "PART_REGISTERS", 4)
+    monkeypatch.setattr(service, "PART_REGISTERS", 4)
 
     async def test(served: Endpoint) -> None:
         parts = [part async for part in stub(served).GetLayouts(wire.GetLayoutsRequest(), timeout=TIMEOUT_S)]

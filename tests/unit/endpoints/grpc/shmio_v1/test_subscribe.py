@@ -9,7 +9,6 @@ from typing import Any
 import grpc
 import pytest
 
-from shmio.endpoints.grpc.shmio_v1 import service
 from shmio.endpoints.grpc.shmio_v1.subscribe import BATCH_UPDATES
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.layout.model import Layout, Register
@@ -270,7 +269,7 @@ def test_options_that_are_none(segment: Segment, options: dict[str, Any], messag
 
 
 def test_too_many_streams(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "MAX_STREAMS", 2)
+    monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.subscribe.MAX_STREAMS", 2)
 
     async def test(served: Endpoint) -> None:
         served.publish(image())

@@ -1,13 +1,17 @@
-"""Reads values that clients send, by path or packed by a table's slots; encodes outcomes."""
+"""The call Write, and what calls share that send values: they come by path, or packed by a table's slots."""
 
 from __future__ import annotations
 
 from typing import Any, Final
 
+import grpc
+
+from shmio.endpoints.grpc.commands import command_client
+from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.server.limits import time_sliced
-from shmio.endpoints.grpc.shmio_v1.views import Selection
+from shmio.endpoints.grpc.shmio_v1.tables import Selection
 from shmio.endpoints.grpc.topics import Topics
-from shmio.errors import CommandError, ValueRangeError
+from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.model import Register, index_at
 from shmio.layout.topic import shorten
 from shmio.layout.values.text import from_text, wire_type
@@ -18,6 +22,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_VALUES: Final = 4096
 """Bound of one command's values."""
+MAX_TIMEOUT_MS: Final = 86_400_000
 
 FIELDS: Final = {column: wire.Values.DESCRIPTOR.fields_by_number[column].name for column in Column}
 _OUTCOMES: Final = {
@@ -29,6 +34,39 @@ _OUTCOMES: Final = {
     EventKind.SHADOWED: wire.Outcome.KIND_SHADOWED,
     EventKind.ACCEPTED: wire.Outcome.KIND_ACCEPTED,
 }
+
+
+class WriteCalls:
+    """The call Write."""
+
+    def __init__(self, topics: Topics) -> None:
+        self._topics = topics
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Return the handler of the call, by name."""
+        request, response = wire.WriteRequest.FromString, wire.WriteResponse.SerializeToString
+        return {"Write": grpc.unary_unary_rpc_method_handler(self.write, request, response)}
+
+    async def write(self, request: wire.WriteRequest, context: Context) -> wire.WriteResponse:
+        """Write registers of one source, all or none; return the outcome of each.
+
+        After an error status nothing was sent.
+
+        Statuses:
+            NOT_FOUND: No such register.
+            INVALID_ARGUMENT: A value does not fit, several sources, or too many values.
+            FAILED_PRECONDITION: A register is not writable, or the source does not answer.
+        """
+        try:
+            if request.timeout_ms > MAX_TIMEOUT_MS:
+                raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS}, a day")
+            source, values = await assigned(request.values, self._topics)
+            timeout_s = request.timeout_ms / 1000 or None
+            commands = self._topics.feed(source).commands
+            ends = await command_client.write(commands, values, timeout_s, until_accepted=request.until_accepted)
+            return wire.WriteResponse(outcomes=[outcome(*end) for end in ends])
+        except ShmioError as error:
+            await refuse(context, error)
 
 
 def outcome(kind: EventKind, reason: str) -> wire.Outcome:

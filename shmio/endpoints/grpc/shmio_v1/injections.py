@@ -1,30 +1,45 @@
-"""The call Inject: lays an injection, streams its originals, and takes other values."""
+"""The calls about injections: Inject, Declare (with ``declare``), ListInjections, Lift and LiftAll."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Final, NamedTuple
+from collections.abc import AsyncIterator, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
+import grpc
+import msgspec
 import numpy as np
 
+from shmio.config import Declaration
 from shmio.endpoints.grpc.commands import command_client
 from shmio.endpoints.grpc.commands.injections import InjectionBase, InjectionFollower
 from shmio.endpoints.grpc.encoding import field
-from shmio.endpoints.grpc.shmio_v1.columns import Array, pack, pack_slots
+from shmio.endpoints.grpc.server.error_status import Context, refuse
+from shmio.endpoints.grpc.shmio_v1.declare import DeclareCall
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_PATTERNS, Selections, SourceDirection
-from shmio.endpoints.grpc.shmio_v1.values import MAX_VALUES, assigned, outcome, packed
-from shmio.endpoints.grpc.shmio_v1.views import VALUES, head, head_of
+from shmio.endpoints.grpc.shmio_v1.tables import VALUES, Array, head, head_of, pack, pack_slots
+from shmio.endpoints.grpc.shmio_v1.write import MAX_VALUES, assigned, outcome, packed
+from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import SendQueue
 from shmio.endpoints.grpc.topics import Topics
 from shmio.endpoints.grpc.wakeups import WakeUps
-from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
+from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.layout.values.write import Write, covering, merge
-from shmio.segment import Direction, EventKind, Frame
+from shmio.messages import declaration_to_wire
+from shmio.model.injection import Running
+from shmio.segment import Block, Direction, EventKind, Frame
 from shmio.segment.commands import MAX_NAME_BYTES, CommandWrites, End, apply, worst
+from shmio.segment.standing_injections import StandingInjection
 from shmio.wire import shmio_v1_pb2 as wire
 
+MAX_INJECTIONS: Final = 256
+"""Bound of the open Inject and Declare calls."""
+MAX_OPEN: Final = 32
+"""Bound of one stream's values in flight; further values wait."""
+MAX_LIFETIME_MS: Final = 86_400_000
+
+_ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].number for name in ("originals", "answers"))
 _RANGES: Final = wire.Table.DESCRIPTOR.fields_by_name["ranges"].number
 _PIECES: Final = wire.Update.DESCRIPTOR.fields_by_name["pieces"].number
 
@@ -137,13 +152,6 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
         given[span] |= wanted
         spans.append((span.start, span.stop))
     return merge(image.tobytes(), given.tobytes(), spans)
-
-
-MAX_OPEN: Final = 32
-"""Bound of one stream's values in flight; further values wait."""
-MAX_LIFETIME_MS: Final = 86_400_000
-
-_ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].number for name in ("originals", "answers"))
 
 
 class InjectCall(InjectionFollower):
@@ -395,3 +403,204 @@ def _check(lay: wire.Lay) -> None:
         raise ValueRangeError(f"lifetime_ms: at most {MAX_LIFETIME_MS}, a day")
     if lay.keep and lay.lifetime_ms:
         raise ValueRangeError("keep and lifetime_ms exclude each other: a kept injection stays until somebody lifts it")
+
+
+class InjectionCalls:
+    """The calls about injections."""
+
+    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, wake_ups: WakeUps) -> None:
+        self._topics = topics
+        self._feeds = feeds
+        self._selections = selections
+        self._wake_ups = wake_ups
+        self._open: set[InjectCall | DeclareCall] = set()
+        self._turn = asyncio.Lock()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Return the handlers of these calls, by name."""
+        unary = grpc.unary_unary_rpc_method_handler
+        return {
+            "Inject": grpc.stream_stream_rpc_method_handler(self.inject, wire.InjectRequest.FromString),
+            "Declare": grpc.unary_stream_rpc_method_handler(self.declare, wire.DeclareRequest.FromString),
+            "ListInjections": unary(
+                self.list_injections,
+                wire.ListInjectionsRequest.FromString,
+                wire.ListInjectionsResponse.SerializeToString,
+            ),
+            "Lift": unary(self.lift, wire.LiftRequest.FromString, wire.LiftResponse.SerializeToString),
+            "LiftAll": unary(self.lift_all, wire.LiftAllRequest.FromString, wire.LiftResponse.SerializeToString),
+        }
+
+    async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
+        """Lay an injection while the stream is open, or for good.
+
+        Originals are streamed to the client, which streams other values back.
+
+        Statuses:
+            NOT_FOUND: No such register.
+            INVALID_ARGUMENT: The injection is not valid, or does not cover a given value.
+            FAILED_PRECONDITION: The source refuses the injection; the message says why.
+            RESOURCE_EXHAUSTED: Too many streams.
+            ABORTED: Another client lifted it, or this client does not read the originals.
+        """
+        opening: asyncio.Task[bytes] | None = None
+        taking: asyncio.Task[None] | None = None
+        try:
+            injection = await self._injection(requests)
+            opening = asyncio.get_running_loop().create_task(injection.open())
+            yield await asyncio.shield(opening)
+            taking = asyncio.get_running_loop().create_task(injection.take(requests))
+            taking.add_done_callback(injection.taken)
+            async for message in injection.messages():
+                yield message
+            taking.cancel()
+            await asyncio.shield(self._spawn(self._close(injection, opening)))  # it is lifted before the stream ends
+            opening = None
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            if taking is not None:
+                taking.cancel()
+            if opening is not None:
+                self._spawn(self._close(injection, opening))
+        if injection.failure is not None:
+            await refuse(context, injection.failure)
+        if injection.over:
+            await context.abort(grpc.StatusCode.ABORTED, f"{injection.source}: {injection.over}")
+
+    async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> InjectCall:
+        """Read the first message. Raises PathError, ValueRangeError or EndpointError."""
+        self._check_room()
+        async for request in requests:
+            if request.WhichOneof("what") == "lay":
+                injection = InjectCall(self._topics, self._selections, self._wake_ups, request.lay)
+                self._open.add(injection)
+                return injection
+            break
+        raise ValueRangeError("the first message of Inject lays an injection, all others give values")
+
+    def _check_room(self) -> None:
+        """Raise EndpointError if too many calls are open."""
+        if len(self._open) >= MAX_INJECTIONS:
+            raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the maximum")
+
+    async def _close(self, one: InjectCall | DeclareCall, opening: asyncio.Task[bytes]) -> None:
+        try:
+            await asyncio.wait((opening,))
+            if not opening.cancelled() and opening.exception() is None:
+                await one.close()
+        finally:
+            self._open.discard(one)
+
+    async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
+        """Lay declared injections, all or none, while the stream is open or for good.
+
+        The stream is the record of their events.
+
+        Statuses:
+            INVALID_ARGUMENT: A declaration is not valid; the message names the key.
+            FAILED_PRECONDITION: A source refuses an injection; the message says why.
+            RESOURCE_EXHAUSTED: Too many streams.
+            ABORTED: The client does not read the record, or it would have a gap.
+        """
+        opening: asyncio.Task[bytes] | None = None
+        try:
+            self._check_room()
+            campaign = DeclareCall(self._feeds, request, self._turn)
+            self._open.add(campaign)
+            opening = asyncio.get_running_loop().create_task(campaign.open())
+            yield await asyncio.shield(opening)
+            async for message in campaign.messages():
+                yield message
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            if opening is not None:
+                campaign.abandon()
+                self._spawn(self._close(campaign, opening))
+        if campaign.over:
+            await context.abort(grpc.StatusCode.ABORTED, campaign.over)
+
+    async def list_injections(
+        self, request: wire.ListInjectionsRequest, context: Context
+    ) -> wire.ListInjectionsResponse:
+        """List the injections that stand. Status NOT_FOUND: no such source."""
+        found = wire.ListInjectionsResponse()
+        try:
+            for block in self._topics.blocks(request.sources):
+                found.injections.extend(_describe(block, one) for one in block.standing.read())
+        except ShmioError as error:
+            await refuse(context, error)
+        return found
+
+    async def lift(self, request: wire.LiftRequest, context: Context) -> wire.LiftResponse:
+        """Lift one injection.
+
+        Statuses:
+            NOT_FOUND: No such injection.
+            FAILED_PRECONDITION: The source does not answer.
+        """
+        try:
+            (block,) = self._topics.blocks([request.source])
+            standing = [one for one in block.standing.read() if one.number == request.number and not one.lifted]
+            if not standing:
+                raise PathError(f"{request.source}: there is no injection {request.number}; ListInjections lists them")
+            lifted = await self._lift(block, standing[0])
+            if lifted.failure:
+                raise CommandError(f"{request.source}: {lifted.failure}")
+            return wire.LiftResponse(lifted=[lifted])
+        except ShmioError as error:
+            await refuse(context, error)
+
+    async def lift_all(self, request: wire.LiftAllRequest, context: Context) -> wire.LiftResponse:
+        """Lift all injections at once; the answer says why one still stands.
+
+        Status NOT_FOUND: no such source.
+        """
+        try:
+            blocks = self._topics.blocks(request.sources)
+        except ShmioError as error:
+            await refuse(context, error)
+        standing = [(block, one) for block in blocks for one in block.standing.read() if not one.lifted]
+        lifted = await asyncio.gather(*(self._lift(block, one) for block, one in standing))
+        return wire.LiftResponse(lifted=lifted)
+
+    async def _lift(self, block: Block, one: StandingInjection) -> wire.Lifted:
+        failure = await command_client.lift(self._topics.feed(block.source).commands, one.number)
+        return wire.Lifted(source=block.source, number=one.number, name=one.name, failure=failure)
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+
+def _describe(block: Block, one: StandingInjection) -> wire.Injection:
+    """Describe an injection that stands on a block."""
+    return wire.Injection(
+        source=block.source,
+        number=one.number,
+        direction=wire.DIRECTION_IN if one.direction == "in" else wire.DIRECTION_OUT,
+        priority=one.priority,
+        keep=one.keep,
+        name=one.name,
+        pid=one.pid,
+        writer=one.writer,
+        ranges=[wire.Range(offset=offset, size=size, mask=mask) for offset, size, mask in one.ranges],
+        running=None if one.running is None else _running(one.running),
+    )
+
+
+def _running(running: Running[Declaration]) -> wire.Running:
+    """Describe the state of a declared injection."""
+    declaration = running.declaration
+    return wire.Running(
+        declaration=declaration_to_wire(msgspec.to_builtins(declaration), declaration.name),
+        state=f"STATE_{running.state.upper()}",
+        seed=running.seed,
+        runs=running.runs,
+        cycle=running.cycle,
+        time_ns=running.time_ns,
+    )
