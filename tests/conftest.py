@@ -79,7 +79,7 @@ SLOW = (
     "tests/unit/endpoints/grpc/services/test_publish.py::test_ten_thousand",
     "tests/unit/endpoints/grpc/server/test_call_guard.py::test_the_limits_hold",
     "tests/unit/endpoints/grpc/services/test_simlog_v1.py::test_a_client_that_does_not_read",
-    "tests/unit/endpoints/grpc/services/test_subscribers.py",
+    "tests/unit/endpoints/grpc/services/test_simlog_v2_subscribers.py",
     "tests/unit/endpoints/grpc/shmio_v1/test_clock.py::test_a_stream_that_is_not_read",
     "tests/unit/endpoints/grpc/shmio_v1/test_events.py::test_a_client_that_does_not_read",
     "tests/unit/endpoints/grpc/test_inject_v2.py::test_a_subscriber_that_does_not_read",

@@ -239,8 +239,7 @@ class CommandClient:
         for channel, message in self.write_subscriptions.follow(event):
             for listener in channel.listeners:
                 listener.deliver(message)
-        for item in self.followers.gather(event):
-            self.followers.tell(item)
+        self.followers.follow(event)
         if self._in_flight.hear(event):
             self._silent = False
             if event.kind == EventKind.STARTED:

@@ -46,10 +46,6 @@ class WriteListener(Protocol):
         """React to missed events: the writes that follow are not complete."""
 
 
-InjectionChange = CommandWrites | Event
-"""Diverted values, an event of an injection, or an accepted write if there is a listener."""
-
-
 class InjectionFollowers:
     """The followers of a block's injections, by number, and the listeners of its writes."""
 
@@ -58,12 +54,22 @@ class InjectionFollowers:
         self._listeners: dict[WriteListener, None] = {}  # in the order in which they came
         self._assembler = CommandAssembler()
 
-    def gather(self, event: Event) -> list[InjectionChange]:
-        """Process an event; return what :meth:`tell` has to pass on."""
-        change: list[InjectionChange] = [*self._assembler.follow(event)]
-        if (event.kind in _STACKED and not event.offset) or (event.kind == EventKind.ACCEPTED and self._listeners):
-            change.append(event)  # the first part of a long declaration
-        return change
+    def follow(self, event: Event) -> None:
+        """Pass an event on to the followers and listeners that it concerns."""
+        for diverted in self._assembler.follow(event):
+            if follower := self._followers.get(diverted.injection):
+                follower.divert(diverted)
+        if event.kind == EventKind.ACCEPTED:
+            for listener in list(self._listeners):
+                listener.accept(event)
+        elif event.kind in _STACKED and not event.offset:  # of a long declaration, the first part
+            if follower := self._followers.get(event.injection):
+                follower.happened(event)
+                if event.kind == EventKind.LIFTED:
+                    del self._followers[event.injection]
+                    follower.lifted(event.text)
+            for follower in list(self._followers.values()):
+                follower.restack()
 
     def skip(self) -> None:
         """Forget incomplete commands after missed events."""
@@ -89,25 +95,6 @@ class InjectionFollowers:
     def busy(self) -> bool:
         """Whether there is a listener of writes."""
         return bool(self._listeners)
-
-    def tell(self, change: InjectionChange) -> None:
-        """Pass a change on to the followers and listeners that it concerns."""
-        if isinstance(change, CommandWrites):
-            if follower := self._followers.get(change.injection):
-                follower.divert(change)
-            return
-        if change.kind == EventKind.ACCEPTED:
-            for listener in list(self._listeners):
-                listener.accept(change)
-            return
-        if follower := self._followers.get(change.injection):
-            follower.happened(change)
-            if change.kind == EventKind.LIFTED:
-                del self._followers[change.injection]
-                follower.lifted(change.text)
-        if change.kind in _STACKED:
-            for follower in list(self._followers.values()):
-                follower.restack()
 
     def fail(self, reason: str) -> None:
         """Report missed events to all followers and listeners."""

@@ -20,7 +20,7 @@ from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
 from tests.unit.endpoints import http2
 from tests.unit.endpoints.grpc.services.test_simlog_v2 import write
-from tests.unit.endpoints.grpc.services.test_subscribers import messages
+from tests.unit.endpoints.grpc.services.test_simlog_v2_subscribers import messages
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, endpoint, image, listening, message, refusal, serve
 from tests.unit.endpoints.stepped import Model, simulate, stepped_segment
 

@@ -21,7 +21,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.client.both import BOTH, Connect
 from tests.unit.endpoints.grpc.services.test_publish import with_plant
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub
-from tests.unit.endpoints.grpc.shmio_v1.test_inject import seen, with_client
+from tests.unit.endpoints.grpc.shmio_v1.test_injections import seen, with_client
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, refusal
 from tests.unit.endpoints.plant import Plant
 from tests.unit.endpoints.rude import NOISE
