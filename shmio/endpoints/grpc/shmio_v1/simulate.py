@@ -136,15 +136,19 @@ class SimulateCalls:
                 self._ring(block)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Its calls, by name."""
+        """Return the handler of the call, by name."""
         decode = wire.SimulateRequest.FromString
         return {"Simulate": grpc.stream_stream_rpc_method_handler(self.simulate, decode)}
 
     async def simulate(self, requests: AsyncIterator[wire.SimulateRequest], context: Context) -> AsyncIterator[bytes]:
-        """Hand the source's steps to the client, and its outputs to the source.
+        """Send the source's steps to the client, and the client's outputs to the source.
 
-        NOT_FOUND: no such source; FAILED_PRECONDITION: no model can join it; ALREADY_EXISTS: another one has;
-        INVALID_ARGUMENT: it does not join, or answers what was not asked; UNAVAILABLE: a reload has changed the source.
+        Statuses:
+            NOT_FOUND: No such source.
+            FAILED_PRECONDITION: No model can join the source.
+            ALREADY_EXISTS: Another model has joined it.
+            INVALID_ARGUMENT: The client does not join, or answers a step that is not pending.
+            UNAVAILABLE: A reload has changed the source.
         """
         taking: asyncio.Task[None] | None = None
         simulation: SimulateCall | None = None
@@ -154,9 +158,8 @@ class SimulateCalls:
             self._ring(simulation.block)
             taking = asyncio.get_running_loop().create_task(simulation.take(requests))
             taking.add_done_callback(simulation.taken)
-            taking.add_done_callback(
-                partial(self._release, simulation)
-            )  # even if the client does not read the stream's end
+            # Even if the client does not read the stream's end:
+            taking.add_done_callback(partial(self._release, simulation))
             yield first
             async for message in simulation.messages():
                 yield message
@@ -246,7 +249,13 @@ class SimulateCall:
         return self.block.model_channel
 
     async def join(self) -> bytes:
-        """Take the link; the first message. ConflictError, ValueRangeError."""
+        """Join the source's model channel; return the first message.
+
+        Raises:
+            ConflictError: Another model has joined.
+            ValueRangeError: The source has too many registers or elements.
+
+        """
         self._inputs, self._outputs = await asyncio.to_thread(_tables, self.block)  # takes seconds for a large layout
         self._encoder = OutputEncoder(self._outputs)
         link = self._link
@@ -353,7 +362,7 @@ class SimulateCall:
         late_ns = (now_ns := time.monotonic_ns()) - ask.until_ns
         if late_ns < 0:
             self._link.answer(ask, now_ns, image, None if failure is None else printable(failure))
-        else:  # not given: a source that looks late, too, might take it still
+        else:  # not given, because a source that is late too might still take it
             self._refused = self._refused or f"step {ask.step}: the answer came {late_ns // 1_000_000} ms too late"
         self._asked = None
         self._wake.set()
