@@ -1,192 +1,214 @@
-"""Subscribe to ``/in``: what is written toward a source, all of it, in the order in which it was accepted."""
+"""From images to packed arrays and on to a client's numpy arrays, against the codec that has its own fixed bytes."""
 
 from __future__ import annotations
 
-import asyncio
+import math
+from dataclasses import replace
 from typing import Any
 
-import grpc
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from shmio.client import connect_aio
-from shmio.endpoints.grpc.streams import outbox
+from shmio.client.table import Table, Values
+from shmio.endpoints.grpc.shmio_v1.tables import KINDS, Columns, describe, merge, pack
 from shmio.layout.model import Layout, Register
-from shmio.segment import Attributes, BlockSpec, EventKind, ProcessSpec, Segment
+from shmio.layout.values.codec import Value, codec
+from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
-from tests.unit.endpoints.grpc.services.test_publish import message, publish, with_plant
-from tests.unit.endpoints.grpc.shmio_v1.harness import Stream, stub, subscribe
-from tests.unit.endpoints.grpc.shmio_v1.test_write import write
-from tests.unit.endpoints.harness import STALE_NS, TIMEOUT_S, Endpoint, refusal
-from tests.unit.endpoints.plant import Plant
-from tests.unit.endpoints.stepped import Model, simulate
+from tests.unit.layout.values.test_frame_codec import LAYOUT
 
-Status = grpc.StatusCode
+LITTLE = replace(LAYOUT, byte_order="little")
 
 
-async def told(stream: Stream, count: int) -> list[dict[str, Any]]:
-    return [await stream.values() for _ in range(count)]
+def table_of(registers: list[Register], columns: Columns) -> Table:
+    table = wire.Table(number=1, source="cell", slots=[0, *columns.sizes.values()])
+    for register, (column, slot) in zip(registers, columns.places, strict=True):
+        describe(register, table.registers.add(), column, slot)
+    return Table(wire.Table.FromString(table.SerializeToString()))
 
 
-async def joined(stream: Stream) -> Any:
-    table = await stream.next()
-    assert table.direction == wire.DIRECTION_IN
-    return table
+def plain(value: Value, register: Register) -> Any:
+    """What a client has of a value: of an array's element that is none, zero or an empty text."""
+    if isinstance(value, list):
+        return [plain(item, register) for item in value]
+    if value is None:
+        return "" if register.element.base not in ("S5TIME", "TIME_OF_DAY", "LTOD") else 0
+    return value
 
 
-def test_what_all_write_comes_at_once_in_order(segment: Segment) -> None:
-    async def test(served: Endpoint, device: Plant) -> None:
-        stream = subscribe(served, "cell/axis/in", "cell/step/in", "cell/inputs/in", "cell/running/in", "cell/name/in")
-        table = await joined(stream)
-        await write(served, {"cell/step": 5, "cell/axis/speed": 2.0}, until_accepted=True)
-        await write(served, {"cell/inputs/1": 7}, until_accepted=True)
-        await write(served, {"cell/long/5": 7}, until_accepted=True)  # of nobody's interest
-        await write(served, {"cell/running": True, "cell/name": "ab"}, until_accepted=True)
-        await write(served, {"cell/step": 5}, until_accepted=True)  # the same again is told again
-        assert await told(stream, 6) == [
-            {"step": 5},
-            {"axis/speed": 2.0},
-            {"inputs": {1: 7}},
-            {"running": True},
-            {"name": "ab"},
-            {"step": 5},
-        ]
-        assert table.source == "cell"
-        assert not device.written
-
-    with_plant(segment, test, running=False)
+def same(found: Any, wanted: Any) -> bool:
+    if isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(same, found, wanted))
+    if isinstance(wanted, float) and math.isnan(wanted):
+        return bool(np.isnan(found))
+    return bool(found == wanted)
 
 
-def test_publishers_of_version_1_are_heard_too(segment: Segment) -> None:
-    async def test(served: Endpoint, _: Plant) -> None:
-        stream = subscribe(served, "cell/step/in")
-        await joined(stream)
-        await publish(served, [message("cell/step/in", str(number)) for number in range(300)])
-        assert await told(stream, 300) == [{"step": number} for number in range(300)]
-
-    with_plant(segment, test)
+def check(table: Table, registers: list[Register], layout: Layout, image: bytes) -> None:
+    for place, register in enumerate(registers):
+        wanted = plain(codec(register, layout.byte_order).decode(image), register)
+        assert same(table.value(place), wanted), register.path
 
 
-def test_both_ways_on_one_stream(segment: Segment) -> None:
-    async def test(served: Endpoint, _: Plant) -> None:
-        async with (
-            connect_aio(f"127.0.0.1:{served.port}") as cell,
-            cell.subscribe("cell/step", "cell/step/in") as stream,
-        ):
-            assert (await anext(stream)).table.direction == "out"
-            await cell.write({"cell/step": 9})
-            seen: dict[str, Any] = {}
-            while seen != {"in": 9, "out": 9}:
-                update = await anext(stream)
-                seen[update.table.direction] = update["cell/step"]
-
-    with_plant(segment, test)
+BY_PATH = {register.path: register for register in LAYOUT.registers}
+chosen = st.lists(st.sampled_from(list(BY_PATH)), min_size=1, max_size=12, unique=True)
+seeds = st.integers(0, 1 << 32)
 
 
-def test_long_texts_come_whole(instance: str) -> None:
-    """Though the source tells of them in parts."""
-    layout = Layout("L", 1, 1024, False, (Register("texts", "STRING[100]", ((0, 9),), 2, None, 1020, 10),))
-    block = BlockSpec("cell", layout, 20_000_000, STALE_NS, 1 << 20, Attributes("test", ("**",)))
-    texts = [chr(65 + index) * 100 for index in range(10)]
-
-    async def test(served: Endpoint, _: Plant) -> None:
-        stream = subscribe(served, "cell/texts/in")
-        await joined(stream)
-        await write(served, {"cell/texts": texts})
-        found: dict[int, str] = {}
-        while len(found) < 10:
-            part = (await stream.values())["texts"]
-            assert not set(part) & set(found)
-            found |= part
-        assert [found[index] for index in range(10)] == texts
-
-    with Segment.create(instance, [block], [ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]) as segment:
-        with_plant(segment, test)
-        segment.unlink()
+def random_image(seed: int) -> bytes:
+    """Bytes of which many are zero, so that there are dates and texts among them."""
+    random = np.random.default_rng(seed)
+    return bytes(
+        random.integers(0, 256, LAYOUT.size, np.uint8) * (random.random(LAYOUT.size) < seed % 5 / 4).astype(np.uint8)
+    )
 
 
-def test_a_write_before_a_step_comes_before_its_marker(instance: str) -> None:
-    async def test(served: Endpoint, _: dict[str, Model]) -> None:
-        call = stub(served).Subscribe(wire.SubscribeRequest(patterns=["sim/goal/in"]), timeout=TIMEOUT_S)
-        assert (await call.read()).tables
-        for number in range(1, 20):
-            await write(served, {"sim/goal": number}, until_accepted=True)
-            made = await stub(served).Step(wire.StepRequest(), timeout=TIMEOUT_S)
-            got: list[Any] = []
-            while not any(one.HasField("step") for one in got):
-                got.append(await call.read())
-            assert [value for one in got for update in one.updates for value in update.values.int32s.values] == [number]
-            assert got[-1].step.number == made.step
-        call.cancel()
-
-    simulate(instance, test)
-
-
-def test_a_reload_is_followed(segment: Segment) -> None:
-    async def test(served: Endpoint, _: Plant) -> None:
-        stream = subscribe(served, "cell/step/in", "cell/step")
-        tables = [await stream.next(), await stream.next()]
-        assert {table.direction for table in tables} == {wire.DIRECTION_IN, wire.DIRECTION_OUT}
-        feed = served.feeds.pop("cell")
-        served.service.move(["cell"])
-        ends: list[Any] = []
-        while len(ends) < 2:
-            if isinstance(found := await stream.next(), wire.Ended):
-                ends.append(found)
-        assert {(end.source, end.direction) for end in ends} == {("cell", 0), ("cell", 1)}
-        assert not feed.commands.followers.busy
-        served.feeds["cell"] = feed
-        served.service.move(["cell"])
-        while not isinstance(await stream.next(), wire.Table):
-            pass
-        await write(served, {"cell/step": 8})
-        while await stream.values() != {"step": 8}:
-            pass
-
-    with_plant(segment, test)
+@given(paths=chosen, little=st.booleans(), one=seeds, other=seeds, keep=st.floats(0, 1))
+def test_what_goes_by_wire_is_what_the_codec_says(
+    paths: list[str], little: bool, one: int, other: int, keep: float
+) -> None:
+    registers, layout = [BY_PATH[path] for path in paths], LITTLE if little else LAYOUT
+    first, second = random_image(one), random_image(other)
+    columns = Columns(registers, layout.byte_order)
+    table = table_of(registers, columns)
+    before = columns.decode(first)
+    table.apply(Values.FromString(pack(before)))
+    check(table, registers, layout, first)
+    cut = round(keep * layout.size)
+    image = first[:cut] + second[cut:]
+    now = columns.decode(image)
+    changes = table.apply(Values.FromString(pack(now, before)))
+    check(table, registers, layout, image)
+    # Exactly the registers whose bytes mean something else are told.
+    told = {registers[place].path for place in table.changed(changes)}
+    for register in registers:
+        old, new = (codec(register, layout.byte_order).decode(data) for data in (first, image))
+        assert (repr(plain(old, register)) != repr(plain(new, register))) == (register.path in told), register.path
+    invalid = [
+        place
+        for place, register in enumerate(registers)
+        if holds_none(codec(register, layout.byte_order).decode(image))
+    ]
+    assert list(now.invalid) == invalid
 
 
-def test_who_does_not_keep_up_is_told_and_left(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outbox, "MAX_WAITING", 8)
-
-    async def test(served: Endpoint, _: Plant) -> None:
-        stream = subscribe(served, "cell/step/in")
-        await joined(stream)
-        feed, events = served.feeds["cell"], segment.blocks["cell"].events
-        await write(served, {"cell/step": 1})
-        await stream.update()
-        head = events.head()
-        (accepted,) = (one for at in range(1, head + 1) if (one := events.read(at)) and one.kind == EventKind.ACCEPTED)
-        for number in range(head + 1, head + 21):  # within one turn of the loop: nobody reads meanwhile
-            feed.commands.followers.tell(accepted._replace(number=number))
-        code, text = await refusal(drain(stream))
-        assert code is Status.RESOURCE_EXHAUSTED
-        assert "messages are waiting" in text
-        assert not feed.commands.followers.busy
-
-    with_plant(segment, test)
-
-
-async def drain(stream: Stream) -> None:
-    while True:
-        await asyncio.wait_for(stream.next(), TIMEOUT_S)
-
-
-def test_events_that_were_missed_end_it(segment: Segment) -> None:
-    async def test(served: Endpoint, _: Plant) -> None:
-        stream = subscribe(served, "cell/step/in")
-        await joined(stream)
-        served.feeds["cell"].commands.followers.fail("3 events of source cell were missed")
-        assert await refusal(drain(stream)) == (Status.RESOURCE_EXHAUSTED, "3 events of source cell were missed")
-
-    with_plant(segment, test)
+@given(paths=chosen, little=st.booleans(), one=seeds, other=seeds, part=seeds)
+def test_what_a_client_gives_is_what_the_codec_makes_of_it(
+    paths: list[str], little: bool, one: int, other: int, part: int
+) -> None:
+    registers, layout = [BY_PATH[path] for path in paths], LITTLE if little else LAYOUT
+    columns = Columns(registers, layout.byte_order)
+    image, given = random_image(one), columns.decode_numbers(random_image(other))
+    found, wanted = bytearray(image), bytearray(image)
+    random = np.random.default_rng(part)
+    for column, values in given.items():
+        slots = np.concatenate([random.permutation(len(values))[: part % 9], random.integers(0, len(values), 2)])
+        left = set(columns.encode(column, slots, values[slots], found).tolist())
+        for at, slot in enumerate(slots.tolist()):
+            place = columns.place(column, slot)
+            assert place is not None
+            register = registers[place]
+            if at in left:
+                assert register.element.base in ("S5TIME", "TIME_OF_DAY", "LTOD")
+                continue
+            if register.dims:
+                flat = np.unravel_index(slot - columns.places[place][1], register.shape)
+                index = tuple(int(i) + low for i, (low, _) in zip(flat, register.dims, strict=True))
+                register = layout.element(register, index)
+            codec(register, layout.byte_order).encode_into(values[slot].item(), wanted)
+    assert found == wanted
 
 
-def test_what_is_not_served(segment: Segment) -> None:
-    async def test(served: Endpoint, _: Plant) -> None:
-        frames = subscribe(served, "cell/in", format=wire.FORMAT_FRAMES)
-        assert (await refusal(frames.next()))[0] is Status.INVALID_ARGUMENT
-        nothing = subscribe(served, "cell/nothing/in")
-        assert (await refusal(nothing.next()))[0] is Status.NOT_FOUND
-        assert not served.feeds["cell"].commands.followers.busy
+def test_numbers_that_do_not_fit_are_left() -> None:
+    register = Register("count", "INT", (), 0, None, 2, 1)
+    columns, image = Columns([register], "big"), bytearray(2)
+    slots = np.zeros(3, np.int64)
+    assert columns.encode(Column.INT32, slots, np.array([1 << 15, -2, -(1 << 15) - 1]), image).tolist() == [0, 2]
+    assert image == b"\xff\xfe"
 
-    with_plant(segment, test)
+
+def holds_none(value: Value) -> bool:
+    return any(map(holds_none, value)) if isinstance(value, list) else value is None
+
+
+@given(seed=seeds)
+def test_nothing_is_told_of_an_image_that_stays(seed: int) -> None:
+    image = random_image(seed)
+    columns = Columns(LAYOUT.registers, "big")
+    assert pack(columns.decode(image), columns.decode(bytes(image))) == b""
+
+
+@given(path=st.sampled_from([r.path for r in LAYOUT.registers if r.dims]), seed=seeds, data=st.data())
+def test_of_an_array_only_the_elements_that_changed_are_told(path: str, seed: int, data: Any) -> None:
+    register, image = BY_PATH[path], random_image(seed)
+    index = tuple(data.draw(st.integers(low, high)) for low, high in register.dims)
+    element = LAYOUT.element(register, index)
+    columns = Columns([register], "big")
+    changed = bytearray(image)
+    mask = 0xFF if element.bit is None else 1 << element.bit
+    for at in range(element.offset, element.offset + element.size):
+        changed[at] ^= mask
+    values = wire.Values.FromString(pack(columns.decode(bytes(changed)), columns.decode(image)))
+    flat = int(
+        np.ravel_multi_index([i - low for i, (low, _) in zip(index, register.dims, strict=True)], register.shape)
+    )
+    for name in ("bools", "int32s", "int64s", "uint64s", "floats", "doubles", "texts"):
+        assert set(getattr(values, name).slots) <= {flat}
+
+
+@given(
+    old=st.lists(st.floats(width=32), min_size=1, max_size=8),
+    steps=st.lists(st.lists(st.floats(width=32), min_size=8, max_size=8), max_size=6),
+    deadband=st.floats(0.001, 1e6),
+)
+def test_with_a_dead_band_nobody_is_further_off_than_it(
+    old: list[float], steps: list[list[float]], deadband: float
+) -> None:
+    register = Register("a", "REAL", ((0, len(old) - 1),), 0, None, 4 * len(old), len(old))
+    columns = Columns([register], "big")
+    sent = columns.decode(np.array(old, ">f4").tobytes())
+    table = table_of([register], columns)
+    table.apply(Values.FromString(pack(sent)))
+    for step in steps:
+        now = columns.decode(np.array(step[: len(old)], ">f4").tobytes())
+        table.apply(Values.FromString(pack(now, sent, deadband)))
+        sent = merge(now, sent, deadband)
+        np.testing.assert_array_equal(table.value(0), sent.arrays[Column.FLOAT])
+        for seen, true in zip(table.value(0).tolist(), step, strict=False):
+            assert seen == true or (math.isnan(seen) and math.isnan(true)) or abs(seen - true) <= deadband
+
+
+@pytest.mark.parametrize(
+    ("type_", "raw", "column", "value"),
+    [
+        ("BOOL", "08", Column.BOOL, True),
+        ("USINT", "ff", Column.INT32, 255),
+        ("INT", "8000", Column.INT32, -32768),
+        ("WORD", "ffff", Column.INT32, 65535),
+        ("DINT", "80000000", Column.INT32, -(1 << 31)),
+        ("UDINT", "ffffffff", Column.INT64, (1 << 32) - 1),
+        ("LINT", "8000000000000000", Column.INT64, -(1 << 63)),
+        ("ULINT", "ffffffffffffffff", Column.UINT64, (1 << 64) - 1),
+        ("REAL", "3dcccccd", Column.FLOAT, np.float32(0.1)),
+        ("LREAL", "3fb999999999999a", Column.DOUBLE, 0.1),
+        ("TIME", "ffffffff", Column.INT32, -1),
+        ("LTIME", "0000000000000001", Column.INT64, 1),
+        ("TIME_OF_DAY", "0526 5bff", Column.INT32, 86_399_999),
+        ("S5TIME", "1123", Column.INT32, 12_300),
+        ("DATE", "0000", Column.TEXT, "1990-01-01"),
+        ("STRING[3]", "0302 e461 00", Column.TEXT, "äa"),
+    ],
+)
+def test_fixed_bytes(type_: str, raw: str, column: Column, value: Any) -> None:
+    image = bytes.fromhex(raw)
+    register = Register("a", type_, (), 0, 3 if type_ == "BOOL" else None, len(image), 1)
+    columns = Columns([register], "big")
+    assert columns.places == [(column, 0)]
+    table = table_of([register], columns)
+    (change,) = table.apply(Values.FromString(pack(columns.decode(image))))
+    assert int(change.column) == column
+    assert table.value(0) == value
+    if column in KINDS:
+        assert not change.values.flags.writeable
