@@ -24,7 +24,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 from tests.unit.client.both import BOTH, Connect
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub
-from tests.unit.endpoints.grpc.shmio_v1.test_inject import with_client
+from tests.unit.endpoints.grpc.shmio_v1.test_injections import with_client
 from tests.unit.endpoints.harness import STALE_NS, TIMEOUT_S, WRITER, Endpoint, refusal, serve
 from tests.unit.endpoints.plant import Plant
 
