@@ -9,11 +9,10 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Recorder as Settings
-from shmio.recorder.attached_files import ConfigFiles
 from shmio.recorder.housekeeping import Housekeeper
 from shmio.recorder.instance_follower import InstanceFollower, StartPositions
 from shmio.recorder.predecessor import last_positions, trigger_interrupted
-from shmio.recorder.rotation import RotatingRecorder
+from shmio.recorder.recorder import ConfigFiles, RotatingRecorder
 from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.format.encoding import SUPERVISED, Reason
 from shmio.recording.selection import Selection

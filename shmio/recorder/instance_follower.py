@@ -3,18 +3,146 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import Final, NamedTuple
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from shmio.model.clock import Clock
-from shmio.recorder.block_follower import BlockEntry, BlockFollower, InstanceEntry
-from shmio.recording.format.encoding import BlockPosition, ProcessChange, ProcessEvent, Reason, StepMark
-from shmio.recording.selection import Selection
-from shmio.segment import Block, Segment
+from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, ProcessEvent, Reason, StepMark
+from shmio.recording.selection import RecordedRegisters, Selection
+from shmio.segment import Block, Cursor, Event, Frame, Segment
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.processes import Phase, ProcessSlot
 
+TURN_S: Final = 0.1
+"""Longest pause between two turns."""
+LIVELY: Final = 256
+"""With more entries of a block in a turn the next turn comes sooner: many commands fill an event ring fast."""
+BATCH_BYTES: Final = 2 << 20
+"""About how much of one block is read in a turn; the rest follows at once in the next."""
+
 _DOWN: Final[Mapping[Phase, ProcessEvent]] = {Phase.BACKOFF: ProcessEvent.DIED, Phase.FATAL: ProcessEvent.GAVE_UP}
+
+Item = TypeVar("Item", bound=Frame | Event)
+
+
+class BlockEntry(NamedTuple):
+    """A frame, event or gap of a block, with its time in the recording."""
+
+    log_ns: int
+    follower: BlockFollower
+    item: Frame | Event | Gap
+
+
+class InstanceEntry(NamedTuple):
+    """A step or a change of a process, with its time in the recording."""
+
+    log_ns: int
+    item: StepMark | ProcessChange
+
+
+class _Stream(Generic[Item]):
+    """Position in the frames, or in the events, of a block."""
+
+    def __init__(self, what: str, cursor: Cursor[Item], log_ns: int, reason: Reason) -> None:
+        self.what = what
+        self.cursor = cursor
+        self.last = cursor.last
+        self.reason = reason
+        self.log_ns = log_ns
+        self.held: Item | None = None
+
+    def peek(self) -> Item | None:
+        if self.held is None:
+            self.held = self.cursor.poll()
+        return self.held
+
+
+class BlockFollower:
+    """Follows one block. ``done`` is True once a reload has retired the block and all of it was taken."""
+
+    def __init__(
+        self,
+        block: Block,
+        number: int,
+        place: BlockPosition,
+        reason: Reason,
+        log_time: Callable[[int], int],
+        *,
+        over: bool = False,
+        part: RecordedRegisters | None = None,
+    ) -> None:
+        """Start to follow a block.
+
+        Args:
+            block: The block.
+            number: Number of the block in the recording.
+            place: The position to start behind.
+            reason: Why entries at the start may be missing.
+            log_time: Converts CLOCK_MONOTONIC to the time in the recording.
+            over: Whether a reload had already retired the block.
+            part: The registers to record; None: all.
+        """
+        self.block = block
+        self.number = number
+        self.begin = place
+        self.over = over
+        self.part = part or RecordedRegisters(block.layout)
+        self.done = False
+        self._log_time = log_time
+        self._log_ns = place.log_ns
+        self._frames = _Stream("frames", block.cursor(after=place.frame), place.log_ns, reason)
+        self._events = _Stream("events", block.events.cursor(after=place.event), place.log_ns, reason)
+
+    def take(self, limit: int) -> Iterator[BlockEntry]:
+        """Yield the entries published by now, at most about ``limit``."""
+        retired = self.block.retired  # before reading: what was published before the end is still read
+        for _ in range(limit):
+            side = self._next()
+            if side is None:
+                self.done = retired
+                self._frames.reason = self._events.reason = Reason.OVERTAKEN  # later entries are new
+                return
+            yield from self._entries(side)
+
+    def rest(self) -> Iterator[BlockEntry]:
+        """Yield the gaps at the end, behind the last entry."""
+        for side in (self._frames, self._events):
+            if side.cursor.last > side.last and side.held is None:
+                yield BlockEntry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
+
+    def _next(self) -> _Stream[Frame] | _Stream[Event] | None:
+        """Return the stream whose entry comes first."""
+        frame = self._frames.peek()
+        event = self._events.peek()
+        if event is None:
+            return None if frame is None else self._frames
+        if frame is None and event.frame > self._frames.cursor.last:
+            frame = self._frames.peek()  # published between the two reads
+        return self._events if frame is None or event.frame < frame.number else self._frames
+
+    def _entries(self, side: _Stream[Frame] | _Stream[Event]) -> Iterator[BlockEntry]:
+        item = side.held
+        assert item is not None  # noqa: S101  _next has looked
+        # Never decreasing: entries of a block stay in the order of their numbers, whatever its clock does.
+        self._log_ns = log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(item.clock_ns)))
+        if item.number > side.last + 1:
+            yield BlockEntry(log_ns, self, self._gap(side, item.number - 1, log_ns))
+        side.held, side.last, side.log_ns, side.reason = None, item.number, log_ns, Reason.OVERTAKEN
+        yield BlockEntry(log_ns, self, item)
+
+    def _gap(self, side: _Stream[Frame] | _Stream[Event], last: int, before_ns: int) -> Gap:
+        first = side.last + 1
+        return Gap(
+            self.block.source,
+            self.number,
+            side.what,
+            first,
+            last,
+            last - first + 1,
+            side.reason,
+            side.log_ns,
+            before_ns,
+        )
 
 
 class _ProcessState(NamedTuple):
@@ -79,13 +207,6 @@ def _between(name: str, old: _ProcessState | None, now: _ProcessState) -> Iterat
         yield _change(name, now._replace(why=""), ProcessEvent.STARTED)
     if now.phase is Phase.STOPPED and phase is not Phase.STOPPED:
         yield _change(name, now, ProcessEvent.ENDED)
-
-
-TURN_S: Final = 0.1
-LIVELY: Final = 256
-"""With more entries of a block in a turn the next turn comes sooner: many commands fill an event ring fast."""
-BATCH_BYTES: Final = 2 << 20
-"""About how much of one block is read in a turn; the rest follows at once in the next."""
 
 
 class StartPositions(NamedTuple):

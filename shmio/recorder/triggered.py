@@ -15,11 +15,8 @@ from shmio.errors import ConfigError, RecordingError
 from shmio.injection.expression import Memory, Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.codec import RegisterCodec
-from shmio.recorder.attached_files import AttachedFiles
-from shmio.recorder.block_follower import BlockEntry, InstanceEntry
-from shmio.recorder.instance_follower import TURN_S, InstanceFollower
-from shmio.recorder.recorder import CLOSE_S, Counters, is_process_change
-from shmio.recorder.rotation import RotatingRecorder
+from shmio.recorder.instance_follower import TURN_S, BlockEntry, InstanceEntry, InstanceFollower
+from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Counters, RotatingRecorder, is_process_change
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.segment import Block, Frame, Quality
 

@@ -15,9 +15,8 @@ from shmio.cli.target import target
 from shmio.config import Recorder as Settings
 from shmio.config import Trigger
 from shmio.errors import ControlError, PathError, RecordingError
-from shmio.recorder.attached_files import AttachedFiles, ConfigFiles, no_attachments
 from shmio.recorder.instance_follower import InstanceFollower, StartPositions
-from shmio.recorder.rotation import RotatingRecorder
+from shmio.recorder.recorder import AttachedFiles, ConfigFiles, RotatingRecorder, no_attachments
 from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.selection import Selection
 from shmio.segment import Segment

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from shmio.recorder import attached_files, instance_follower
+from shmio.recorder import instance_follower
 from shmio.recorder import recorder as recorder_module
-from shmio.recorder.attached_files import AttachedFile
 from shmio.recorder.instance_follower import InstanceFollower, ProcessWatch
+from shmio.recorder.recorder import AttachedFile
 from shmio.recording.format.encoding import ProcessChange, ProcessEvent, decode_process, encode_json
 from shmio.recording.reading.reader import Reader
 from shmio.segment import Activity, ProcessSpec, Report, Segment
@@ -138,9 +138,9 @@ def test_a_configuration_that_changes_is_attached_again(
 def test_the_largest_file_is_attached_and_a_larger_one_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(attached_files, "MAX_FILE_BYTES", 10)
+    monkeypatch.setattr(recorder_module, "MAX_FILE_BYTES", 10)
     file = tmp_path / "supervisor.toml"
-    files = attached_files.ConfigFiles(file)
+    files = recorder_module.ConfigFiles(file)
     file.write_bytes(bytes(10))
     assert [(one.name, one.data) for one in files(None, 0)] == [("config/supervisor.toml", bytes(10))]
     file.write_bytes(bytes(11))
@@ -152,7 +152,7 @@ def test_the_largest_file_is_attached_and_a_larger_one_is_not(
 def test_a_configuration_that_became_invalid_is_named_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / "supervisor.toml"
     file.write_text("[instance\n")
-    files = attached_files.ConfigFiles(file)
+    files = recorder_module.ConfigFiles(file)
     assert files("cell", 1) == files("cell", 1) == []
     (line,) = caplog.messages
     assert line.startswith("the layout's sources of cell are not attached: ")

@@ -14,8 +14,8 @@ from shmio.config import Recorder as Settings
 from shmio.config import Trigger as TriggerSettings
 from shmio.errors import ConfigError
 from shmio.recorder import output as output_module
-from shmio.recorder.attached_files import no_attachments
 from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
+from shmio.recorder.recorder import no_attachments
 from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.check import check
 from shmio.recording.reading.reader import Reader
@@ -23,7 +23,7 @@ from shmio.recording.selection import Selection
 from shmio.segment import BlockWriter, Event, EventKind, Origin, Quality, Record, Segment, Stamp
 from shmio.testing.cell import kill, until
 from tests.unit.recorder.harness import OTHER, RING, Process, gaps, numbers, publish, spec
-from tests.unit.recorder.test_rotation import files
+from tests.unit.recorder.test_recorder_rotation import files
 
 S = 1_000_000_000
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recorder import block_follower
+from shmio.recorder import instance_follower
 from shmio.recording.check import Findings, check
 from shmio.recording.format.damage import Damage
 from shmio.recording.format.records import MAGIC, Record
@@ -220,7 +220,7 @@ def test_numbers_that_nobody_accounts_for_are_told(
     publish(writer, 5)
     work.turn()
     with monkeypatch.context() as broken:
-        broken.setattr(block_follower.BlockFollower, "_entries", lambda self, side: iter(_dropped(side)))
+        broken.setattr(instance_follower.BlockFollower, "_entries", lambda self, side: iter(_dropped(side)))
         publish(writer, 3)
         work.turn()
     publish(writer, 2)
@@ -228,7 +228,7 @@ def test_numbers_that_nobody_accounts_for_are_told(
     assert found_in(work.output.path).problems == ["cell, block 1: frames 6 to 8 are missing, and in no gap"]
 
 
-def _dropped(side: block_follower._Stream[Frame]) -> list[block_follower.BlockEntry]:
+def _dropped(side: instance_follower._Stream[Frame]) -> list[instance_follower.BlockEntry]:
     assert side.held is not None
     side.last, side.held = side.held.number, None
     return []

@@ -16,12 +16,10 @@ from shmio.config import Recorder as Settings
 from shmio.connectors.replay.recording import Recording
 from shmio.local.time_control import Coordinator
 from shmio.recorder import output as output_module
-from shmio.recorder.attached_files import no_attachments
-from shmio.recorder.block_follower import BlockEntry
 from shmio.recorder.housekeeping import Housekeeper
-from shmio.recorder.instance_follower import InstanceFollower
+from shmio.recorder.instance_follower import BlockEntry, InstanceFollower
 from shmio.recorder.output import Output
-from shmio.recorder.rotation import RotatingRecorder
+from shmio.recorder.recorder import RotatingRecorder, no_attachments
 from shmio.recording.check import check
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.recording.reading.reader import Reader

@@ -12,8 +12,8 @@ import pytest
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recorder.attached_files import AttachedFile
-from shmio.recorder.closing import finalise
+from shmio.recorder.housekeeping import finalise
+from shmio.recorder.recorder import AttachedFile
 from shmio.recording.check import check
 from shmio.recording.reading.reader import Reader
 from shmio.segment import EventKind, Record, Segment
