@@ -35,8 +35,20 @@ from mcap.records import (
 from shmio.config import Recorder as Settings
 from shmio.errors import RecordingError
 from shmio.recorder.predecessor import about_of, is_own, own_files
-from shmio.recording.format.framing import CHUNK, FOOTER, HEAD, INDEX, MAX_CHUNK_BYTES, U32, U64
-from shmio.recording.format.records import BROKEN, LOOK_BYTES, MAGIC, Record, stream
+from shmio.recording.format.records import (
+    BROKEN,
+    CHUNK,
+    FOOTER,
+    HEAD,
+    INDEX,
+    LOOK_BYTES,
+    MAGIC,
+    MAX_CHUNK_BYTES,
+    U32,
+    U64,
+    Record,
+    stream,
+)
 from shmio.recording.reading.reader import Reader
 
 LOOK_S: Final = 60.0

@@ -9,11 +9,8 @@ from typing import Final
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recording.format.channels import Channel
-from shmio.recording.format.damage import Damage, DamageLog
-from shmio.recording.format.encoding import EVENT, FRAME, Gap
-from shmio.recording.format.framing import U32, U64
-from shmio.recording.format.records import BROKEN, Record
+from shmio.recording.format.encoding import EVENT, FRAME, Channel, Gap
+from shmio.recording.format.records import BROKEN, U32, U64, Damage, DamageLog, Record
 from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
 

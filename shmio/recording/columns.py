@@ -16,7 +16,7 @@ from shmio.layout.model import ByteOrder, Layout, Register
 from shmio.layout.values.frame_codec import FrameCodec
 from shmio.recording.libraries import ANALYSIS, library
 from shmio.recording.reading.batch import HEAD, Batch
-from shmio.recording.reading.blocks import DumpBlock
+from shmio.recording.reading.part import DumpBlock
 
 if TYPE_CHECKING:
     import pandas

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import chain, groupby, islice, zip_longest
 from typing import Any, Final, TypeVar
 
 from shmio.errors import PathError
@@ -13,12 +14,21 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import elements
 from shmio.recording.dump import Dump
-from shmio.recording.joining import EVENT_FIELDS, MAX_EVENTS, InOrder, Pair, aligned, grouped, joined
-from shmio.recording.reading.blocks import DumpBlock
-from shmio.recording.reading.entries import Entry
+from shmio.recording.reading.part import DumpBlock, Entry
 from shmio.segment import Event, EventKind, Frame, Provenance
 from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.playhead import OWN_WORDS
+
+EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
+"""Content of an event, which does not depend on the run."""
+MAX_EVENTS: Final = 4096
+"""Limit on events of one key in memory: while time is paused, one cycle may have any number."""
+MAX_SHIFT: Final = 64
+"""Limit on the frames that one of two recordings lacks at the beginning of the first common key."""
+
+T = TypeVar("T", Frame, Event)
+_Pair = tuple[Entry[T] | None, Entry[T] | None]
+_Groups = Iterator[tuple[int, Iterable[Entry[T]]]]
 
 
 @dataclass(slots=True)
@@ -123,7 +133,7 @@ have.
 """
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
 
-T = TypeVar("T", Frame, Event)
+
 _Chosen = tuple[Mapping[DumpBlock, Sequence[Register]], Mapping[DumpBlock, Sequence[Register]]]
 
 
@@ -203,11 +213,11 @@ class _Source:
         found = self._found
         ignore = self._how.ignore
         frames = [groupby(_frames(dump, self._name), self._frame_key) for dump in self._dumps]
-        in_order = InOrder(shifted="ends" in ignore and not {"cycle", "times"} <= {*ignore})
-        self._compare(found.frames, joined(frames[0], frames[1], in_order), self._frames)
+        in_order = _InOrder(shifted="ends" in ignore and not {"cycle", "times"} <= {*ignore})
+        self._compare(found.frames, _joined(frames[0], frames[1], in_order), self._frames)
         if "events" not in ignore:
-            events = [grouped(_events(dump, self._name), self._event_key, MAX_EVENTS) for dump in self._dumps]
-            self._compare(found.events, joined(events[0], events[1], aligned), self._events)
+            events = [_grouped(_events(dump, self._name), self._event_key, MAX_EVENTS) for dump in self._dumps]
+            self._compare(found.events, _joined(events[0], events[1], _aligned), self._events)
         found.missing = sorted({path for pair in self._pairs.values() for path in pair.missing})
         return found
 
@@ -224,7 +234,7 @@ class _Source:
         return entry.item.frame - (entry.block.after.get("frames", 0) if entry.block else 0)
 
     def _compare(
-        self, side: Side, pairs: Iterator[Pair[T]], differs: Callable[[Entry[T], Entry[T]], list[str]]
+        self, side: Side, pairs: Iterator[_Pair[T]], differs: Callable[[Entry[T], Entry[T]], list[str]]
     ) -> None:
         since, inside = _Alone(), _Alone()
         begun = False
@@ -489,3 +499,108 @@ def _events(dump: Dump, source: str) -> Iterator[Entry[Event]]:
 
 def _is_replays(event: Event) -> bool:
     return event.kind == EventKind.QUALITY and event.text.startswith(OWN_WORDS)
+
+
+# ---- matching entries of two recordings ------------------------------------------------------------------------------
+
+
+def _grouped(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int], most: int) -> _Groups[T]:
+    """Yield groups of at most ``most`` consecutive entries with the same key."""
+    for value, some in groupby(entries, key):
+        while group := list(islice(some, most)):
+            yield value, group
+
+
+def _joined(
+    first: _Groups[T],
+    second: _Groups[T],
+    align: Callable[[Iterable[Entry[T]], Iterable[Entry[T]]], Iterable[_Pair[T]]],
+) -> Iterator[_Pair[T]]:
+    """Yield pairs of matching entries, with None for an entry that one recording lacks.
+
+    The keys of both recordings must ascend. ``align`` matches the entries of two groups.
+    """
+    one, other = next(first, None), next(second, None)
+    while one is not None or other is not None:
+        if one is not None and (other is None or one[0] < other[0]):
+            yield from ((entry, None) for entry in one[1])
+            one = next(first, None)
+        elif other is not None and (one is None or one[0] > other[0]):
+            yield from ((None, entry) for entry in other[1])
+            other = next(second, None)
+        elif one is not None and other is not None:
+            yield from align(one[1], other[1])
+            one, other = next(first, None), next(second, None)
+
+
+class _InOrder:
+    """Pairs frames of one key in their order.
+
+    If ``shifted``, one of the recordings may lack the beginning of the first common key. Its frames
+    are paired with those of the other that have the same content.
+    """
+
+    def __init__(self, *, shifted: bool) -> None:
+        self._shifted = shifted
+
+    def __call__(self, ones: Iterable[Entry[Frame]], others: Iterable[Entry[Frame]]) -> Iterator[_Pair[Frame]]:
+        """Yield pairs, with None for a frame that one group lacks."""
+        if self._shifted:
+            self._shifted = False
+            first, second = iter(ones), iter(others)
+            left, right = list(islice(first, MAX_SHIFT)), list(islice(second, MAX_SHIFT))
+            shift = _shift(left, right)
+            yield from ((entry, None) for entry in left[: max(0, shift)])
+            yield from ((None, entry) for entry in right[: max(0, -shift)])
+            ones, others = chain(left[max(0, shift) :], first), chain(right[max(0, -shift) :], second)
+        yield from zip_longest(ones, others)
+
+
+def _shift(ones: Sequence[Entry[Frame]], others: Sequence[Entry[Frame]]) -> int:
+    """Return how many of ``ones`` are before the first of the others; negative: the other way round.
+
+    Most pairs have the same content, or else there are most pairs, or else the last ones are paired.
+    """
+
+    def alike(shift: int) -> tuple[int, int, int]:
+        pairs = list(zip(ones[max(0, shift) :], others[max(0, -shift) :], strict=False))
+        return sum(_image(one.item) == _image(other.item) for one, other in pairs), len(pairs), abs(shift)
+
+    return max(range(1 - len(others), len(ones)), key=alike)
+
+
+def _image(frame: Frame) -> Hashable:
+    return frame.quality, frame.raw, frame.effective
+
+
+def _aligned(ones: Iterable[Entry[Event]], others: Iterable[Entry[Event]]) -> Iterator[_Pair[Event]]:
+    """Pair events with the same content in any order, then by kind and place, then by kind."""
+    left: list[Entry[Event]] = list(ones)
+    right: list[Entry[Event]] = list(others)
+    for alike in (_content, _place, _event_kind):
+        waiting: defaultdict[Hashable, deque[Entry[Event]]] = defaultdict(deque)
+        for entry in right:
+            waiting[alike(entry.item)].append(entry)
+        unmatched = []
+        matched = set()
+        for entry in left:
+            if same := waiting[alike(entry.item)]:
+                matched.add(id(same[0]))
+                yield entry, same.popleft()
+            else:
+                unmatched.append(entry)
+        left, right = unmatched, [entry for entry in right if id(entry) not in matched]
+    yield from ((entry, None) for entry in left)
+    yield from ((None, entry) for entry in right)
+
+
+def _content(event: Event) -> Hashable:
+    return tuple(getattr(event, name) for name in EVENT_FIELDS)
+
+
+def _place(event: Event) -> Hashable:
+    return event.kind, event.offset, event.mask
+
+
+def _event_kind(event: Event) -> Hashable:
+    return event.kind

@@ -17,9 +17,7 @@ from shmio.layout.topic import holder
 from shmio.layout.values.write import covering
 from shmio.recording.dump import Dump
 from shmio.recording.format.encoding import Gap, ProcessChange, Reason, StepMark
-from shmio.recording.reading.blocks import DumpBlock
-from shmio.recording.reading.entries import Entry
-from shmio.recording.reading.part import MAX_NS
+from shmio.recording.reading.part import MAX_NS, DumpBlock, Entry
 from shmio.recording.reading.reader import Item
 from shmio.recording.selection import RecordedRegisters
 from shmio.recording.times import span

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from shmio.recording.format.damage import Damage
+from shmio.recording.format.records import Damage
 
 
 def iso(time_ns: int) -> str:

@@ -34,7 +34,7 @@ from shmio.recording.format.encoding import (
     encode_json,
     encode_position,
 )
-from shmio.recording.reading.blocks import DumpBlock
+from shmio.recording.reading.part import DumpBlock
 from shmio.segment import Block, Event, Frame
 from shmio.version import __version__
 

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shmio.recording.format.channels import Channel
-from shmio.recording.format.encoding import FRAME, Gap, ProcessChange, StepMark
+from shmio.recording.format.encoding import FRAME, Channel, Gap, ProcessChange, StepMark
 from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import survey
 from shmio.segment import Event, Frame

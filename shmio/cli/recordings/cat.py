@@ -25,8 +25,7 @@ from shmio.layout.values.codec import codec
 from shmio.layout.values.text import json_value, to_text
 from shmio.logs import printable
 from shmio.recording.columns import heading
-from shmio.recording.format.channels import Channel
-from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, Gap, ProcessChange, StepMark
+from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, Channel, Gap, ProcessChange, StepMark
 from shmio.recording.reading.reader import Message, Reader
 from shmio.recording.reading.survey import Survey, survey
 from shmio.recording.times import iso, local, span

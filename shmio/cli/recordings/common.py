@@ -13,7 +13,7 @@ from shmio.errors import RecordingError
 from shmio.local.replays import moment_ns
 from shmio.logs import printable
 from shmio.recording.dump import Dump, open_dump
-from shmio.recording.format.damage import Damage
+from shmio.recording.format.records import Damage
 from shmio.recording.reading.part import MAX_NS
 from shmio.recording.times import lost
 

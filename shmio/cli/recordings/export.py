@@ -11,13 +11,9 @@ from typing import Final
 from shmio.cli.recordings.common import DamageReport, Progress, time_range
 from shmio.cli.run import dumps, say
 from shmio.errors import PathError, RecordingError
-from shmio.recording.dump import Dump
-from shmio.recording.export.events import export_events
-from shmio.recording.export.tables import TABLES, BlockTables
-from shmio.recording.export.viewer import export_mcap
-from shmio.recording.names import Chosen
-from shmio.recording.pieces import pieces
-from shmio.recording.reading.blocks import DumpBlock
+from shmio.recording.dump import Chosen, Dump
+from shmio.recording.export import TABLES, BlockTables, export_events, export_mcap, pieces
+from shmio.recording.reading.part import DumpBlock
 from shmio.recording.rewriting import new_file
 from shmio.recording.times import span
 

@@ -12,8 +12,8 @@ from shmio.cli.run import dumps, say
 from shmio.errors import RecordingError
 from shmio.recording import rewriting
 from shmio.recording.dump import Dump, open_dump
-from shmio.recording.format.damage import Damage
-from shmio.recording.reading.entries import Entry
+from shmio.recording.format.records import Damage
+from shmio.recording.reading.part import Entry
 from shmio.recording.reading.reader import Item
 from shmio.recording.rewriting import Rewriter, part
 from shmio.recording.times import lost

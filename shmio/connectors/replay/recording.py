@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 from shmio.errors import RecordingError
 from shmio.local.replays import date_ns
 from shmio.recording.dump import Dump, open_dump
-from shmio.recording.format.damage import Damage
 from shmio.recording.format.encoding import Gap
-from shmio.recording.reading.blocks import DumpBlock
+from shmio.recording.format.records import Damage
+from shmio.recording.reading.part import DumpBlock
 from shmio.segment import Event, Frame
 from shmio.segment.header import MAX_PROCESSES
 

@@ -1,4 +1,4 @@
-"""Encode and decode frames, events, gaps and steps (docs/reference/dump-format.md).
+"""The messages of a recording: channels, frames, events, gaps, steps and processes (docs/reference/dump-format.md).
 
 Decoding checks everything, and raises ValueError for malformed bytes.
 """
@@ -6,37 +6,42 @@ Decoding checks everything, and raises ValueError for malformed bytes.
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple, TypeVar
 
 import msgspec
+from mcap.records import Channel as ChannelRecord
 
 from shmio.model.values import Provenance, Quality
+from shmio.recording.format.records import stream
 from shmio.segment.block import Frame
 from shmio.segment.events import EVENT_DATA_SIZE, Event
 
 MAX_JSON_BYTES: Final = 4096
+MAX_CHANNELS: Final = 10_000
+MAX_CHANNEL_BYTES: Final = 4096
 
 PROFILE: Final = "shmio"
 ABOUT: Final = "shmio"
-"""Name of the metadata that tell about the instance."""
+"""Name of the metadata about the instance."""
 SUPERVISED: Final = "supervised"
-"""What these say of who records, where that is the instance's own recorder."""
+"""Value of their key ``recorder`` if the instance's own recorder records."""
 PLACES: Final = "places"
-"""Name of the metadata that tell behind which numbers the recording begins."""
+"""Name of the metadata with the positions behind which the recording begins."""
 GAPS_TOPIC: Final = "gaps"
 STEPS_TOPIC: Final = "steps"
 PROCESSES_TOPIC: Final = "processes"
 
 FRAME: Final = "shmio.frame.v1"
 FRAME_V2: Final = "shmio.frame.v2"
-"""The same with differences in place of what stands in the message's own header already: see :func:`differ`."""
+"""The same, with differences from the message's own header in five fields: see :func:`differ`."""
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"
 GAP: Final = "gap"
 STEP: Final = "step"
 PROCESS: Final = "process"
-"""What gaps, steps and changes of processes are called here; in the file all are PLAIN, told apart by their topics."""
+"""Names of gaps, steps and changes of processes in this code; in the file all are PLAIN, and their topics differ."""
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
 _COUNTED: Final = struct.Struct("<QQQQQ")  # how a frame begins: number, cycle, publish, clock, source
@@ -45,6 +50,8 @@ _QUALITIES: Final = (*Quality, Quality.BAD)  # an unknown quality counts as bad
 _PROVENANCES: Final = tuple(Provenance)
 _MAX_U64: Final = (1 << 64) - 1
 _EFFECTIVE: Final = 1  # flag: an effective image follows the raw one
+
+_OWN: Final = {GAPS_TOPIC: GAP, STEPS_TOPIC: STEP, PROCESSES_TOPIC: PROCESS}
 
 T = TypeVar("T")
 
@@ -292,3 +299,46 @@ def decode_position(text: str) -> BlockPosition:
     if min(frame, event, log_ns) < 0:
         raise ValueError("a place is negative")
     return BlockPosition(frame, event, log_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """The channel of a block's frames or events, or of gaps, steps or processes.
+
+    ``layout``: hash of the block's layout, in hex. ``encoding`` is FRAME for frames of either version, and
+    empty for messages that no recorder wrote.
+    """
+
+    number: int
+    encoding: str
+    topic: str
+    source: str = ""
+    block: int = 0
+    section: int = 0
+    after: int = 0
+    """Number before the first recorded frame or event."""
+    layout: str = ""
+    period_ns: int = 0
+    stale_ns: int = 0
+    of: str = ""
+    """Hash of the whole layout, if only some of its registers were recorded."""
+    differences: bool = False
+    """Whether frames are encoded as FRAME_V2."""
+
+
+def describe(content: memoryview) -> Channel:
+    """Decode a channel's record. ValueError, KeyError, struct.error, McapError: it is malformed."""
+    found = ChannelRecord.read(stream(content))
+    about = found.metadata
+    if found.message_encoding in (FRAME, FRAME_V2, EVENT):
+        block, section, after = (int(about[name]) for name in ("block", "section", "after"))
+        period_ns, stale_ns = (int(about[name]) for name in ("period_ns", "stale_ns"))
+        source, layout = about["source"], about["layout"]
+        encoding = EVENT if found.message_encoding == EVENT else FRAME
+        return Channel(
+            found.id, encoding, found.topic, source, block, section, after, layout, period_ns, stale_ns,
+            about.get("of", ""), found.message_encoding == FRAME_V2,
+        )  # fmt: skip
+    if found.message_encoding == PLAIN and found.topic in _OWN:
+        return Channel(found.id, _OWN[found.topic], found.topic)
+    return Channel(found.id, "", found.topic)  # another program's

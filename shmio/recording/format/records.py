@@ -12,6 +12,7 @@ import os
 import re
 import stat
 import struct
+import threading
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -24,20 +25,27 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recording.format.framing import CHUNK, FOOTER, HEAD, MAX_CHUNK_BYTES, U32, framed, unpack
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES: Final = 1 << 20
-"""Any other record that is read as a whole."""
+"""Limit on any other record that is read as a whole."""
 
 BROKEN: Final = 0
-"""The opcode, which no record of MCAP has, of bytes that make no sense."""
+"""Opcode of bytes that are no valid record; no record of MCAP has it."""
 ONLY_BEGUN: Final = "has no content: its recorder was killed before it wrote anything, or has just started"
 LOOK_BYTES: Final = 4096
-"""So much at a record's beginning tells how long it is: names of attachments and metadata fit in."""
+"""Bytes at a record's beginning that suffice for the lengths in it: names of attachments and metadata fit in."""
 BEAT_BYTES: Final = 1 << 20
-"""After so much that was read or unpacked the reader's caller is told that it goes on."""
+"""Bytes that are read or unpacked between two calls of ``beat``."""
+MAX_CHUNK_BYTES: Final = 32 << 20
+"""Limit far above a recorder's chunks, which have 1 MiB and one message of at most 2 MiB."""
 
+HEAD: Final = struct.Struct("<BQ")  # of any record: opcode, size of its content
+CHUNK: Final = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC; then the compression's name, size, data
+FOOTER: Final = struct.Struct("<QQI")  # start of the summary, start of its offsets, CRC of the summary up to here
+INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries that follow
+U32: Final = struct.Struct("<I")
+U64: Final = struct.Struct("<Q")
 _MARK: Final = re.compile(  # beginning of each chunk and attachment that shmio writes
     rb"\x06(?=.{36}\x04\x00\x00\x00zstd)|\x09(?=.{24}.\x00\x00\x00(?:layouts|config|sources)/)", re.DOTALL
 )
@@ -45,6 +53,7 @@ _MARK_BYTES: Final = 64
 _SEARCH_BYTES: Final = 1 << 20
 _MAX_SEARCHED: Final = 100
 """The search ends after this many places that look like a chunk or attachment but are not."""
+_SIZES: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: FOOTER.size}
 
 
 class Record(NamedTuple):
@@ -191,7 +200,7 @@ class Records:
             return None
         opcode, size = HEAD.unpack_from(head)
         content = at + HEAD.size
-        if opcode == BROKEN or size > self.size - content or not framed(opcode, size, head[HEAD.size :]):
+        if opcode == BROKEN or size > self.size - content or not _framed(opcode, size, head[HEAD.size :]):
             return None
         if opcode == Opcode.FOOTER and not MAGIC.startswith(self._peek(content + size, len(MAGIC))):
             return None
@@ -253,7 +262,7 @@ class Records:
     def unpacked(self, record: Record) -> bytes:
         """Return the uncompressed bytes of a chunk, checked against its CRC; else RecordingError."""
         try:
-            data = unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES))
+            data = _unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES))
         except (ValueError, struct.error, zstandard.ZstdError) as error:
             raise RecordingError(f"{self.file}: the chunk at byte {record.at} is damaged: {error}") from None
         self._worked(len(data))
@@ -296,6 +305,120 @@ class Records:
             self._fd = -1
 
 
+class Damage(NamedTuple):
+    """Bytes ``first`` to ``last`` of a file, which cannot be read, or only in part.
+
+    ``after_ns``, ``before_ns``: log times of the readable entries before and after them; 0: none.
+    """
+
+    first: int
+    last: int
+    why: str
+    after_ns: int
+    before_ns: int
+
+
+class DamageLog:
+    """Collects damage while a file is read from front to back. Between two intact chunks it is reported as one.
+
+    Call :meth:`end` before a chunk that can be read, :meth:`after` behind it, and :meth:`end` at the end.
+    """
+
+    def __init__(self, tell: Callable[[Damage], object]) -> None:
+        self._tell = tell
+        self._after_ns = 0
+        self._found: Damage | None = None
+
+    def add(self, record: Record, why: object) -> None:
+        """Add a record that cannot be read completely."""
+        first, last = record.at, record.at + record.size - 1
+        if self._found is None:
+            self._found = Damage(first, last, str(why), self._after_ns, 0)
+        else:
+            self._found = self._found._replace(last=last)
+
+    def after(self, last_ns: int) -> None:
+        """Note that a chunk was read, up to this log time."""
+        self._after_ns = last_ns
+
+    def end(self, before_ns: int = 0) -> None:
+        """Report pending damage. ``before_ns``: log time of the entry behind it; 0: there is none."""
+        if self._found is not None:
+            self._tell(self._found._replace(before_ns=before_ns))
+            self._found = None
+
+
 def stream(data: bytes | memoryview) -> ReadDataStream:
     """Return a stream from which the mcap library reads records; it has its own copy of the data."""
     return ReadDataStream(BytesIO(data))
+
+
+class _OfThread(threading.local):
+    """Decompressor of a thread: making one takes longer than unpacking a chunk."""
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
+
+
+_of_thread = _OfThread()
+
+
+def _framed(opcode: int, size: int, look: bytes) -> bool:
+    """Return whether the lengths inside a record agree with the length of the whole record.
+
+    This keeps a damaged length from leading the reader past intact records. ``look`` is the
+    beginning of the content.
+    """
+    try:
+        if opcode == Opcode.CHUNK:
+            (name,) = U32.unpack_from(look, CHUNK.size)
+            (data,) = U64.unpack_from(look, CHUNK.size + 4 + name)
+            return bool(size == CHUNK.size + 12 + name + data)
+        if opcode == Opcode.MESSAGE_INDEX:
+            (data,) = U32.unpack_from(look, 2)
+            return bool(size == 6 + data)
+        if opcode == Opcode.ATTACHMENT:
+            (name,) = U32.unpack_from(look, 16)
+            (media_type,) = U32.unpack_from(look, 20 + name)
+            (data,) = U64.unpack_from(look, 24 + name + media_type)
+            return bool(size == 36 + name + media_type + data)
+        if opcode == Opcode.METADATA:
+            (name,) = U32.unpack_from(look)
+            (data,) = U32.unpack_from(look, 4 + name)
+            return bool(size == 8 + name + data)
+    except struct.error:
+        return False
+    return size == _SIZES.get(opcode, size)
+
+
+def _unpack(content: bytes) -> bytes:
+    """Return the uncompressed records of a chunk.
+
+    Raises:
+        ValueError: A size, the compression or the checksum is wrong.
+        struct.error: The chunk is too short.
+        ZstdError: The compressed data is damaged.
+    """
+    _, _, size, crc = CHUNK.unpack_from(content)
+    (name_size,) = U32.unpack_from(content, CHUNK.size)
+    at = CHUNK.size + 4 + name_size
+    compression = content[CHUNK.size + 4 : at].decode()
+    (packed_size,) = U64.unpack_from(content, at)
+    packed = memoryview(content)[at + 8 :]
+    if packed_size != len(packed):
+        raise ValueError("its sizes contradict each other")
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"{size} bytes, more than {MAX_CHUNK_BYTES}")
+    if compression == "zstd":
+        if zstandard.get_frame_parameters(packed).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise ValueError("its sizes contradict each other")
+        data = _of_thread.decompressor.decompress(packed, max_output_size=size)
+    elif not compression:
+        data = bytes(packed)
+    else:
+        raise ValueError(f"its compression {compression[:20]!r} is unknown")
+    if len(data) != size:
+        raise ValueError("its sizes contradict each other")
+    if crc and zlib.crc32(data) != crc:
+        raise ValueError("its checksum is wrong")
+    return data

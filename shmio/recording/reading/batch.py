@@ -13,8 +13,7 @@ from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
 from shmio.model.values import Provenance
-from shmio.recording.format.channels import Channel
-from shmio.recording.format.encoding import decode_frame, restore
+from shmio.recording.format.encoding import Channel, decode_frame, restore
 from shmio.segment.block import Frame
 
 HEAD: Final = np.dtype(

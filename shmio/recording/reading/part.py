@@ -1,144 +1,147 @@
-"""Read one file of a dump from any time on."""
+"""One file of a dump: its blocks, and its entries from any time on."""
 
 from __future__ import annotations
 
-import struct
-import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import groupby, islice
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, Generic, NamedTuple, TypeVar
 
+import numpy as np
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recording.format.damage import Damage, DamageLog
-from shmio.recording.format.encoding import GAP, Gap
-from shmio.recording.format.framing import FOOTER, HEAD
-from shmio.recording.format.records import Record
-from shmio.recording.reading.batch import Batch, batch, frames
-from shmio.recording.reading.reader import Message, Reader
-from shmio.recording.reading.survey import Survey, Track, read_index, survey
-from shmio.segment.block import Frame
-
-MAX_SUMMARY_BYTES: Final = 64 << 20
-"""A chunk takes about 90 bytes of the summary, so that this is enough for a week."""
-
-_CHUNK_INDEX: Final = struct.Struct("<QQQQI")  # first and last log time, start, length; bytes of the map that follows
-_PLACE: Final = struct.Struct("<HQ")  # a channel and where its message index is, or how many messages it has
-_STATISTICS: Final = struct.Struct("<QHIIIIQQI")
-
-
-def survey_by_index(reader: Reader) -> Survey | None:
-    """Survey a recording by its index; None if it has no intact and consistent index.
-
-    The result is the same as that of :func:`~shmio.recording.reading.survey.survey`.
-    """
-    try:
-        data = _summary(reader)
-        return _Work(reader).survey(data) if data else None
-    except (RecordingError, struct.error, ValueError):
-        return None
-
-
-def _summary(reader: Reader) -> bytes:
-    """Return the summary's bytes if their CRC is right, else an empty object."""
-    footer = reader.records.footer()
-    if footer is None:
-        return b""
-    content = reader.records.read(footer.at, FOOTER.size)
-    start, _, crc = FOOTER.unpack(content)
-    if not 0 < start < footer.start or not crc:
-        return b""
-    data = reader.records.read(start, footer.start - start, MAX_SUMMARY_BYTES)
-    head = reader.records.read(footer.start, footer.at - footer.start) + content[:-4]
-    return data if zlib.crc32(head, zlib.crc32(data)) == crc else b""
-
-
-class _Work:
-    def __init__(self, reader: Reader) -> None:
-        self._reader = reader
-        self._found = Survey()
-        self._first: dict[int, tuple[Record, int]] = {}
-        self._last: dict[int, tuple[Record, int]] = {}
-        """First and last chunk with messages of a channel, and places of their message indexes."""
-        self._counts: dict[int, int] = {}
-        self._chunk_count = -1
-
-    def survey(self, data: bytes) -> Survey:
-        for opcode, content in _records(data):
-            if opcode == Opcode.CHUNK_INDEX:
-                self._chunk(content)
-            elif opcode == Opcode.STATISTICS:
-                self._chunk_count = _STATISTICS.unpack_from(content)[5]
-                self._counts = dict(_places(content, _STATISTICS.size))
-            elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
-                record = self._reader.records.record(struct.unpack_from("<Q", content)[0])
-                if record is None:
-                    raise ValueError
-                self._reader.note(record)
-        if self._chunk_count != len(self._found.chunks) or self._counts.keys() != self._first.keys():
-            raise ValueError
-        for number, (chunk, index) in self._first.items():
-            self._track(number, chunk, index)
-        self._reader.require_ours()
-        self._reader.complete = self._reader.records.closed = True
-        return self._found
-
-    def _chunk(self, content: memoryview) -> None:
-        first_ns, last_ns, start, length, _ = _CHUNK_INDEX.unpack_from(content)
-        if length < HEAD.size or start + length > self._reader.records.size:
-            raise ValueError
-        chunk = Record(Opcode.CHUNK, start + HEAD.size, length - HEAD.size)
-        places = list(_places(content, _CHUNK_INDEX.size))
-        for number, index in places:
-            self._first.setdefault(number, (chunk, index))
-            self._last[number] = chunk, index
-        self._found.chunks.add(chunk, first_ns, last_ns, [number for number, _ in places])
-
-    def _track(self, number: int, chunk: Record, index: int) -> None:
-        """Note the messages of a channel; RecordingError or ValueError if the index is wrong."""
-        reader = self._reader
-        channel = reader.channel(number)
-        last_chunk, last_index = self._last[number]
-        records = reader.records.record(index), reader.records.record(last_index)
-        first, last = (read_index(reader, record) if record else None for record in records)
-        if channel is None or first is None or last is None or (first.channel, last.channel) != (number, number):
-            raise ValueError
-        count = self._counts[number]
-        self._found.tracks[number] = Track(channel, count, first.first_ns, last.last_ns, chunk, last_chunk)
-        if channel.encoding == GAP:
-            self._gaps(number)
-
-    def _gaps(self, number: int) -> None:
-        for chunk, _, _ in self._found.chunks.between(0, (1 << 64) - 1, [number]):
-            for channel, _, data in self._reader.raw(chunk):
-                if channel.number == number and isinstance(item := self._reader.decode(channel, data), Gap):
-                    self._found.add_gap(item)
-
-
-def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
-    view, at = memoryview(data), 0
-    while at < len(data):
-        opcode, size = HEAD.unpack_from(data, at)
-        at += HEAD.size
-        if size > len(data) - at:
-            raise ValueError
-        yield opcode, view[at : at + size]
-        at += size
-
-
-def _places(content: memoryview, at: int) -> Iterator[tuple[int, int]]:
-    """Yield the items of a map of channels to numbers; its length is before ``at``."""
-    (size,) = struct.unpack_from("<I", content, at - 4)
-    if size > len(content) - at or size % _PLACE.size:
-        raise ValueError
-    yield from _PLACE.iter_unpack(content[at : at + size])
-
+from shmio.layout.glob import named
+from shmio.layout.model import Layout, Register
+from shmio.layout.topic import Topic, find, parse_topic
+from shmio.layout.values.codec import Value, codec
+from shmio.recording.format.encoding import EVENT, FRAME, Gap, encode_frame
+from shmio.recording.format.records import Damage, DamageLog, Record
+from shmio.recording.reading.batch import HEAD, Batch, batch, frames
+from shmio.recording.reading.reader import Item, Message, Reader
+from shmio.recording.reading.survey import Track, survey, survey_by_index
+from shmio.segment import Frame
 
 MAX_NS: Final = (1 << 63) - 1
+BATCH_FRAMES: Final = 256
 
 Damaged = Callable[[Path, Damage], object]
 T = TypeVar("T")
+ItemT_co = TypeVar("ItemT_co", bound=Item, covariant=True)
+
+
+@dataclass(slots=True, eq=False)
+class DumpBlock:
+    """A source with one layout. A reload that changes the layout starts another block.
+
+    ``section`` is unique among the blocks of a run, also across files. ``layout_hash`` is a SHA-256 in hex.
+    """
+
+    source: str
+    section: int
+    layout: Layout
+    layout_hash: str
+    period_ns: int
+    stale_ns: int
+    of: str = ""
+    """Hash of the whole layout, if only some of its registers were recorded."""
+    frames: int = 0
+    """Number of recorded frames; those in two files count twice."""
+    events: int = 0
+    after: dict[str, int] = field(default_factory=dict)
+    """Numbers before the first recorded frame and event, by ``frames`` and ``events``."""
+    begin_ns: int = 0
+    end_ns: int = 0
+    """Log times of the first and last frame or event."""
+    first_ns: int = 0
+    last_ns: int = 0
+    """Log times of the first and last frame."""
+
+    def add(self, kind: str, track: Track) -> None:
+        """Add the frames or events of a file."""
+        if kind == FRAME:
+            self.frames += track.count
+            self.first_ns = min(self.first_ns or track.first_ns, track.first_ns)
+            self.last_ns = max(self.last_ns, track.last_ns)
+        else:
+            self.events += track.count
+        self.begin_ns = min(self.begin_ns or track.first_ns, track.first_ns)
+        self.end_ns = max(self.end_ns, track.last_ns)
+
+    def register(self, path: str) -> Register:
+        """Return a register or array element, by its path with or without the source; PathError."""
+        return find(self.layout, parse_topic(path, (self.source,), self.source).path)
+
+    def named(self, topic: Topic) -> list[Register]:
+        """Return the registers that a topic of any form names; PathError."""
+        return named(self.layout, topic)
+
+    def value(self, frame: Frame, path: str) -> Value:
+        """Return the value that consumers saw of a register in a frame of this block; PathError."""
+        return codec(self.register(path), self.layout.byte_order).decode(frame.image)
+
+
+@dataclass(slots=True)
+class Contents:
+    """Channels of one file, by number."""
+
+    blocks: dict[int, DumpBlock] = field(default_factory=dict)
+    """Of frames and events."""
+    kinds: dict[int, str] = field(default_factory=dict)
+    instance: set[int] = field(default_factory=set)
+    """What is of no single block: gaps, steps."""
+    numbered: dict[tuple[str, int], DumpBlock] = field(default_factory=dict)
+    """Blocks by source and their number in this file."""
+    number: dict[DumpBlock, int] = field(default_factory=dict)
+
+    def frames(self, source: str) -> list[int]:
+        """Channels with frames of a source, in the order in which the blocks began."""
+        return [number for number, kind in self.kinds.items() if kind == FRAME and self.blocks[number].source == source]
+
+    def events(self, sources: Collection[str]) -> list[int]:
+        """Channels with events of these sources."""
+        return [
+            number for number, kind in self.kinds.items() if kind == EVENT and self.blocks[number].source in sources
+        ]
+
+
+def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Contents:
+    """Return the contents of a file, and add its new blocks to ``blocks``.
+
+    A block with a damaged layout is left out and listed in the survey's damage.
+    """
+    found = Contents()
+    for channel in sorted(part.reader.channels.values(), key=lambda channel: (channel.block, channel.number)):
+        if channel.encoding not in (FRAME, EVENT):
+            if channel.encoding:
+                found.instance.add(channel.number)
+            continue
+        key = channel.source, channel.section, channel.layout
+        if key not in blocks:
+            try:
+                layout = part.reader.layout(channel)
+            except RecordingError as error:
+                if str(error) not in part.found.damage:
+                    part.found.damage.append(str(error))
+                continue
+            blocks[key] = DumpBlock(
+                channel.source,
+                channel.section,
+                layout,
+                channel.layout,
+                channel.period_ns,
+                channel.stale_ns,
+                channel.of,
+            )
+        block = blocks[key]
+        block.after.setdefault("frames" if channel.encoding == FRAME else "events", channel.after)
+        if track := part.found.tracks.get(channel.number):
+            block.add(channel.encoding, track)
+        found.blocks[channel.number] = found.numbered[channel.source, channel.block] = block
+        found.kinds[channel.number] = channel.encoding
+        found.number[block] = channel.block
+    return found
 
 
 class Part:
@@ -244,3 +247,44 @@ class Part:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class Entry(NamedTuple, Generic[ItemT_co]):
+    """A recorded item with its log time (UTC); ``block`` is None for items of the whole instance."""
+
+    time_ns: int
+    block: DumpBlock | None
+    item: ItemT_co
+
+
+def messages_of(
+    part: Part, within: Contents, channels: Collection[int], from_ns: int, to_ns: int
+) -> Iterator[tuple[Contents, Entry[Item]]]:
+    """Yield the messages of a file's channels in a range of log times, with the file's contents."""
+    for channel, log_ns, item in part.messages(channels, from_ns, to_ns):
+        block = (
+            within.numbered.get((item.source, item.block))
+            if isinstance(item, Gap)
+            else within.blocks.get(channel.number)
+        )
+        yield within, Entry(log_ns, block, item)
+
+
+def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[DumpBlock, Batch]]:
+    """Yield frames as arrays in batches; ``raw`` for the source's images, not the consumers'."""
+    for block, of_block in groupby(frames, key=lambda entry: entry.block):
+        while block is not None and (some := list(islice(of_block, BATCH_FRAMES))):
+            items = [entry.item for entry in some]
+            data = b"".join(encode_frame(f)[: HEAD.itemsize] + (f.raw if raw else f.image) for f in items)
+            records = np.frombuffer(data, np.uint8).reshape(len(items), HEAD.itemsize + block.layout.size)
+            times = np.array([entry.time_ns for entry in some], np.int64)
+            yield block, Batch(times, records, [frame.reason for frame in items])
+
+
+def latest_of(part: Part, within: Contents, source: str, time_ns: int) -> Entry[Frame] | None:
+    """Return the last frame of a source in a file at or before a time."""
+    for messages in part.messages_before(within.frames(source), time_ns):
+        for message in reversed(messages):
+            if isinstance(message.item, Frame):
+                return Entry(message.log_ns, within.blocks[message.channel.number], message.item)
+    return None

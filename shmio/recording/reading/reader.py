@@ -16,18 +16,19 @@ from mcap.records import Header, Metadata
 from shmio.errors import LayoutError, RecordingError
 from shmio.layout.document import load_layout
 from shmio.layout.model import Layout
-from shmio.recording.format.channels import MAX_CHANNEL_BYTES, MAX_CHANNELS, Channel, describe
-from shmio.recording.format.damage import Damage, DamageLog
 from shmio.recording.format.encoding import (
     ABOUT,
     EVENT,
     FRAME,
     GAP,
+    MAX_CHANNEL_BYTES,
+    MAX_CHANNELS,
     PLACES,
     PROCESS,
     PROFILE,
     STEP,
     BlockPosition,
+    Channel,
     Gap,
     ProcessChange,
     StepMark,
@@ -37,9 +38,20 @@ from shmio.recording.format.encoding import (
     decode_position,
     decode_process,
     decode_step,
+    describe,
     restore,
 )
-from shmio.recording.format.records import BROKEN, LOOK_BYTES, MAGIC, ONLY_BEGUN, Record, Records, stream
+from shmio.recording.format.records import (
+    BROKEN,
+    LOOK_BYTES,
+    MAGIC,
+    ONLY_BEGUN,
+    Damage,
+    DamageLog,
+    Record,
+    Records,
+    stream,
+)
 from shmio.segment import Event, Frame
 
 MAX_LAYOUT_BYTES: Final = 64 << 20

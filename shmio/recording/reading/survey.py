@@ -1,8 +1,9 @@
-"""Survey a recording without reading all of it: chunks are skipped if their indexes suffice."""
+"""Survey a recording without reading all of it: by the index of a closed file, or by the indexes of its chunks."""
 
 from __future__ import annotations
 
 import struct
+import zlib
 from array import array
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
@@ -14,15 +15,26 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recording.format.channels import Channel
-from shmio.recording.format.encoding import GAP, Gap
-from shmio.recording.format.framing import INDEX, U64
-from shmio.recording.format.records import BROKEN, MAX_RECORD_BYTES, Record
+from shmio.recording.format.encoding import GAP, Channel, Gap
+from shmio.recording.format.records import BROKEN, FOOTER, HEAD, INDEX, MAX_RECORD_BYTES, U64, Record
 from shmio.recording.reading.reader import Reader
 
 MAX_CHUNKS: Final = 1 << 22
 MAX_SETS: Final = 1 << 16
 """Limit on different sets of channels in the chunks."""
+MAX_GAPS: Final = 1000
+"""Limit on gaps that are listed; all are counted."""
+MAX_DAMAGE: Final = 20
+"""Limit on damaged places that are listed."""
+MAX_BLOCKS: Final = 10_000
+MAX_SUMMARY_BYTES: Final = 64 << 20
+"""A chunk takes about 90 bytes of the summary, so that this is enough for a week."""
+
+_MAX_U64: Final = (1 << 64) - 1
+_ENTRY: Final = struct.Struct("<QQ")  # log time, offset
+_CHUNK_INDEX: Final = struct.Struct("<QQQQI")  # first and last log time, start, length; bytes of the map that follows
+_PLACE: Final = struct.Struct("<HQ")  # a channel and where its message index is, or how many messages it has
+_STATISTICS: Final = struct.Struct("<QHIIIIQQI")
 
 _Times = npt.NDArray[np.uint64]
 
@@ -107,18 +119,6 @@ class Chunks:
         first_ns: npt.NDArray[Any] = np.array(self._first_ns, np.uint64)
         last_ns: npt.NDArray[Any] = np.array(self._last_ns, np.uint64)
         return np.maximum.accumulate(last_ns), np.minimum.accumulate(first_ns[::-1])[::-1]
-
-
-_MAX_U64: Final = (1 << 64) - 1
-
-
-MAX_GAPS: Final = 1000
-"""Limit on gaps that are listed; all are counted."""
-MAX_DAMAGE: Final = 20
-"""Limit on damaged places that are listed."""
-MAX_BLOCKS: Final = 10_000
-
-_ENTRY: Final = struct.Struct("<QQ")  # log time, offset
 
 
 class Count(NamedTuple):
@@ -300,3 +300,110 @@ def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
     except RecordingError as error:
         _damaged(found, str(error))
     return list(counts.values())
+
+
+def survey_by_index(reader: Reader) -> Survey | None:
+    """Survey a recording by its index; None if it has no intact and consistent index.
+
+    The result is the same as that of :func:`survey`.
+    """
+    try:
+        data = _summary(reader)
+        return _IndexSurvey(reader).survey(data) if data else None
+    except (RecordingError, struct.error, ValueError):
+        return None
+
+
+def _summary(reader: Reader) -> bytes:
+    """Return the summary's bytes if their CRC is right, else an empty object."""
+    footer = reader.records.footer()
+    if footer is None:
+        return b""
+    content = reader.records.read(footer.at, FOOTER.size)
+    start, _, crc = FOOTER.unpack(content)
+    if not 0 < start < footer.start or not crc:
+        return b""
+    data = reader.records.read(start, footer.start - start, MAX_SUMMARY_BYTES)
+    head = reader.records.read(footer.start, footer.at - footer.start) + content[:-4]
+    return data if zlib.crc32(head, zlib.crc32(data)) == crc else b""
+
+
+class _IndexSurvey:
+    def __init__(self, reader: Reader) -> None:
+        self._reader = reader
+        self._found = Survey()
+        self._first: dict[int, tuple[Record, int]] = {}
+        self._last: dict[int, tuple[Record, int]] = {}
+        """First and last chunk with messages of a channel, and places of their message indexes."""
+        self._counts: dict[int, int] = {}
+        self._chunk_count = -1
+
+    def survey(self, data: bytes) -> Survey:
+        for opcode, content in _records(data):
+            if opcode == Opcode.CHUNK_INDEX:
+                self._chunk(content)
+            elif opcode == Opcode.STATISTICS:
+                self._chunk_count = _STATISTICS.unpack_from(content)[5]
+                self._counts = dict(_places(content, _STATISTICS.size))
+            elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+                record = self._reader.records.record(struct.unpack_from("<Q", content)[0])
+                if record is None:
+                    raise ValueError
+                self._reader.note(record)
+        if self._chunk_count != len(self._found.chunks) or self._counts.keys() != self._first.keys():
+            raise ValueError
+        for number, (chunk, index) in self._first.items():
+            self._track(number, chunk, index)
+        self._reader.require_ours()
+        self._reader.complete = self._reader.records.closed = True
+        return self._found
+
+    def _chunk(self, content: memoryview) -> None:
+        first_ns, last_ns, start, length, _ = _CHUNK_INDEX.unpack_from(content)
+        if length < HEAD.size or start + length > self._reader.records.size:
+            raise ValueError
+        chunk = Record(Opcode.CHUNK, start + HEAD.size, length - HEAD.size)
+        places = list(_places(content, _CHUNK_INDEX.size))
+        for number, index in places:
+            self._first.setdefault(number, (chunk, index))
+            self._last[number] = chunk, index
+        self._found.chunks.add(chunk, first_ns, last_ns, [number for number, _ in places])
+
+    def _track(self, number: int, chunk: Record, index: int) -> None:
+        """Note the messages of a channel; RecordingError or ValueError if the index is wrong."""
+        reader = self._reader
+        channel = reader.channel(number)
+        last_chunk, last_index = self._last[number]
+        records = reader.records.record(index), reader.records.record(last_index)
+        first, last = (read_index(reader, record) if record else None for record in records)
+        if channel is None or first is None or last is None or (first.channel, last.channel) != (number, number):
+            raise ValueError
+        count = self._counts[number]
+        self._found.tracks[number] = Track(channel, count, first.first_ns, last.last_ns, chunk, last_chunk)
+        if channel.encoding == GAP:
+            self._gaps(number)
+
+    def _gaps(self, number: int) -> None:
+        for chunk, _, _ in self._found.chunks.between(0, _MAX_U64, [number]):
+            for channel, _, data in self._reader.raw(chunk):
+                if channel.number == number and isinstance(item := self._reader.decode(channel, data), Gap):
+                    self._found.add_gap(item)
+
+
+def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
+    view, at = memoryview(data), 0
+    while at < len(data):
+        opcode, size = HEAD.unpack_from(data, at)
+        at += HEAD.size
+        if size > len(data) - at:
+            raise ValueError
+        yield opcode, view[at : at + size]
+        at += size
+
+
+def _places(content: memoryview, at: int) -> Iterator[tuple[int, int]]:
+    """Yield the items of a map of channels to numbers; its length is before ``at``."""
+    (size,) = struct.unpack_from("<I", content, at - 4)
+    if size > len(content) - at or size % _PLACE.size:
+        raise ValueError
+    yield from _PLACE.iter_unpack(content[at : at + size])

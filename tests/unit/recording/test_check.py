@@ -13,8 +13,7 @@ from mcap.opcode import Opcode
 from shmio.errors import RecordingError
 from shmio.recorder import instance_follower
 from shmio.recording.check import Findings, check
-from shmio.recording.format.damage import Damage
-from shmio.recording.format.records import MAGIC, Record
+from shmio.recording.format.records import MAGIC, Damage, Record
 from shmio.recording.reading.reader import Message, Reader
 from shmio.segment import Frame, Segment
 from tests.unit.recorder.harness import publish, recorder

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import shmio
 from shmio.errors import MissingLibraryError, PathError, RecordingError
 from shmio.layout.model import Layout, Register
-from shmio.recording.format.damage import Damage
 from shmio.recording.format.encoding import Gap, Reason, StepMark
+from shmio.recording.format.records import Damage
 from shmio.recording.reading.part import Part
 from shmio.segment import Event, Frame, Quality
 from tests.unit.recording.build import PERIOD_NS, START_NS, build, image, plain, varied

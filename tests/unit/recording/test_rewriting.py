@@ -10,7 +10,7 @@ import pytest
 import shmio
 from shmio.errors import PathError, RecordingError
 from shmio.recording.check import check
-from shmio.recording.reading.entries import Entry
+from shmio.recording.reading.part import Entry
 from shmio.recording.reading.reader import Item, Reader
 from shmio.recording.rewriting import part, rewrite
 from tests.unit.recording.build import PERIOD_NS, START_NS, varied

@@ -18,8 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from shmio.errors import RecordingError
 from shmio.recording.format.encoding import EVENT, FRAME, FRAME_V2
-from shmio.recording.format.framing import MAX_CHUNK_BYTES
-from shmio.recording.format.records import MAGIC
+from shmio.recording.format.records import MAGIC, MAX_CHUNK_BYTES
 from shmio.recording.reading.reader import Message, Reader
 from shmio.recording.reading.survey import survey
 

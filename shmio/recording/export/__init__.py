@@ -1,1 +1,0 @@
-"""Export recordings for other programs: tables, and MCAP with JSON for viewers."""
