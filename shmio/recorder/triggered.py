@@ -166,7 +166,7 @@ class TriggeredRecorder:
         self._until_ns = 0
         self._came_s = time.monotonic()
         self._problem = ""
-        self._held = False  # whether no file could be begun for what of others waits
+        self._held = False  # whether no file was started because too much of earlier files waits for the disk
         if going:
             self._begin(tap.now())
 
@@ -203,7 +203,7 @@ class TriggeredRecorder:
             return
         if sum(series.waiting for series in self._ending) > self._settings.buffer_bytes:
             if not self._held:
-                log.error("%s: no new file is begun while earlier ones wait for the disk", self._trigger.when)
+                log.error("%s: no new file is started while earlier ones wait for the disk", self._trigger.when)
             self._held = True
             return
         self._held = False

@@ -24,7 +24,9 @@ from shmio.recording.reading.survey import Track, survey, survey_by_index
 from shmio.segment import Frame
 
 MAX_NS: Final = (1 << 63) - 1
+"""The end of time, for ranges without an end."""
 BATCH_FRAMES: Final = 256
+"""Frames of a batch that is made from single frames."""
 
 Damaged = Callable[[Path, Damage], object]
 T = TypeVar("T")
@@ -87,10 +89,10 @@ class Contents:
     """Channels of one file, by number."""
 
     blocks: dict[int, DumpBlock] = field(default_factory=dict)
-    """Of frames and events."""
+    """Blocks of the channels with frames and events."""
     kinds: dict[int, str] = field(default_factory=dict)
     instance: set[int] = field(default_factory=set)
-    """What is of no single block: gaps, steps."""
+    """Channels that belong to no single block: gaps, steps, processes."""
     numbered: dict[tuple[str, int], DumpBlock] = field(default_factory=dict)
     """Blocks by source and their number in this file."""
     number: dict[DumpBlock, int] = field(default_factory=dict)
@@ -125,15 +127,7 @@ def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Conte
                 if str(error) not in part.found.damage:
                     part.found.damage.append(str(error))
                 continue
-            blocks[key] = DumpBlock(
-                channel.source,
-                channel.section,
-                layout,
-                channel.layout,
-                channel.period_ns,
-                channel.stale_ns,
-                channel.of,
-            )
+            blocks[key] = DumpBlock(*key[:2], layout, channel.layout, channel.period_ns, channel.stale_ns, channel.of)
         block = blocks[key]
         block.after.setdefault("frames" if channel.encoding == FRAME else "events", channel.after)
         if track := part.found.tracks.get(channel.number):
@@ -188,7 +182,7 @@ class Part:
         """Yield the frames of a channel as arrays, chunk by chunk; ``size`` is that of an image."""
         channel = self.reader.channels[number]
         for found in self._each(
-            channel.number, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)
+            number, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)
         ):
             if found is not None:
                 yield found

@@ -221,7 +221,7 @@ def test_while_the_disk_takes_nothing_no_more_waits_than_may(
         bench.publish(10)
     assert 1 < len(list(tmp_path.iterdir())) < 10
     assert "No space left on device" in bench.work.problem
-    assert caplog.text.count("no new file is begun while") == 1
+    assert caplog.text.count("no new file is started while") == 1
     full = False
     until(lambda: all(series.ended for series in bench.work._ending), "what waits is written")
     bench.publish(10)
