@@ -173,7 +173,7 @@ class Housekeeper:
 
 
 def _is_held(path: Path) -> bool:
-    """Whether a replay uses the file; a restarted replay would need it again."""
+    """Return whether a replay uses the file; a restarted replay would need it again."""
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

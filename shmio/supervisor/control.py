@@ -84,10 +84,7 @@ def socket_path(instance: str) -> str:
 
 
 def _prepare(folder: Path, uid: int) -> str | None:
-    """Create a folder for this user alone; return why not, or None.
-
-    Symbolic links are not followed.
-    """
+    """Create a folder for this user alone, without following links; return why not, or None."""
     try:
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
@@ -136,10 +133,7 @@ Request = Stop | Restart | Reload | Where
 
 
 class Answer:
-    """The way to answer the client of one request.
-
-    If the client is gone, answering has no effect.
-    """
+    """Answers the client of one request. Without effect if the client is gone."""
 
     def __init__(self, server: ControlServer, client: socket.socket) -> None:
         self._server = server
@@ -157,8 +151,7 @@ class Answer:
 class ControlServer:
     """The supervisor's end of the control socket. No call waits for a client.
 
-    The supervisor's selector drives it. The data of its selector keys are functions without
-    arguments.
+    The supervisor's selector drives it. The data of its selector keys are functions without arguments.
     """
 
     def __init__(self, path: str, selector: selectors.BaseSelector, handle: Callable[[Request, Answer], None]) -> None:
@@ -199,17 +192,14 @@ class ControlServer:
             self._selector.register(client, selectors.EVENT_READ, lambda: self._receive(client))
 
     def _has_room(self) -> bool:
-        """Return whether one more client can be served.
-
-        If necessary drop the longest silent one.
-        """
+        """Return whether one more client can be served; if necessary, drop the one that has been silent longest."""
         silent = (client for client, (_, deadline) in self._clients.items() if deadline is not None)
         if len(self._clients) >= MAX_CLIENTS and (longest := next(silent, None)):
             self.answer(longest, {"error": _TOO_MANY})
         return len(self._clients) < MAX_CLIENTS
 
     def _receive(self, client: socket.socket) -> None:
-        if client not in self._clients:  # answered by what came before it in the same round
+        if client not in self._clients:  # dropped in the same round of the selector
             return
         data, deadline = self._clients[client]
         try:
@@ -235,13 +225,13 @@ class ControlServer:
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self.answer(client, {"error": f"not a request: {error}"})
         else:
-            if _hung_up(client):  # it gave up while the supervisor was held up, and said so to its user
+            if _hung_up(client):  # it gave up while the supervisor was delayed, and told its user so
                 self._drop(client)
                 return
             self._handle(request, Answer(self, client))
 
     def answer(self, client: socket.socket, message: dict[str, object]) -> None:
-        """Send the answer and close. What the socket's buffer cannot take is lost."""
+        """Send the answer and close. Bytes that do not fit into the socket's buffer are lost."""
         if client in self._clients:
             _send(client, message)
             self._drop(client)
@@ -259,10 +249,7 @@ class ControlServer:
         client.close()
 
     def retire(self) -> None:
-        """Remove the socket, so that a successor can create it.
-
-        Waiting clients can still be answered.
-        """
+        """Remove the socket, so that a successor can create it. Waiting clients can still be answered."""
         if self._listener.fileno() < 0:
             return
         self._selector.unregister(self._listener)
@@ -340,7 +327,7 @@ def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[
 
 
 def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]) -> bytes:
-    """Some more of the answer; TimeoutError, ControlError."""
+    """Return the next bytes of the answer; TimeoutError, ControlError."""
     while True:
         client.settimeout(max(0.001, min(TURN_S, deadline - time.monotonic())))
         try:

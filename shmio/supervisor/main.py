@@ -28,45 +28,10 @@ from shmio.supervisor.policy import Event, Limits, State
 from shmio.supervisor.reload import Reloader
 from shmio.supervisor.takeover import take_over
 
-
-@contextmanager
-def wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int], None]) -> Iterator[None]:
-    """Call ``on_signal`` from the selector's loop for SIGINT, SIGTERM and SIGHUP.
-
-    SIGHUP counts unless it is ignored, as by nohup.
-    """
-    receiver, sender = socket.socketpair()
-    with receiver, sender:
-        receiver.setblocking(False)
-        sender.setblocking(False)
-
-        def receive() -> None:
-            for number in receiver.recv(64):
-                on_signal(number)
-
-        selector.register(receiver, selectors.EVENT_READ, receive)
-        old_fd = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-        handled = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-        if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-            handled.remove(signal.SIGHUP)
-        old = {sign: signal.signal(sign, _wake) for sign in handled}
-        try:
-            yield
-        finally:
-            for sign, handler in old.items():
-                signal.signal(sign, handler)
-            signal.set_wakeup_fd(old_fd)
-            selector.unregister(receiver)
-
-
-def _wake(_number: int, _frame: FrameType | None) -> None:
-    """A handler must exist for the wake-up descriptor to be written."""
-
-
 START_TICK_S: Final = 0.01
-"""How often it is looked while a process starts: its report has no bell to ring."""
+"""How often processes are checked while one starts: its report cannot wake the supervisor."""
 MAX_ADDRESSES: Final = 16
-"""Most listening addresses of a process in an answer."""
+"""Limit on the listening addresses of a process in an answer."""
 NAME_S: Final = 1.0
 """How often to check that the segment can still be found."""
 
@@ -89,7 +54,7 @@ class Supervisor:
             plan: The instance to run. The folder of the log files must exist.
             replan: Makes a new plan from the present configuration for a reload; it raises
                 ShmioError.
-            limits: The times by which processes are judged.
+            limits: Times and counts by which processes are judged.
             modules: The Python module of each kind of process.
             on_state: Called with each new state of the instance.
 
@@ -108,7 +73,7 @@ class Supervisor:
         self._found_ns = 0
         self._adopted: dict[str, int] = {}
         self.history: list[str] = []
-        """What was found of an earlier supervisor and done about it, one line each."""
+        """What an earlier supervisor left and what was done about it, one line each."""
 
     def run(self) -> None:
         """Start everything, or take over what a dead supervisor left; return after a stop.
@@ -124,7 +89,7 @@ class Supervisor:
         """
         with ExitStack() as stack:
             stack.callback(self._selector.close)
-            stack.enter_context(wake_on_signals(self._selector, self._on_signal))
+            stack.enter_context(_wake_on_signals(self._selector, self._on_signal))
             path = socket_path(self._plan.instance)
             found, self.history = take_over(self._plan, path, self._limits)
             for line in self.history:
@@ -306,3 +271,37 @@ class Supervisor:
         self._fleet.start_due()
         since_ns = max((m.life.ready_ns or 0 for m in self._fleet), default=0)
         self._started = policy.start_over(self._fleet.ranked, self._health.look(), since_ns, now_ns, self._limits)
+
+
+@contextmanager
+def _wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int], None]) -> Iterator[None]:
+    """Call ``on_signal`` from the selector's loop for SIGINT, SIGTERM and SIGHUP.
+
+    SIGHUP counts unless it is ignored, as by nohup.
+    """
+    receiver, sender = socket.socketpair()
+    with receiver, sender:
+        receiver.setblocking(False)
+        sender.setblocking(False)
+
+        def receive() -> None:
+            for number in receiver.recv(64):
+                on_signal(number)
+
+        selector.register(receiver, selectors.EVENT_READ, receive)
+        old_fd = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+        handled = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+        if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+            handled.remove(signal.SIGHUP)
+        old = {sign: signal.signal(sign, _wake) for sign in handled}
+        try:
+            yield
+        finally:
+            for sign, handler in old.items():
+                signal.signal(sign, handler)
+            signal.set_wakeup_fd(old_fd)
+            selector.unregister(receiver)
+
+
+def _wake(_number: int, _frame: FrameType | None) -> None:
+    """A handler must exist for the wake-up descriptor to be written."""

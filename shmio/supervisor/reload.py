@@ -314,7 +314,7 @@ class Reloader:
             if reason := _refusal(plan, self.plan):
                 raise ShmioError(f"{plan.config_file}: {reason}")
             self._change = InstanceChange(self._fleet, self._segment, plan)
-        except Exception as error:  # noqa: BLE001 - whatever a connector's own check raises, what runs goes on
+        except Exception as error:  # noqa: BLE001 - a connector's own check may raise anything; the instance goes on
             expected = isinstance(error, ShmioError)
             reason = str(error) if expected else f"the reload failed: {brief(error)}"
             log.error("nothing is changed: %s", reason, exc_info=None if expected else error)

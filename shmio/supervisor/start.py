@@ -1,4 +1,4 @@
-"""What must hold before an instance starts: it is not running, and its ports and log folder are free."""
+"""Checks before an instance starts: it is not running, and its ports and its folder for log files are free."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ LOCK_NAME: Final = ".instance"
 
 
 def check_startable(plan: Plan) -> None:
-    """Check that nothing is in the way of an instance.
-
-    After a supervisor that died, its processes may still have the ports; they are taken over.
+    """Check that an instance can start. Ports that processes of a dead supervisor hold count as free.
 
     Raises:
         AlreadyRunningError: The instance is running; the message says how to stop it.
@@ -33,7 +31,7 @@ def check_startable(plan: Plan) -> None:
         try:
             check_ports(plan)
         except EndpointError:
-            _refuse_second(plan)  # one that began meanwhile may have them
+            _refuse_second(plan)  # an instance that started in between may hold them
             raise
 
 
@@ -66,7 +64,7 @@ def hold_log_folder(folder: Path, instance: str) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # It is truncated: not what a link put there by somebody leads to.
+        # No link is followed, because the file is truncated below.
         fd = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
     except OSError as error:
         raise ConfigError(f"instance.log_dir: cannot write {folder / LOCK_NAME}: {error.strerror}") from None
@@ -81,6 +79,6 @@ def hold_log_folder(folder: Path, instance: str) -> Iterator[None]:
                 "its own"
             ) from None
         line = f"{instance}\n".encode()
-        os.pwrite(fd, line, 0)  # before what was there is cut off: who looks meanwhile sees a name
+        os.pwrite(fd, line, 0)  # before truncating, so that a reader always finds a name
         os.ftruncate(fd, len(line))
         yield
