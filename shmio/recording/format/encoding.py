@@ -326,7 +326,7 @@ class Channel:
     """Whether frames are encoded as FRAME_V2."""
 
 
-def describe(content: memoryview) -> Channel:
+def decode_channel(content: memoryview) -> Channel:
     """Decode a channel's record. ValueError, KeyError, struct.error, McapError: it is malformed."""
     found = ChannelRecord.read(stream(content))
     about = found.metadata

@@ -32,13 +32,13 @@ from shmio.recording.format.encoding import (
     Gap,
     ProcessChange,
     StepMark,
+    decode_channel,
     decode_event,
     decode_frame,
     decode_gap,
     decode_position,
     decode_process,
     decode_step,
-    describe,
     restore,
 )
 from shmio.recording.format.records import (
@@ -305,7 +305,7 @@ class Reader:
                 f"{self.file}: it has more, or longer, descriptions of channels than a recorder writes"
             )
         try:
-            channel = describe(content)
+            channel = decode_channel(content)
         except (ValueError, KeyError, struct.error, McapError):
             raise RecordingError(f"{self.file}: the description of a channel is damaged") from None
         if self.channels.setdefault(channel.number, channel) != channel:  # messages would be ambiguous
