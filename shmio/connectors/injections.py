@@ -253,7 +253,7 @@ class DeclaredInjections:
         periods_ns = {source: block.period_ns for source, block in self._blocks.items()}
         program = compile_program(declaration, layouts, periods_ns)
         if program.source != self._own.source:
-            raise ConfigError(f"target: it is of source {program.source}, this is {self._own.source}")
+            raise ConfigError(f"target: it names source {program.source}, but this is source {self._own.source}")
         return program
 
     def rebind(self) -> None:

@@ -520,7 +520,7 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     ("wrong", "reason"),
     [
         (declaration("x", "cell/speeds", "freeze"), "target: cell/speeds: no such register"),
-        (declaration("x", "other/speed", "freeze"), "target: it is of source other, this is cell"),
+        (declaration("x", "other/speed", "freeze"), "target: it names source other, but this is source cell"),
         (declaration("x", "cell/speed", "set"), "value: this key is needed for operation 'set'"),
         (declaration("x", "cell/speed", "set", value="hot"), "value: speed: INT: expected"),
         (declaration("x", "cell/speed", "freeze", when="cell/speed >"), "when: at character 13: expected a register"),
