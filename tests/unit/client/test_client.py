@@ -230,17 +230,17 @@ def test_what_is_wrong_with_tls(tmp_path: Path, serves: str, ca: str | None, tol
     authority = trustme.CA()
     authority.cert_pem.write_to_path(tmp_path / "ca.pem")
     trustme.CA().cert_pem.write_to_path(tmp_path / "other.pem")
-    own = authority.issue_cert("elsewhere.example" if serves == "of another" else "localhost")
+    own = authority.issue_cert("elsewhere.example" if serves == "of another" else "127.0.0.1")
     known = [(own.private_key_pem.bytes(), own.cert_chain_pems[0].bytes())]
     mutual = serves == "mutual"
     server = grpc.server(ThreadPoolExecutor(1))
     if serves == "plain":
-        port = server.add_insecure_port("localhost:0")
+        port = server.add_insecure_port("127.0.0.1:0")
     else:
         asked = authority.cert_pem.bytes() if mutual else None
-        port = server.add_secure_port("localhost:0", grpc.ssl_server_credentials(known, asked, mutual))
+        port = server.add_secure_port("127.0.0.1:0", grpc.ssl_server_credentials(known, asked, mutual))
     server.start()
-    address = f"localhost:{port}"
+    address = f"127.0.0.1:{port}"
     try:
         with (
             connect(address, ca=ca and tmp_path / ca) as cell,
