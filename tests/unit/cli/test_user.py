@@ -159,6 +159,13 @@ def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -
     assert main(["watch", "--instance", running, "cell/a"]) == 130
 
 
+def test_the_command_starts_without_heavy_imports() -> None:
+    heavy = {"numpy", "grpc", "snap7", "asyncio", "mcap"}
+    code = f"import sys, shmio.cli.user; sys.exit(','.join({heavy!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.strip() == ""
+
+
 def watching(*arguments: str) -> subprocess.Popen[str]:
     program = "import sys; from shmio.cli.user import main; sys.exit(main())"
     command = [sys.executable, "-P", "-c", program, "watch", *arguments]
