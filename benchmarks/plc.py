@@ -16,8 +16,7 @@ from collections.abc import Callable
 from common import tell, wait_for_parent
 
 from shmio.config.address import Address
-from shmio.emulators.s7 import S7Server
-from shmio.emulators.s7_jobs import MAX_PDU_SIZE, Traits
+from shmio.emulators.s7 import MAX_PDU_SIZE, S7Server, Traits
 
 NUMBER = 201
 SIZE = 2180

@@ -12,8 +12,7 @@ from snap7.server import CPUState
 
 from shmio.config.address import Address
 from shmio.emulators.programs import program
-from shmio.emulators.s7 import S7Server
-from shmio.emulators.s7_jobs import Traits
+from shmio.emulators.s7 import S7Server, Traits
 from shmio.errors import ConfigError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout

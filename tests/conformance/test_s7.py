@@ -13,7 +13,7 @@ from shmio.connectors.base import Connector
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.emulators.emulator import Emulator
 from shmio.emulators.programs import Counter, generations
-from shmio.emulators.s7_jobs import Traits
+from shmio.emulators.s7 import Traits
 from shmio.layout.model import Layout, Register
 from shmio.segment import EventKind, Quality, Write
 from shmio.testing.conformance import Run

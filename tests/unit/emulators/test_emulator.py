@@ -14,7 +14,7 @@ from shmio.config.address import Address
 from shmio.connectors.s7 import S7Client, S7Options
 from shmio.emulators.emulator import Emulator
 from shmio.emulators.programs import generations
-from shmio.emulators.s7_jobs import Traits
+from shmio.emulators.s7 import Traits
 from shmio.errors import ConfigError, EndpointError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
-from shmio.emulators.s7_jobs import Fault, Jobs, Memory, Traits
+from shmio.emulators.s7 import Fault, Jobs, Memory, Traits
 
 BIT, BYTE, CHAR, WORD, INT, DWORD, DINT, REAL = range(1, 9)
 DB = 0x84

@@ -9,8 +9,7 @@ from contextlib import ExitStack
 import pytest
 
 from shmio.config.address import Address
-from shmio.emulators.s7 import S7Server
-from shmio.emulators.s7_jobs import Traits
+from shmio.emulators.s7 import S7Server, Traits
 from shmio.testing.proxy import FaultProxy
 from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
 

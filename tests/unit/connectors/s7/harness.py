@@ -8,8 +8,7 @@ from typing import Protocol
 import pytest
 
 from shmio.connectors.s7 import S7Client, S7Options
-from shmio.emulators.s7 import S7Server
-from shmio.emulators.s7_jobs import Traits
+from shmio.emulators.s7 import S7Server, Traits
 from shmio.errors import ConnectorError
 from shmio.testing.proxy import FaultProxy
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
 from shmio.connectors.s7.blocks import SizeProbe, parse_readable
-from shmio.emulators.s7_jobs import Jobs, Memory, Traits
+from shmio.emulators.s7 import Jobs, Memory, Traits
 from shmio.errors import ConnectorError
 from tests.unit.connectors.s7 import noise as frames
 

@@ -13,7 +13,7 @@ from snap7.datatypes import S7Area
 from shmio.connectors.base import Lost
 from shmio.connectors.s7.blocks import bit_item, byte_item, ends, parse_write_answer, waves, write_request
 from shmio.connectors.s7.explain import RefusedError
-from shmio.emulators.s7_jobs import Fault, Jobs, Memory, Traits
+from shmio.emulators.s7 import Fault, Jobs, Memory, Traits
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 from tests.unit.connectors.s7 import noise as frames

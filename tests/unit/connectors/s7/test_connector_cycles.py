@@ -8,7 +8,7 @@ import time
 import pytest
 
 from shmio.connectors.s7.connector import S7Client
-from shmio.emulators.s7_jobs import Traits
+from shmio.emulators.s7 import Traits
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc, assert_recovers

@@ -10,8 +10,7 @@ import pytest
 import snap7
 
 from shmio.connectors.s7 import S7Client, mode
-from shmio.emulators.s7 import S7Server
-from shmio.emulators.s7_jobs import Fault, Traits
+from shmio.emulators.s7 import Fault, S7Server, Traits
 from shmio.errors import ConnectorError
 from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
 

@@ -11,7 +11,7 @@ import pytest
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.s7.connector import S7Client, S7Connector, S7Options
-from shmio.emulators.s7_jobs import Fault, Traits
+from shmio.emulators.s7 import Fault, Traits
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.write import Write
