@@ -207,7 +207,7 @@ def test_whatever_comes_it_answers_or_closes(plc: Plc) -> None:
         assert len(plc.honest.read()) == SIZE
 
     run()
-    assert count > 100, "it came to talk"
+    assert count > 20, "it came to talk"  # how many depends on what else Hypothesis has seen in this process
     until(lambda: plc.clients == 1, "all places are free again")
     until(lambda: plc.resources[1:] == (threads, descriptors), "threads and descriptors are given back")
     assert plc.resources[0] < peak_kib + 16 * 1024
