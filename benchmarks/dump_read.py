@@ -26,7 +26,7 @@ from common import begin, db201, interleave, report, report_spread, table
 
 import shmio
 from shmio.cli.dump import main as shmio_dump
-from shmio.recorder.output import Output
+from shmio.recorder.file_output import Output
 from shmio.recording.dump import Dump
 from shmio.recording.writer import Writer
 from shmio.segment import Block, Frame, Provenance, Quality

@@ -27,7 +27,7 @@ from common import CpuTime, begin, db201, table
 
 from shmio.emulators.programs import A50
 from shmio.layout.model import Layout
-from shmio.recorder.output import Output, create
+from shmio.recorder.file_output import Output, create
 from shmio.recorder.recorder import CHUNK_S
 from shmio.recording.format.encoding import FRAME, differ, encode_frame
 from shmio.recording.writer import Writer

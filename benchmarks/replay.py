@@ -18,8 +18,8 @@ from common import begin, db201, quantiles, table
 
 from shmio.config import Address
 from shmio.local.attach import attach
+from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower
-from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
 from shmio.segment import BlockSpec, Origin, Quality, Segment, Stamp
 from shmio.testing.cell import Cell

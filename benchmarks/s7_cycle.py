@@ -16,7 +16,7 @@ from functools import partial
 from common import Child, begin, db201, interleave, table
 
 from shmio.config.address import Address
-from shmio.connectors.loop import Schedule, SourceLoop, WallClock
+from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.segment import BlockSpec, ProcessSpec, Segment
 

@@ -86,7 +86,7 @@ SLOW = (
     "tests/unit/endpoints/grpc/test_rude.py",
     "tests/unit/layout/test_compiler.py::test_bounds_on_files",
     "tests/unit/layout/test_instances.py::test_many_",
-    "tests/unit/layout/test_structures.py::test_a_table_cannot_hide_more_registers",
+    "tests/unit/layout/test_simlog_structures.py::test_a_table_cannot_hide_more_registers",
     "tests/unit/recorder/test_housekeeping_closing.py::test_it_may_end_anywhere",
     "tests/unit/recording/reading/test_reader.py::test_changed_bytes",
     "tests/unit/recording/test_check.py::test_no_",

@@ -66,7 +66,11 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _ask(cell: Cell) -> None:
-    """Ask before the clock departs from the devices' real time; CommandError unless confirmed."""
+    """Ask the user to confirm a step that pauses the clock while devices go on in real time.
+
+    Raises:
+        CommandError: The user does not confirm.
+    """
     if cell.clock().virtual or not (real := cell.real_sources()):
         return
     who = f"{real[0]} goes" if len(real) == 1 else f"{real[0]} and {len(real) - 1} more go"

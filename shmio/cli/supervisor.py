@@ -70,7 +70,11 @@ def _parser() -> argparse.ArgumentParser:
     init.add_argument("--emulated", action="store_true", help="with an emulated PLC in place of the real one")
     init.add_argument("--block", metavar="NAME", help="only this data block (default: a source for each)")
     init.add_argument(
-        "files", metavar="FILE", nargs="*", type=Path, help="the block's sources (.db, .udt, .scl), and a plc.ini"
+        "files",
+        metavar="FILE",
+        nargs="*",
+        type=Path,
+        help="source files of data blocks (.db, .udt, .scl), optionally after a plc.ini",
     )
     return parser
 

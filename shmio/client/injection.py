@@ -124,7 +124,7 @@ class Held:
 
 
 def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outcome]:
-    """Return an outcome for each value, and with ``more`` one for all arrays and raw bytes."""
+    """Apply one outcome to every value; ``more`` adds one entry, with path "", for all arrays and raw bytes."""
     paths = [*values, *([""] if more else [])]
     return calls.outcomes(paths, [outcome])
 

@@ -120,7 +120,7 @@ def _check_external(mqtt: Mqtt) -> None:
         if not (address.loopback or mqtt.tls or mqtt.insecure):
             _refuse_plain_text("mqtt.host", f"{address} would get plain text over the network")
     if mqtt.password_file is not None and mqtt.username is None:
-        raise ConfigError("mqtt.username: a password_file needs it: the password is this user's")
+        raise ConfigError("mqtt.username: set it, because mqtt.password_file holds the password of this user")
     if mqtt.tls and (mqtt.tls.certificate is None) != (mqtt.tls.key is None):
         raise ConfigError("mqtt.tls: certificate and key go together")
 

@@ -14,8 +14,8 @@ from shmio import worker
 from shmio.connectors import registry
 from shmio.connectors.base import Computed, Connector, Replayed
 from shmio.connectors.injection_layers import Owner
-from shmio.connectors.loop import Schedule, SourceLoop, WallClock
 from shmio.connectors.models.stepped import Inputs, PageClock, SteppedLoop
+from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.topic import parse_topic
 from shmio.segment import Block, BlockWriter, Segment

@@ -434,7 +434,7 @@ class CommandProcessor:
             self._writer.block.commands.wake()
 
     def _take_one(self, writer: int) -> bool:
-        """Judge the oldest command of a writer; return whether there was one and room for it."""
+        """Judge the held command, or else the writer's oldest one; return False if there is none, or it must wait."""
         if self._held is not None:
             command, self._held = self._held, None
             return self._judge(command)

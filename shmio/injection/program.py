@@ -12,8 +12,8 @@ import numpy as np
 from shmio.config import Declaration
 from shmio.errors import ConfigError, PathError, ValueRangeError
 from shmio.injection.activation import Window
+from shmio.injection.condition import Expression, parse
 from shmio.injection.draw import SeededRandom
-from shmio.injection.expression import Expression, parse
 from shmio.injection.operations import (
     MAX_DELAY_BYTES,
     MAX_DELAY_CYCLES,

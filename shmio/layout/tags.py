@@ -45,8 +45,8 @@ from shmio.layout.model import (
     shape_of,
 )
 from shmio.layout.report import Report, TooManyErrors
+from shmio.layout.simlog_structures import CONTENTS, members
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
-from shmio.layout.structures import CONTENTS, members
 from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
 from shmio.layout.values.literal import parse_literal, split_array
 from shmio.logs import printable

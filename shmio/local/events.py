@@ -62,7 +62,7 @@ class EventReader:
         return None
 
     def removed(self, instance: str) -> Event:
-        """Return the last event of a source that a reload has removed."""
+        """Create the REMOVED event, which ends the events of a source that a reload has removed."""
         last, source = self._last, self.block.source
         times = (0, 0, 0) if last is None else (last.frame, last.cycle, last.incarnation)
         reason = f"source {source!r} was removed from instance {instance!r} by a reload"

@@ -65,11 +65,11 @@ def _document(source: str, programs: list[Program]) -> bytes:
     declarations: Iterable[Declaration] = [program.declaration for program in programs]
     try:
         if len(programs) > MAX_INJECTIONS:
-            raise ValueError(f"a source has at most {MAX_INJECTIONS}")
+            raise ValueError(f"at most {MAX_INJECTIONS} are allowed")
         encode([msgspec.json.encode(_standing(program)) for program in programs], GROWTH * len(programs))
         return declared_document(declarations)
     except ValueError as error:
-        raise ConfigError(f"injection: {len(programs)} over source {source!r}: {error}") from None
+        raise ConfigError(f"injection: source {source!r} has {len(programs)}: {error}") from None
 
 
 def _standing(program: Program) -> StandingInjection:

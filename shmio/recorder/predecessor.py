@@ -14,7 +14,7 @@ from typing import Final
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recorder.output import SUFFIX
+from shmio.recorder.file_output import SUFFIX
 from shmio.recording.format.encoding import EVENT, FRAME, BlockPosition
 from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import survey

@@ -15,6 +15,7 @@ from shmio.backoff import Backoff
 from shmio.config import Recorder as Settings
 from shmio.config import load
 from shmio.errors import ConfigError, RecordingError
+from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import (
     TURN_S,
     BlockEntry,
@@ -23,7 +24,6 @@ from shmio.recorder.instance_follower import (
     InstanceFollower,
     StartPositions,
 )
-from shmio.recorder.output import Output, create
 from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, Reason
 from shmio.recording.writer import JSON, TEXT, TOML, Channels, Writer
 from shmio.segment import Event, Frame

@@ -129,7 +129,10 @@ def heading(source: str, path: str, taken: Collection[str] = OF_FRAMES) -> str:
 
 
 def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:
-    """Yield path and values, of shape (n,), of a register or each element; POINTER and ANY as hex digits."""
+    """Yield a column (path, values) for the register, or for each element of an array.
+
+    POINTER and ANY become hex digits.
+    """
     if values.dtype.kind == "V":
         texts = [bytes(value).hex() for value in values.reshape(-1)]
         values = np.array(texts, f"U{2 * values.dtype.itemsize}").reshape(values.shape)

@@ -17,7 +17,7 @@ import numpy as np
 
 from shmio.errors import ConfigError, LayoutError, ModelError, ShmioError
 from shmio.layout.model import Layout
-from shmio.layout.structures import members
+from shmio.layout.simlog_structures import members
 from shmio.layout.tags import place_tags
 from shmio.layout.topic import canonical_path, shorten
 from shmio.logs import printable

@@ -155,9 +155,9 @@ class ControlServer:
     """
 
     def __init__(self, path: str, selector: selectors.BaseSelector, handle: Callable[[Request, Answer], None]) -> None:
-        """Bind the socket; ControlError if that fails.
+        """Bind the socket; raise ControlError if that fails.
 
-        The caller holds the instance, so an existing socket is a dead supervisor's.
+        The caller holds the instance, so an existing socket was left by a dead supervisor and is removed.
         """
         self._path = path
         self._selector = selector

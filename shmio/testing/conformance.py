@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Protocol
 import pytest
 
 from shmio.connectors.base import Connector
-from shmio.connectors.loop import Schedule, SourceLoop, WallClock
+from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.layout.model import Layout
 from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment
 from shmio.testing.proxy import FaultProxy

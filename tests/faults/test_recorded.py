@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from shmio.layout.model import Layout, Register
+from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import InstanceFollower
-from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
 from shmio.recording.format.encoding import Gap, Reason
 from shmio.segment import BlockSpec, Event, EventKind, Frame, Quality, Record, Segment

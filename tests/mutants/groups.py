@@ -38,7 +38,7 @@ GROUPS: Final = {
             "shmio/connectors/commands.py",
             "shmio/connectors/injection_layers.py",
             "shmio/connectors/injections.py",
-            "shmio/connectors/loop.py",
+            "shmio/connectors/poll_loop.py",
             "shmio/connectors/output.py",
             "shmio/layout/values/write.py",
             "shmio/local/writer.py",

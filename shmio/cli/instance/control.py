@@ -37,7 +37,9 @@ def down(arguments: argparse.Namespace) -> int:
                 return 0
     except FormatError as error:  # the file that it was started from is unknown
         if wanted.file is not None:
-            raise FormatError(f"{error}; down --instance {name} clears it if its supervisor is dead") from None
+            raise FormatError(
+                f"{error}; if its supervisor is dead, `shmio-supervisor down --instance {name}` clears the instance"
+            ) from None
     print(f"{name}: its supervisor is dead; clearing what it left")
     for line in stale_segment.clear(name, forget_control=lambda path: _forget(path, name)):
         print(line)

@@ -257,7 +257,10 @@ def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) ->
     together = len(blocks) == held > 1 and all(block.number is not None for block in blocks)
     ports = _free(S7_PORTS, 1 if together else len(blocks))
     if not together and len(ports) < len(blocks):
-        raise ConfigError(f"there are {len(blocks)} data blocks and fewer free ports; choose one by --block NAME")
+        raise ConfigError(
+            f"{len(blocks)} data blocks need {len(blocks)} ports, but only {len(ports)} are free: "
+            "choose one block with --block NAME"
+        )
     lines: list[str] = []
     for index, block in enumerate(blocks[: len(ports)]):
         key = [f"block = {_toml(block.name)}"] if held > 1 else []

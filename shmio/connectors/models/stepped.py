@@ -12,8 +12,8 @@ from typing import Final, Protocol
 from shmio.connectors.base import Computed
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.injections import Blocks, OwnerOf, newest
-from shmio.connectors.loop import Counters, QualityLog, Schedule
 from shmio.connectors.output import Image, Output
+from shmio.connectors.poll_loop import Counters, QualityLog, Schedule
 from shmio.errors import PathError, SegmentError, ShmioError
 from shmio.layout.topic import Topic, find
 from shmio.layout.values.codec import RegisterCodec, Value, codec

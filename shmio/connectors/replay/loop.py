@@ -13,9 +13,9 @@ from typing import Final, cast
 
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.injections import Blocks, OwnerOf
-from shmio.connectors.loop import Counters
 from shmio.connectors.models.stepped import StepClock
 from shmio.connectors.output import Image, Output
+from shmio.connectors.poll_loop import Counters
 from shmio.connectors.replay.recording import MAX_NS, Entry, RecordedSource
 from shmio.connectors.replay.source import Replay, ReplayStart, as_others, stamp
 from shmio.errors import PathError, SegmentError, ValueRangeError

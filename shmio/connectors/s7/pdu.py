@@ -180,7 +180,9 @@ def parse_connect_confirm(frame: memoryview) -> int:
     if frame[5] != _COTP_CC or len(frame) < 11:
         raise ConnectorError(f"the peer is not an S7 controller: it answered COTP TPDU 0x{frame[5]:02X} to the request")
     if frame[4] != len(frame) - 5:
-        raise ConnectorError("connection confirm of a wrong length")
+        raise ConnectorError(
+            "the peer's connection confirm has the wrong length: check that host and port are those of an S7 controller"
+        )
     position = 11
     while position + 2 < len(frame):
         code, length = frame[position], frame[position + 1]

@@ -12,7 +12,7 @@ from paho.mqtt.client import MQTTMessage
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, InFlightTable
+from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, InFlightTable
 from shmio.endpoints.mqtt.topics import Message, TopicRules
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Layout, Register
@@ -190,7 +190,7 @@ class _Reply:
 
     def __call__(self, kind: EventKind, reason: str) -> None:
         if kind not in DONE:  # MQTT does not say who sent it; the response topic is the only hint
-            asked = "" if self._topic == f"{self._command}/result" else f", for {shorten(self._topic)}"
+            asked = "" if self._topic == f"{self._command}/result" else f" (response topic {shorten(self._topic)})"
             log.warning("command on %s%s: %s: %s", shorten(self._command, 400), asked, kind, reason)
         payload = msgspec.json.encode({"outcome": str(kind), "done": kind in DONE, "reason": reason})
         properties = None

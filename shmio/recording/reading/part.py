@@ -1,4 +1,4 @@
-"""One file of a dump: its blocks, and its entries from any time on."""
+"""One file of a dump: its blocks, and its entries from a given time on."""
 
 from __future__ import annotations
 

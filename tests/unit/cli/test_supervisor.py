@@ -950,7 +950,7 @@ def test_what_is_declared_for_a_source_has_a_bound(example: Edit, capsys: pytest
     tables = "".join(INJECTION.replace("one", f"n{place}").replace("[grpc]\n", "") for place in range(65))
     example("[grpc]\n", f"{tables}[grpc]\n")
     assert main(["check"]) == 1
-    assert "injection: 65 over source 'cell': a source has at most 64" in capsys.readouterr().err
+    assert "injection: source 'cell' has 65: at most 64 are allowed" in capsys.readouterr().err
 
 
 def test_all_that_is_missing_is_told_in_one_round(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:

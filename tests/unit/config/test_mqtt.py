@@ -118,7 +118,7 @@ def test_where_an_external_broker_is(tmp_path: Path, text: str, expected: list[s
         (f'{EXTERNAL}host = ["b", "c:x"]\n{TLS}', "mqtt.host[1]"),
         (f'{EXTERNAL}host = "mqtts://b:8883"\n{TLS}', "mqtt.host: 'mqtts://b:8883': write the host's name or address"),
         (f'{EXTERNAL}host = "b"\nlisten = "127.0.0.1:1"\n{TLS}', "mqtt.listen: an external broker listens by itself"),
-        (f'{EXTERNAL}host = "b"\npassword_file = "p"\n{TLS}', "mqtt.username: a password_file needs it"),
+        (f'{EXTERNAL}host = "b"\npassword_file = "p"\n{TLS}', "mqtt.username: set it"),
         (f'{EXTERNAL}host = "b"\n{TLS}key = "k"\n', "mqtt.tls: certificate and key go together"),
         (f'{OWN}[[source]]\nname = "broker"\nconnector = "memory"\n', "is the name of one of shmio's processes"),
     ],

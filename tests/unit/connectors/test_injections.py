@@ -12,7 +12,7 @@ import pytest
 from shmio.config import Declaration
 from shmio.connectors.base import Connector
 from shmio.connectors.injection_layers import MAX_INJECTIONS, Owner
-from shmio.connectors.loop import Schedule, SourceLoop, WallClock
+from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import CommandError, PathError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from shmio.layout.model import Layout, Register
+from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
-from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
 from shmio.recording.format.encoding import Gap, ProcessChange
 from shmio.recording.reading.reader import Message, Reader

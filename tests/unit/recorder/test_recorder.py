@@ -13,8 +13,8 @@ import pytest
 
 from shmio.errors import RecordingError
 from shmio.recorder import recorder as module
+from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import InstanceFollower, StartPositions
-from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import AttachedFile, Recorder
 from shmio.recording.format.encoding import FRAME_V2, Reason, decode_event, decode_frame, restore
 from shmio.recording.reading.reader import Reader

@@ -15,10 +15,10 @@ from shmio.cli.dump import main
 from shmio.config import Recorder as Settings
 from shmio.connectors.replay.recording import Recording
 from shmio.local.time_control import Coordinator
-from shmio.recorder import output as output_module
+from shmio.recorder import file_output as output_module
+from shmio.recorder.file_output import Output
 from shmio.recorder.housekeeping import Housekeeper
 from shmio.recorder.instance_follower import BlockEntry, InstanceFollower
-from shmio.recorder.output import Output
 from shmio.recorder.recorder import RotatingRecorder, no_attachments
 from shmio.recording.check import check
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason

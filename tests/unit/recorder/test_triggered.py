@@ -13,7 +13,7 @@ from shmio.cli.dump import main
 from shmio.config import Recorder as Settings
 from shmio.config import Trigger as TriggerSettings
 from shmio.errors import ConfigError
-from shmio.recorder import output as output_module
+from shmio.recorder import file_output as output_module
 from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
 from shmio.recorder.recorder import no_attachments
 from shmio.recorder.triggered import TriggeredRecorder

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from shmio.layout.model import Layout, Register
-from shmio.recorder.output import Output
+from shmio.recorder.file_output import Output
 from shmio.recording.format.encoding import Gap, ProcessChange, ProcessEvent, Reason, StepMark
 from shmio.recording.writer import Channels, Writer
 from shmio.segment import Block, Event, EventKind, Frame, Provenance, Quality, Record

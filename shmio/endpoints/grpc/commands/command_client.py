@@ -12,10 +12,10 @@ from typing import Any, Final, Unpack
 import msgspec
 
 from shmio.config import Declaration
+from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, Done, InFlightTable
 from shmio.endpoints.grpc.commands.injections import InjectionFollower, InjectionFollowers
 from shmio.endpoints.grpc.commands.write_subscriptions import WriteSubscriptions
 from shmio.endpoints.grpc.wakeups import BatchReader, WakeUps
-from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, Done, InFlightTable
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find

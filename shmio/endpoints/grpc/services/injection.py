@@ -12,6 +12,7 @@ from enum import Enum
 from functools import partial
 from typing import Final, NamedTuple, cast
 
+from shmio.endpoints.commands_in_flight import Done
 from shmio.endpoints.grpc.commands import command_client
 from shmio.endpoints.grpc.commands.injections import InjectionBase, InjectionFollower
 from shmio.endpoints.grpc.commands.write_subscriptions import Listener
@@ -20,7 +21,6 @@ from shmio.endpoints.grpc.server.connections import Peer, connected, peer_of
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import EventLane, Finish, Outbox, StateLane
 from shmio.endpoints.grpc.topics import Shape, TimeTopic, Topics
-from shmio.endpoints.in_flight import Done
 from shmio.errors import CommandError, ConflictError, EndpointError, PathError, ValueRangeError
 from shmio.layout.topic import Topic, encode_segment, find, shorten
 from shmio.layout.values.write import covering, encode

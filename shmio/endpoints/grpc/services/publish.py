@@ -12,10 +12,10 @@ import grpc
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 
+from shmio.endpoints.commands_in_flight import Done, in_words
 from shmio.endpoints.grpc.server.call_guard import Refusals
 from shmio.endpoints.grpc.services.injection import ShadowKind, Shadows
 from shmio.endpoints.grpc.topics import Shape, Topics, shape
-from shmio.endpoints.in_flight import Done, in_words
 from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind

@@ -26,7 +26,7 @@ from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.endpoints.grpc.topics import Shape, TimeTopic, Topics, shape
 from shmio.errors import PathError, ShmioError, ValueRangeError
 from shmio.layout.model import Layout, Register
-from shmio.layout.structures import CONTENTS, Found, recognise
+from shmio.layout.simlog_structures import CONTENTS, Found, recognise
 from shmio.layout.topic import Topic, shorten
 from shmio.layout.values.codec import codec
 from shmio.layout.values.literal import default_text, scalar_literal

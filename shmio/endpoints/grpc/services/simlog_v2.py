@@ -145,7 +145,7 @@ def time_message(topic: TimeTopic, moment: Moment) -> EncodedMessage:
 
 
 def repeated(messages: Iterable[bytes]) -> bytes:
-    """Encode a message whose repeated field 1 has these messages."""
+    """Encode a protobuf message whose field 1 repeats these messages."""
     return b"".join(b"\x0a" + delimited(message) for message in messages)
 
 

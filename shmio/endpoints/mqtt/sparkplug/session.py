@@ -81,7 +81,10 @@ class PrimaryHost:
         try:
             state = msgspec.json.decode(payload, type=_State)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-            log.warning("%s: expected JSON with online, true or false, and a timestamp", self.topic)
+            log.warning(
+                '%s: ignored a state message: expected JSON such as {"online": true, "timestamp": 1700000000000}',
+                self.topic,
+            )
             return
         if state.timestamp > time.time() * 1000 + AHEAD_MS:  # no later message would be newer
             log.warning("%s: the timestamp is more than a day ahead; it is in ms since 1970", self.topic)

@@ -10,8 +10,8 @@ import pytest
 
 from shmio.connectors import registry
 from shmio.connectors.base import Computed
-from shmio.connectors.loop import Schedule
 from shmio.connectors.models.stepped import PageClock, SteppedLoop
+from shmio.connectors.poll_loop import Schedule
 from shmio.errors import CommandError, ConfigError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.local.reading import reading

@@ -12,9 +12,9 @@ import msgspec
 import pytest
 
 from shmio.connectors.base import Computed
-from shmio.connectors.loop import Schedule
 from shmio.connectors.models.memory import Memory
 from shmio.connectors.models.stepped import RESTARTED, Inputs, PageClock, SteppedLoop
+from shmio.connectors.poll_loop import Schedule
 from shmio.errors import ConnectorError, TimeError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import parse_topic

@@ -95,7 +95,7 @@ def test_connect_confirm_names_the_tpdu_size() -> None:
     [
         (changed(CONFIRM, _5=0x80), "refused the session"),
         (changed(CONFIRM, _5=0xF0), "not an S7 controller"),
-        (changed(CONFIRM, _4=5), "wrong length"),
+        (changed(CONFIRM, _4=5), "the wrong length"),
         (changed(CONFIRM, _13=40), "size code 40"),
         (memoryview(CONFIRM[:8]), "not an S7 controller"),
     ],

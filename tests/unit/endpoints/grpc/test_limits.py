@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from shmio.client import calls
-from shmio.endpoints import in_flight
+from shmio.endpoints import commands_in_flight
 from shmio.endpoints.grpc.server import server
 from shmio.endpoints.grpc.server.call_guard import CallLimits
 from shmio.endpoints.grpc.services import simlog_v2
@@ -40,7 +40,7 @@ SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc
         ("characters of a subscriber's name or uuid", simlog_v2.MAX_NAME),
         ("elements of a value of version 2, or of one `Read`", simlog_v2.MAX_ELEMENTS),
         ("registers of a value of version 2, or of one `Read`", simlog_v2.MAX_MEMBERS),
-        ("events of a source under way for what clients write", in_flight.MAX_OPEN),
+        ("events of a source under way for what clients write", commands_in_flight.MAX_OPEN),
         ("a client whose host is silent", SILENT_MS // 1000),
     ],
 )

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from grpc import StatusCode
 
-from shmio.layout.structures import CONTENTS
+from shmio.layout.simlog_structures import CONTENTS
 from shmio.layout.tags import place_tags
 from shmio.layout.topic import find
 from shmio.layout.values.codec import codec

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from shmio.connectors.base import Connector
-from shmio.connectors.loop import Schedule, SourceLoop
+from shmio.connectors.poll_loop import Schedule, SourceLoop
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
 from shmio.local.writer import CommandSender

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.loop import Schedule
+from shmio.connectors.poll_loop import Schedule
 
 
 def test_cycles_are_due_at_multiples_of_the_period_from_the_start() -> None:

@@ -7,7 +7,7 @@ import pytest
 from shmio.errors import LayoutError, ValueRangeError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Register
-from shmio.layout.structures import CONTENTS, members, recognise
+from shmio.layout.simlog_structures import CONTENTS, members, recognise
 from shmio.layout.tags import place_tags
 
 LENGTHS = {"JointTrajectoryPoint": "[6]", "JointTrajectory": "[6, 3]"}

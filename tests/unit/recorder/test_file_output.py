@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from shmio.errors import RecordingError
-from shmio.recorder import output as module
-from shmio.recorder.output import Output, create
+from shmio.recorder import file_output as module
+from shmio.recorder.file_output import Output, create
 from shmio.testing.cell import until
 
 NOW = datetime(2026, 11, 21, 8, 30, 5, tzinfo=UTC)
