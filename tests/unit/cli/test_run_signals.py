@@ -11,13 +11,9 @@ from shmio.cli.run import stop_on_signals
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_them(sign: signal.Signals) -> None:
-    before = signal.signal(sign, signal.SIG_DFL)  # the tests may run under nohup themselves
-    try:
-        with stop_on_signals() as stopping:
-            signal.raise_signal(sign)
-            assert stopping.wait(20)
-    finally:
-        signal.signal(sign, before)
+    with stop_on_signals() as stopping:
+        signal.raise_signal(sign)
+        assert stopping.wait(20)
 
 
 def test_under_nohup_a_closed_terminal_does_not() -> None:
