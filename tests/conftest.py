@@ -21,8 +21,10 @@ from xdist.scheduler import LoadScopeScheduling
 
 from shmio.testing.mosquitto import missing
 
-# Tests interrupt themselves and others; who runs in the background, or beside others, begins with SIGINT ignored.
+# Tests interrupt themselves and others. In the background, or beside others, Python begins with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+if "PYTEST_XDIST_WORKER" in os.environ:  # and under nohup with SIGHUP ignored, which only the main process is to keep
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # No deadline: the machine may be busy with other things. Each run has the same examples, --fast fewer of them;
 # --hypothesis-profile=search looks for others.
