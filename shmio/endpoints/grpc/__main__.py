@@ -87,14 +87,12 @@ async def _serve(worker: Worker) -> None:
     if (file := place.config_file) is not None:
         worker.on_reread(lambda: loop.call_soon_threadsafe(reread, file))
     worker.running()
-    reading: asyncio.Task[list[str]] | None = None
+    reading: asyncio.Task[None] | None = None
     while not stopping.is_set():
-        reading = reading or loop.create_task(feeds.follow())
+        reading = reading or loop.create_task(_follow(worker, feeds, services))
         await asyncio.wait((reading,), timeout=BEAT_S)  # a large layout takes long: the heartbeat goes on meanwhile
         if reading.done():
-            if changed := reading.result():
-                worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
-                services.move(changed)
+            reading.result()
             reading = None
         if not server.alive:
             _end_now(worker)
@@ -115,6 +113,13 @@ async def _serve(worker: Worker) -> None:
     await server.stop()
     await _calls_end()
     wake_ups.close()
+
+
+async def _follow(worker: Worker, feeds: Feeds, services: Services) -> None:
+    """Adopt what a reload has changed: no call begins between the change of the feeds and the move of the others."""
+    if changed := await feeds.follow():
+        worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
+        services.move(changed)
 
 
 def _end_now(worker: Worker) -> NoReturn:

@@ -137,8 +137,9 @@ class EventLogs:
         """
         log = self._logs.get(block.section)
         if log is None:
-            log = self._logs[block.section] = EventLog(block, self._wake_ups, after)
+            log = EventLog(block, self._wake_ups, after)
             log.start()
+            self._logs[block.section] = log
         log.listeners[wake] = None
         return log
 
@@ -197,10 +198,15 @@ class EventsCall:
         self._places: dict[str, _Place] = {}
         self._moved: dict[str, EventLog | None] = {}
         """The next log of each source that a reload has changed; None: the source was removed."""
-        for source in dict.fromkeys(sources) or feeds:
-            block = feeds[source].block
-            after = block.events.head()
-            self._places[source] = _Place(logs.join(block, self._wake.set, after=after), after)
+        self._failure: EndpointError | None = None
+        try:
+            for source in dict.fromkeys(sources) or feeds:
+                block = feeds[source].block
+                after = block.events.head()
+                self._places[source] = _Place(logs.join(block, self._wake.set, after=after), after)
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Stop following the sources."""
@@ -214,6 +220,8 @@ class EventsCall:
         """Prepare to follow the present blocks of these sources, after a reload."""
         for source in self._places.keys() & sources:
             feed, before = self._feeds.get(source), self._moved.get(source)
+            if feed is not None and self._places[source].log.block is feed.block:
+                continue  # the call began with this block
             log = None if feed is None else self._logs.join(feed.block, self._wake.set, after=0)
             if before is not None and before is not log:  # two reloads, and the client has not read up to the first
                 self._places[source].missed += before.end + before.missed
@@ -228,7 +236,9 @@ class EventsCall:
             self._wake.clear()  # before looking
             if batch := self._batch():
                 yield batch
-            else:
+            if self._failure is not None:
+                raise self._failure
+            if not batch:
                 await self._wake.wait()
 
     def _batch(self) -> bytes:
@@ -254,8 +264,10 @@ class EventsCall:
         while (event := place.next()) is None and place.log.ended:
             if source not in self._moved:
                 if place.log.failed:
-                    raise EndpointError(f"source {source}: its events can no longer be read; see the endpoint's log")
-                return None  # the reload is not complete yet
+                    self._failure = EndpointError(
+                        f"source {source}: its events can no longer be read; see the endpoint's log"
+                    )
+                return None  # or the reload is not complete yet
             log = self._moved.pop(source)
             self._logs.leave(place.log, self._wake.set)
             if log is None:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import grpc
 import pytest
 
-from shmio.endpoints.grpc.__main__ import _take_anew, run
+from shmio.endpoints.grpc.__main__ import _follow, _take_anew, run
 from shmio.segment import Segment
 from shmio.testing.ports import reserved_port
 from shmio.wire import simlog_v1_pb2 as v1
@@ -26,6 +26,27 @@ from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
 from tests.unit.endpoints.harness import TIMEOUT_S
 
 STREAMS = 20
+
+
+def test_no_call_begins_between_new_feeds_and_the_move_of_the_calls() -> None:
+    done: list[str] = []
+
+    class ReloadedFeeds:
+        async def follow(self) -> list[str]:
+            await asyncio.to_thread(lambda: None)
+            asyncio.get_running_loop().call_soon(done.append, "call")
+            done.append("feeds")
+            return ["cell"]
+
+    async def test() -> None:
+        feeds: Any = ReloadedFeeds()
+        services: Any = SimpleNamespace(move=lambda sources: done.append(f"move {sources}"))
+        worker: Any = SimpleNamespace(log=logging.getLogger("test"))
+        await asyncio.create_task(_follow(worker, feeds, services))
+        await asyncio.sleep(0)
+
+    asyncio.run(test())
+    assert done == ["feeds", "move ['cell']", "call"]
 
 
 def test_it_beats_while_layouts_are_read(segment: Segment, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:

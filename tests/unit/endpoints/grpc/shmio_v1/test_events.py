@@ -11,13 +11,14 @@ import pytest
 
 from shmio.client import Client, Event, EventKind
 from shmio.endpoints.grpc.shmio_v1 import events as events_module
+from shmio.endpoints.grpc.shmio_v1.events import EventLog, EventLogs, EventsCall
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.errors import PathError, RemoteError, ValueRangeError
+from shmio.errors import EndpointError, PathError, RemoteError, SegmentError, ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.local.events import EventReader
 from shmio.messages import event_from_wire, event_to_wire
 from shmio.model.values import Quality
-from shmio.segment import Attributes, BlockSpec, Segment
+from shmio.segment import Attributes, Block, BlockSpec, Segment
 from shmio.segment import EventKind as Recorded
 from shmio.segment.events import EVENT_SLOTS, Record
 from shmio.wire import shmio_v1_pb2 as wire
@@ -223,6 +224,26 @@ def test_of_two_reloads_at_once_the_first_is_counted_as_missed(segment: Segment)
     serve(segment, test)
 
 
+def test_a_call_that_began_with_the_new_block_stays_there(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        reload(served, OTHER)
+        stream = Stream(served)
+        await stream.begin()
+        (call,) = served.service._shmio_v1._event_calls._open
+        call.move(["cell"])
+        assert not call._moved
+        for _ in range(3):
+            served.writer.event(NOTE)
+            while (await stream.next()).kind != wire.Event.KIND_NOTED:
+                pass
+        reload(served, OTHER)
+        found = await stream.next()
+        assert (found.kind, found.missed) == (wire.Event.KIND_STARTED, 0)
+        stream.call.cancel()
+
+    serve(segment, test)
+
+
 def test_a_source_that_a_reload_removes_is_told_once(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.writer.event(NOTE)
@@ -292,6 +313,52 @@ def test_events_that_cannot_be_read_end_the_call(segment: Segment, monkeypatch: 
         served.writer.event(NOTE)
         found, text = await refusal(stream.call.read())
         assert (found, "can no longer be read" in text) == (Status.RESOURCE_EXHAUSTED, True)
+
+    serve(segment, test)
+
+
+def test_events_of_other_sources_come_before_the_failure(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    segment.change([BlockSpec("press", OTHER, 20_000_000, STALE_NS, 1 << 16, Attributes("test"))])
+
+    async def test(served: Endpoint) -> None:
+        press = Feed(served.segment.blocks["press"], WRITER, served.wake_ups, lambda *_: None)
+        call = EventsCall({"press": press, **served.feeds}, EventLogs(served.wake_ups), "x", [])
+        messages = call.messages()
+        await anext(messages)
+        served.segment.writer("press").event(NOTE)
+        call._places["press"].log._read()
+        failing = call._places["cell"].log
+        monkeypatch.setattr(failing.reader, "next", lambda: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            failing._read()
+        found = wire.EventsResponse.FromString(await anext(messages))
+        assert [(one.source, one.kind) for one in found.events] == [
+            ("press", wire.Event.KIND_STARTED),
+            ("press", wire.Event.KIND_NOTED),
+        ]
+        with pytest.raises(EndpointError, match="source cell: its events can no longer be read"):
+            await anext(messages)
+        call.close()
+
+    serve(segment, test)
+
+
+def test_a_call_that_cannot_follow_all_follows_nothing(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    segment.change([BlockSpec("press", OTHER, 20_000_000, STALE_NS, 1 << 16, Attributes("test"))])
+
+    async def test(served: Endpoint) -> None:
+        press = Feed(served.segment.blocks["press"], WRITER, served.wake_ups, lambda *_: None)
+        logs, join = EventLogs(served.wake_ups), EventLogs.join
+
+        def fail(self: EventLogs, block: Block, *arguments: Any, **named: Any) -> EventLog:
+            if block.source == "press":
+                raise SegmentError("damaged")
+            return join(self, block, *arguments, **named)
+
+        monkeypatch.setattr(EventLogs, "join", fail)
+        with pytest.raises(SegmentError):
+            EventsCall({**served.feeds, "press": press}, logs, "x", [])
+        assert not logs._logs
 
     serve(segment, test)
 
