@@ -47,7 +47,7 @@ class EventReader:
         while (event := self._cursor.poll()) is not None:
             if missed := self._cursor.take_missed():
                 self._missed += missed
-                self._explainer.know(self.block.standing.read())
+                self._explainer.resume(self.block.standing.read(), self.block.events.head())
             self._last = event
             explained = self._explainer.explain(event)
             if explained.partial:
@@ -111,6 +111,8 @@ class Events(Following[Event]):
         """Follow the block that a reload has put in place of another; return the end if there is none."""
         self._segment.require_running()
         block = self._blocks().get(old.block.source)
+        if block is old.block:
+            return None  # the reload is not complete yet
         self._leave(old.block)
         if block is None:
             self._readers.remove(old)

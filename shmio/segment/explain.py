@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -100,7 +100,10 @@ class Explainer:
         self._most = most
         self._injections: dict[int, _Injection] = {}
         self._documents: dict[int, bytes] = {}
-        self._under_way: dict[tuple[int, int, int], dict[int, tuple[Place, ...]]] = {}
+        self._under_way: dict[tuple[int, int, int], dict[int, list[Place]]] = {}
+        self._gone: frozenset[int] = frozenset()
+        """Known injections that were lifted no later than by event ``_gone_at``."""
+        self._gone_at = 0
 
     def know(self, present: Iterable[Injection[Any]]) -> None:
         """Take the injections that were laid before the next event."""
@@ -110,8 +113,28 @@ class Explainer:
                 places = self._over(one.ranges) if one.running is None else ()
                 self._injections[one.number] = _Injection(one.direction, places)
 
+    def resume(self, present: Sequence[Injection[Any]], newest: int) -> None:
+        """Go on after lost events, among which may be ends of commands and injections.
+
+        Args:
+            present: The injections that are laid now.
+            newest: Number of the newest event after ``present`` was read.
+        """
+        self._under_way.clear()
+        self._documents.clear()
+        self._gone = frozenset(self._injections) - {one.number for one in present}
+        self._gone_at = newest
+        self.know(present)
+
     def explain(self, event: Event) -> Explained:
         """Explain the next event."""
+        if self._gone and event.number > self._gone_at:  # their ends, if they were not lost, have been explained
+            for number in self._gone:
+                self._injections.pop(number, None)
+            self._gone = frozenset()
+        if event.kind == EventKind.STARTED:  # nobody ends the commands of the process before
+            for key in [key for key in self._under_way if key[0] != event.incarnation]:
+                del self._under_way[key]
         laid = self._laid(event) if event.kind == EventKind.INJECTED else None
         known = self._injections.get(event.injection)
         direction, places = "", tuple[Place, ...]()
@@ -127,6 +150,7 @@ class Explainer:
             places = known.places
         if event.kind == EventKind.LIFTED:
             self._injections.pop(event.injection, None)
+            self._documents.pop(event.injection, None)
         partial = event.kind == EventKind.INJECTED and laid is None and len(event.data) == EVENT_DATA_SIZE
         return Explained(places, direction, by(event.writer), laid, partial)
 
@@ -142,19 +166,24 @@ class Explainer:
             return places
         key = event.command_key
         accepted = self._under_way.get(key, {})
-        found: tuple[Place, ...] = ()
+        found: list[Place] = []
         for item in range(event.item, event.item + min(event.items, MAX_REMEMBERED)):
-            found += tuple(place._replace(value=None, valued=False) for place in accepted.pop(item, ()))
+            found += self._at_most(accepted.pop(item, ()), found)
         if not accepted:
             self._under_way.pop(key, None)
-        return found or self._places(event.offset, event.size, event.mask)
+        return tuple(found) or self._places(event.offset, event.size, event.mask)
 
     def _remember(self, event: Event, places: tuple[Place, ...]) -> None:
         if len(self._under_way) >= MAX_REMEMBERED:
             self._under_way.pop(next(iter(self._under_way)))
         items = self._under_way.setdefault(event.command_key, {})
         if len(items) < MAX_REMEMBERED:
-            items[event.item] = items.get(event.item, ()) + places
+            known = items.setdefault(event.item, [])
+            known += (place._replace(value=None, valued=False) for place in self._at_most(places, known))
+
+    def _at_most(self, places: Sequence[Place], before: Sequence[Place]) -> Sequence[Place]:
+        """Return the places that may still be named behind those before."""
+        return places if self._most is None else places[: self._most - len(before)]
 
     def _places(self, offset: int, size: int, mask: int, data: bytes = b"") -> tuple[Place, ...]:
         if self._layout is None or offset + size > self._layout.size:

@@ -107,6 +107,77 @@ def test_an_event_names_a_bounded_number_of_registers(segment: Segment, cell: At
         assert len(next(events).paths) == MAX_PATHS
 
 
+def test_the_outcome_of_many_items_names_a_bounded_number_of_registers(segment: Segment, cell: Attachment) -> None:
+    segment.change(add=[spec("many", MANY)])
+    writer = segment.writer("many")
+    with cell.events("many") as events:
+        for item in range(MAX_PATHS + 500):
+            writer.event(Record(Recorded.ACCEPTED, "", 3, 7, item, 1, item, 0, 1, b"\1"))
+            next(events)
+        writer.event(Record(Recorded.WRITTEN, "", 3, 7, 0, MAX_PATHS + 500, 0, 0, 1))
+        paths = next(events).paths
+    assert paths == tuple(f"many/r{at}" for at in range(MAX_PATHS))
+    assert not events._readers[0]._explainer._under_way
+
+
+def test_the_outcome_of_a_long_item_names_a_bounded_number_of_registers(segment: Segment, cell: Attachment) -> None:
+    segment.change(add=[spec("many", MANY)])
+    writer = segment.writer("many")
+    with cell.events("many") as events:
+        for at in range(0, 4096, EVENT_DATA_SIZE):
+            writer.event(Record(Recorded.ACCEPTED, "", 3, 7, 0, 1, at, 0, EVENT_DATA_SIZE, bytes(EVENT_DATA_SIZE)))
+            next(events)
+        ((known,),) = (items.values() for items in events._readers[0]._explainer._under_way.values())
+        assert len(known) == MAX_PATHS
+        assert not any(place.valued for place in known)
+        writer.event(Record(Recorded.WRITTEN, "", 3, 7, 0, 1, 0, 0, 4096))
+        assert len(next(events).paths) == MAX_PATHS
+
+
+def test_a_command_whose_end_is_lost_is_forgotten(segment: Segment, cell: Attachment) -> None:
+    writer = segment.writer("cell")
+    with cell.events("cell") as events:
+        writer.event(Record(Recorded.ACCEPTED, "", 3, 7, 0, 1, 2, 0, 2, b"\1\2"))
+        next(events)
+        under_way = events._readers[0]._explainer._under_way
+        assert under_way
+        for _ in range(EVENT_SLOTS + 100):
+            writer.event(NOTE)
+        assert next(events).missed
+        assert not under_way
+
+
+def test_a_command_of_the_process_before_is_forgotten(segment: Segment, cell: Attachment) -> None:
+    writer = segment.writer("cell")
+    with cell.events("cell") as events:
+        writer.event(Record(Recorded.ACCEPTED, "", 3, 7, 0, 1, 2, 0, 2, b"\1\2"))
+        segment.writer("cell")
+        assert [next(events).kind for _ in range(2)] == ["accepted", "started"]
+        assert not events._readers[0]._explainer._under_way
+
+
+def test_an_injection_whose_end_is_lost_is_forgotten(segment: Segment, cell: Attachment) -> None:
+    writer = segment.writer("cell")
+    how = json.dumps({"direction": "in", "ranges": [[0, 2, 255]]}).encode()
+    standing = {"id": 9, "direction": "in", "priority": 0, "keep": False, "name": "n", "writer": 0, "pid": 1}
+    with cell.events("cell") as events:
+        for number in (7, 8, 9):
+            writer.event(Record(Recorded.INJECTED, "n", 0, number, 0, 1, 0, 0, len(how), how, number))
+            next(events)
+        for _ in range(EVENT_SLOTS + 100):
+            writer.event(NOTE)
+        writer.event(Record(Recorded.LIFTED, "lifted", injection=8))
+        writer.block.standing.write(json.dumps([standing | {"ranges": [[0, 2, 255]]}]).encode())
+        newest = writer.block.events.head()
+        assert next(events).missed
+        while (event := next(events)).number < newest:
+            pass
+        assert (event.kind, event.injection, event.paths) == ("lifted", 8, ("cell/a",)), "its end is not lost"
+        writer.event(NOTE)
+        next(events)
+        assert set(events._readers[0]._explainer._injections) == {9}
+
+
 def test_an_event_of_a_later_version_is_some_other(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     with cell.events("cell") as events:
@@ -170,6 +241,17 @@ def test_a_reload_goes_on_with_the_new_block_and_ends_what_it_removes(segment: S
         (gone,) = [one for one in found if one.source == "press"]
         assert (gone.kind, gone.number, gone.quality) == (EventKind.REMOVED, 0, Quality.BAD)
         assert gone.text == f"source 'press' was removed from instance {segment.instance!r} by a reload"
+
+
+def test_a_reload_that_is_not_complete_yet_repeats_nothing(segment: Segment, cell: Attachment) -> None:
+    segment.writer("cell").event(NOTE)
+    with cell.events("cell") as events:
+        blocks, old = events._blocks, events._readers[0].block
+        segment.change(retire=["cell"])
+        events._blocks = lambda: {"cell": old}
+        assert events._take() is None
+        events._blocks = blocks
+        assert next(events).kind is EventKind.REMOVED
 
 
 def test_an_unknown_source_is_refused_at_once(cell: Attachment) -> None:
