@@ -76,7 +76,8 @@ class Event:
             is unknown.
         direction: ``in`` for what is written toward the device, ``out`` for what consumers see; empty if the event
             is about no registers, or it is unknown.
-        paths: The registers, elements, slices or bits that the event is about, at most 2048.
+        paths: The registers, elements, slices or bits that the event is about, at most 2048. Of several items of a
+            command, ``rejected`` and ``taken`` name those of the first; so do other outcomes if ``accepted`` was lost.
         values: Values by path, where the event has them: with ``accepted``, ``diverted`` and ``shadowed``. A value
             of None stands for bytes that are not valid for their type.
         missed: Events of the source that were lost between the event before and this one.

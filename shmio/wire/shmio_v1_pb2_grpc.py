@@ -224,7 +224,8 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Step(self, request, context):
-        """Takes control of time, and moves it by one step. It returns when every stream has the step's changes.
+        """Takes control of time, and moves it by one step. It returns when every stream has the step's changes,
+        except Events, which no step waits for.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
