@@ -124,7 +124,7 @@ def test_down_clears_another_versions_instance(cell: Cell) -> None:
     refused = cell.supervisor("down")
     assert refused.returncode == 1
     name = f"--instance {cell.instance}"
-    assert f"down {name} clears it" in refused.stderr, "nobody can tell from which file it was started"
+    assert f"down {name}` clears" in refused.stderr, "nobody can tell from which file it was started"
     down = cell.supervisor("down", *name.split())
     assert down.returncode == 0, down.stderr
     assert all(gone(pid) for pid in before.values())
