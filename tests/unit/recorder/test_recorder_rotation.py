@@ -268,8 +268,8 @@ def test_by_age(segment: Segment, tmp_path: Path, caplog: pytest.LogCaptureFixtu
 
 def test_by_size_the_oldest_first(segment: Segment, tmp_path: Path) -> None:
     files = [recorded(segment, tmp_path, days) for days in (1, 3, 2, 0)]
-    size = sum(file.stat().st_size for file in files) - files[1].stat().st_size / 2  # room for all but that one
-    assert keep(segment, tmp_path, keep_mb=size / 1e6) == {files[0], files[2], files[3]}
+    size = sum(file.stat().st_size for file in files) - files[1].stat().st_size
+    assert keep(segment, tmp_path, keep_mb=(size + 0.5) / 1e6) == {files[0], files[2], files[3]}
     assert keep(segment, tmp_path, files[3], keep_mb=1e-6) == {files[3]}
 
 
