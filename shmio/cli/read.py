@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from shmio.cli.run import add_full, at_least, dumps, room, seconds
+from shmio.cli.run import add_full, at_least, dumps, ended_by_interrupt, room, seconds
 from shmio.errors import NotRunningError, PathError
 from shmio.layout.glob import choose
 from shmio.layout.model import Register
@@ -65,6 +65,7 @@ def get_arguments(parser: argparse.ArgumentParser) -> None:
 def get(cell: Cell, options: argparse.Namespace) -> int:
     """Print present values; all values of one source are from one frame."""
     found = cell.get(*options.patterns)
+    _load_numpy(found)
     if options.json:
         print(dumps({one.path: _object(one) for one in found}))
         return 0
@@ -102,6 +103,8 @@ def watch(cell: Cell, options: argparse.Namespace) -> int:
         batches = _rounds(cell, options.patterns, options.every_s)
     width = printed = 0
     for batch in batches:
+        if not printed:
+            _load_numpy(batch)
         width = max(width, _width(batch))
         for one in batch:
             if options.json:
@@ -120,6 +123,8 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
     drawn = 0
     for read in _rounds(cell, options.patterns, options.every_s or TABLE_EVERY_S):
         columns, rows = shutil.get_terminal_size()
+        if not drawn:
+            _load_numpy(read)
         width, limit = _width(read), room(options)
         if limit is not None:
             limit = min(limit, columns - CLOCK_CHARACTERS - width - 4)
@@ -175,6 +180,13 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Seq
             readings = cell.get(*patterns)
         except PathError as error:
             raise NotRunningError(f"{error}: a reload removed it") from None
+
+
+def _load_numpy(readings: Sequence[Reading]) -> None:
+    """Import numpy, which the text of a REAL needs, while Ctrl-C ends the process at once."""
+    if any(one.register.element.base == "REAL" for one in readings):
+        with ended_by_interrupt():
+            import numpy as np  # noqa: F401, PLC0415  other values are printed without it
 
 
 def _width(readings: Sequence[Reading]) -> int:

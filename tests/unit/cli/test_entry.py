@@ -9,6 +9,8 @@ import sys
 import pytest
 
 from shmio import __version__
+from shmio.layout.model import Layout, Register
+from shmio.segment import BlockSpec, Segment
 
 INTERRUPTED = """
 import importlib.abc, sys
@@ -83,6 +85,17 @@ def test_ctrl_c_leaves_no_half_of_a_library(name: str, words: list[str], library
     """C code may swallow the exception that it would be, and go on with what it has not got."""
     program = SWALLOWED.format(name=name, words=words, library=library)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+@pytest.mark.parametrize("words", [["get"], ["get", "--json"], ["watch", "-n", "1"]])
+def test_ctrl_c_leaves_no_half_of_what_prints_a_real(instance: str, words: list[str]) -> None:
+    layout = Layout("DB1", 1, 4, False, (Register("a", "REAL", (), 0, None, 4, 1),))
+    with Segment.create(instance, [BlockSpec("cell", layout, 20_000_000, 3600 * 10**9, 1 << 16)], []) as segment:
+        segment.writer("cell").publish(bytes(4), cycle=1, source_ns=1)
+        program = SWALLOWED.format(name="shmio", words=[*words, "--instance", instance, "cell/a"], library="numpy")
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+        segment.unlink()
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
 
 
