@@ -45,6 +45,8 @@ def test_all_goes_on_under_the_next_supervisor(cell: Cell) -> None:
         next(stream)
         first = reader.frame("cell").frame
         kill_supervisor(cell)
+        checked = cell.supervisor("check")
+        assert (checked.returncode, "would fail" in checked.stdout) == (0, False), "the ports are its own processes'"
         up = cell.supervisor("up", "--detach")
         assert up.returncode == 0, up.stderr
         for name, pid in before.items():

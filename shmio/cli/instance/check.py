@@ -48,9 +48,13 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _taken(file: Path, plan: Plan) -> list[str]:
-    """Return a note for each address that another program uses; none if the instance runs."""
+    """Return a note for each address that another program uses.
+
+    There is none if the instance runs, or if its processes outlived the supervisor: they hold the
+    addresses, and ``up`` takes them over.
+    """
     with suppress(ShmioError), Segment.open(plan.instance, config=file) as segment:
-        if segment.supervised:
+        if segment.supervised or any(slot.alive() for slot in segment.processes):
             return []
     return [f"note: up would fail at present: {problem}" for problem in taken(plan)]
 
