@@ -1,4 +1,4 @@
-"""``scripts/fault-suite``: runs the fault suite and writes its report."""
+"""``scripts/fault-suite``: run the fault suite and write its report."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from tests.faults.suite import Record, Suite
 
 SHM_SIZE = "384m"
 STEPPED = 0.2
-"""The share of a run that is for the instance that is stepped."""
+"""Share of a run in which the stepped instance is tested."""
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="fault-suite", description="Break a whole instance under load, and watch.")
+    parser = argparse.ArgumentParser(prog="fault-suite", description="Break an instance under load; check all values.")
     parser.add_argument(
         "--for", dest="for_s", type=float, default=60.0, metavar="SECONDS",
-        help="default: 60; a fifth of it is for the instance that is stepped",
+        help="duration (default: 60); a fifth of it tests an instance with stepped time",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, help="which faults come when; default: a new one")
-    parser.add_argument("--report", type=Path, metavar="FILE", help="default: printed at the end")
+    parser.add_argument("--seed", type=int, help="determines the faults and their times (default: a new seed)")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="file for the report (default: print it)")
     arguments = parser.parse_args()
     _have_own_shm()
     seed = secrets.randbits(32) if arguments.seed is None else arguments.seed
@@ -69,7 +69,7 @@ def main() -> int:
 
 
 def _have_own_shm() -> None:
-    """Go on in a mount name space with a small /dev/shm of its own, which may be filled; only root can."""
+    """Start again in a mount name space with a small /dev/shm that may be filled. Needs root."""
     space = ["unshare", "--mount", "--propagation", "private"]
     if OWN_SHM in os.environ or os.geteuid() or subprocess.run([*space, "true"], check=False).returncode:
         return

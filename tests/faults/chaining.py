@@ -1,7 +1,7 @@
-"""Two clients over one word, below a declared injection: whose value is seen, and what is left when one of them dies.
+"""A chain over one word: two clients inject below a declared injection, and end one by one.
 
-The inner one gives multiples of 4; the outer one, by a higher priority, gives one more than what comes to it. Both come
-by shmio.v1: programs that are attached are as many as may be already.
+The inner client gives multiples of 4. The outer client has a higher priority, and gives the value
+that it receives plus 1. Both use shmio.v1, because no further program may attach with write access.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tests.faults.plc import CHAINED_AT
 
 
 class Chaining:
-    """Has one pair of clients after another inject."""
+    """Runs one pair of injecting clients after the other, and checks what readers see."""
 
     def __init__(self, checker: Checker) -> None:
         self._checker = checker
@@ -40,12 +40,12 @@ class Chaining:
         )
 
     def work(self, attachment: Attachment) -> None:
-        """Go on as long as this instance is there."""
+        """Run pairs of clients until this instance stops."""
         self._attachment, self._awake = attachment, Awake(attachment)
         while self._goes_on:
             try:
                 self._turn(*next(self._turns))
-            except (CommandError, PathError, QualityError):  # the source is just being restarted, or made anew
+            except (CommandError, PathError, QualityError):  # the source is being restarted or replaced
                 self._checker.stopping.wait(PAUSE_S)
             if time.monotonic_ns() - self._effect_ns > EFFECT_NS + self._checker.slack_ns:
                 self._effect_ns = time.monotonic_ns()
@@ -56,7 +56,7 @@ class Chaining:
         return self._attachment.current and not self._checker.stopping.is_set()
 
     def _turn(self, source: Source, check: ChainCheck) -> None:
-        """One pair, from its start until nothing of it is left: first one ends, then the other."""
+        """Run one pair: both start, then one ends, then the other. No injection must remain."""
         chance, description, first = self._chance, self._checker.description, next(self._first)
         section = self._attachment.block(source.name).section
         clients: dict[str, Client] = {}
@@ -80,7 +80,7 @@ class Chaining:
                 client.end(kill=True)
 
     def _end(self, part: str, source: Source, check: ChainCheck, clients: dict[str, Client], section: int) -> None:
-        """Have one end, and see its injection go."""
+        """End one client, and check that its injection is lifted."""
         client = clients.pop(part)
         ended_ns = client.end(kill=self._chance.random() < 0.7)
         if not client.stands.is_set():
@@ -106,9 +106,16 @@ class Chaining:
             self._tick(source, check, clients, section)
 
     def _tick(self, source: Source, check: ChainCheck, clients: dict[str, Client], section: int) -> bool:
-        """Look at what is shown, and at what stands before and after that; whether the block is new.
+        """Read the newest frame, and the injections before and after it, and check them.
 
-        ``clients``: those that have not been told to end.
+        Args:
+            source: The source.
+            check: The check of this chain.
+            clients: The clients that are not to end yet.
+            section: The block's section when the pair started.
+
+        Returns:
+            Whether the block is no longer the one of ``section``.
         """
         self._checker.stopping.wait(PAUSE_S)
         self._awake.look()
@@ -126,12 +133,12 @@ class Chaining:
         return renewed
 
     def _parts(self, source: Source) -> set[str]:
-        """Who stands."""
+        """Return which injections of the pair are on the block."""
         return {one.name.rpartition(" ")[2] for one in standing(self._attachment, source.name, "c")}
 
 
 def _settled(clients: dict[str, Client]) -> bool:
-    """Whether both stand, or one has ended."""
+    """Return whether both injections are laid, or a client has ended."""
     return all(client.stands.is_set() for client in clients.values()) or any(c.over for c in clients.values())
 
 

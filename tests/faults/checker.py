@@ -1,7 +1,8 @@
-"""What the checking processes share: their description, what they tell, how they end.
+"""The common part of the checking processes: their input, their output and their end.
 
-A checker is ``python -m tests.faults.<module> DESCRIPTION``. It prints a JSON line for each violation and, ten times a
-second, what it has counted; it ends, with a last count, when its standard input does.
+A checker is ``python -m tests.faults.<module> DESCRIPTION``. It prints a JSON line for each
+violation and, ten times a second, its counters. When its standard input ends, it prints the
+counters again and ends.
 """
 
 from __future__ import annotations
@@ -21,44 +22,44 @@ from tests.faults.pulse import Pulse
 from tests.faults.truth import Truth
 
 NOTES: Final = ("landed", "guarded", "given", "chained")
-"""The truths of a source beside that of what its PLC's program did; see :class:`Source`."""
+"""Truths of a source in addition to that of its PLC's program; see :class:`Source`."""
 TELL_S: Final = 0.1
 SLACK_NS: Final = 1_000_000_000
-"""How much later than it was sent something may come to a checker's notice on a machine that is not overloaded."""
+"""Maximum delay until a checker sees a value, on a machine that is not overloaded."""
 TRACED: Final = 4096
-"""Characters of a traceback that are told."""
+"""Maximum number of characters of a traceback in a violation."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """What a checker is to look at."""
+    """The input of a checker: the instance, its sources and its files."""
 
     instance: str
     grpc: str
     mqtt: str
     seed: int
     reader: str
-    """The program of examples/reader.c, compiled."""
+    """Path of the compiled examples/reader.c."""
     recordings: str
-    """The recorder's folder."""
+    """Folder of the recordings."""
     rings_ns: Mapping[str, int]
-    """For how long each source's ring holds a frame."""
+    """Time for which each source's ring keeps a frame, in ns."""
     sources: tuple[Mapping[str, Any], ...]
-    """The fields of :class:`Source`, with paths of files for ``truth`` and the :data:`NOTES`."""
+    """Fields of each :class:`Source`, with file paths as ``truth`` and :data:`NOTES`."""
 
     def to_json(self) -> str:
-        """As an argument of a command line."""
+        """Encode the description as a command-line argument."""
         return json.dumps(asdict(self))
 
 
 def open_source(fields: Mapping[str, Any]) -> Source:
-    """A source whose truth is mapped."""
+    """Create a source from its fields, and map its truths."""
     files = {name: Truth(Path(fields[name])) if fields[name] else None for name in ("truth", *NOTES)}
     return Source(**{**fields, **files})
 
 
 class Checker:
-    """A checking process: threads that work, and the one that tells."""
+    """A checking process: threads that check, and the main thread, which prints the counters."""
 
     def __init__(self) -> None:
         self.description = Description(**json.loads(sys.argv[1]))
@@ -70,21 +71,21 @@ class Checker:
         self._pulse = Pulse()
 
     def complain(self, problem: str) -> None:
-        """Tell a violation."""
+        """Report a violation."""
         self._tell({"violation": problem, "at_ns": time.monotonic_ns()})
 
     def counts(self, name: str) -> Counts:
-        """New counts that are told from now on."""
+        """Return new counters, which are reported from now on."""
         counts = self._counts[name] = Counts()
         return counts
 
     def work(self, function: Callable[[], None]) -> None:
-        """Run ``function`` in a thread; it returns when ``stopping`` is set."""
+        """Run ``function`` in a thread. It must return when ``stopping`` is set."""
 
         def run() -> None:
             try:
                 function()
-            except Exception:  # noqa: BLE001 - whatever it is, it is a finding
+            except Exception:  # noqa: BLE001 - any error is a violation
                 self.complain(f"a checker failed: {traceback.format_exc()[-TRACED:]}")
 
         thread = threading.Thread(target=run)
@@ -93,12 +94,12 @@ class Checker:
 
     @property
     def slack_ns(self) -> int:
-        """How late something may come to our notice: more, when the machine has lately kept us waiting."""
+        """Maximum delay in ns until this process sees a value; more on an overloaded machine."""
         return round(SLACK_NS * self.slowness) + 3 * self._pulse.held_up_ns
 
     @property
     def slowness(self) -> float:
-        """How many times longer than on an idle machine a process that has much to do takes for it."""
+        """Factor by which work takes longer than on an idle machine."""
         return self._pulse.slowness
 
     def _beat(self) -> None:
@@ -106,7 +107,7 @@ class Checker:
             self._pulse.beat()
 
     def run(self) -> None:
-        """Tell until standard input ends."""
+        """Report the counters until standard input ends."""
         threading.Thread(target=self._await_end, daemon=True).start()
         threading.Thread(target=self._beat, daemon=True).start()
         while not self.stopping.wait(TELL_S):

@@ -1,6 +1,7 @@
-"""The invariants. They know nothing of how shmio works, only what it promises; each can be fed by hand.
+"""The invariants of frames, values and processes: what shmio promises, not how it works.
 
-A check tells what it finds to ``complain``, a function that takes one line.
+A check gets its data by method calls, so tests can use it without an instance. It reports each
+violation as one line to ``complain``.
 """
 
 from __future__ import annotations
@@ -18,15 +19,15 @@ from tests.faults.truth import Truth, Words, generations, places
 Complain = Callable[[str], None]
 
 HELD_UP_NS = 4_000_000_000
-"""How long a process may be held up between its cycle's due time and its frame: the schedule pauses them so long."""
+"""Maximum delay between a cycle's due time and its frame, because the schedule pauses processes."""
 
 FOREIGN = 60_000
-"""Generations within an image that differ by more are not of one PLC's cycles, where no truth is kept."""
+"""Maximum difference between generations in one image, for a PLC without a truth."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """What a check must know of a source. ``truth``: None for a PLC that keeps none."""
+    """A source as the checks know it. ``truth`` is None if its PLC records none."""
 
     name: str
     size: int
@@ -36,35 +37,38 @@ class Source:
     one_pdu: bool
     truth: Truth | None = None
     landed: Truth | None = None
-    """What was written into the first two of the last words, where there is a truth; they are none of the program's."""
+    """Values written into the words ``command`` and ``remote``, if there is a truth."""
     guarded: Truth | None = None
-    """What came into the word that injections stand before."""
+    """Values written into the word ``guarded``, over whose ``/in`` injections are laid."""
     given: Truth | None = None
-    """What injections were about to give, of the word that shows that and of the one they stand before."""
+    """Values that injections were about to give, of the words ``shown`` and ``guarded``."""
     chained: Truth | None = None
-    """The same of the word over which several stand: multiples of 4 of the inner client, and one more of the outer."""
+    """Values that the chain was about to give, of the word ``chained``.
+
+    The inner client gives multiples of 4, the outer client one more.
+    """
 
     @property
     def oldest_ns(self) -> int:
-        """Greatest age of a good value."""
+        """Maximum age of a good value in ns."""
         return self.stale_ns + self.tolerance_ns
 
 
 @dataclass
 class Counts:
-    """What a check has seen."""
+    """Counters of one reader."""
 
     frames: int = 0
     good: int = 0
     missed: int = 0
     values: int = 0
     since_ns: int = 0
-    """When the PLC got the newest good value seen, or was last heard of."""
+    """CLOCK_MONOTONIC at which the PLC got the newest good value; without a truth, when it was seen."""
 
 
 @dataclass
 class FrameCheck:
-    """Holds one reader's frames of one source to all that is promised of them."""
+    """Checks the frames that one reader gets from one source."""
 
     source: Source
     complain: Complain
@@ -80,12 +84,18 @@ class FrameCheck:
         self._places = places(self._own)
 
     def begin(self, started_ns: int) -> None:
-        """A stream begins: of an instance that was started at ``started_ns``. Values still may not go back."""
+        """Begin a stream of an instance that started at ``started_ns``. Values must not go back."""
         self._last = None
         self._started_ns = started_ns
 
     def frame(self, frame: Frame, missed: int, now_ns: int) -> None:
-        """The next frame of the stream, ``missed`` after the one before, in the reader's hands at ``now_ns``."""
+        """Check the next frame of the stream.
+
+        Args:
+            frame: The frame.
+            missed: Number of frames that the reader missed before it.
+            now_ns: CLOCK_MONOTONIC when the reader had it.
+        """
         self.counts.frames += 1
         self.counts.missed += missed
         if self._last is not None:
@@ -106,12 +116,12 @@ class FrameCheck:
         if frame.number != last.number + 1 + missed:
             self._say(frame, f"comes after frame {last.number} with {missed} missed")
         if frame.incarnation < last.incarnation:
-            self._say(frame, f"incarnation {last.incarnation} was here before")
+            self._say(frame, f"incarnation {last.incarnation} came before")
         again = frame.cycle == last.cycle and frame.quality is last.quality is Quality.GOOD
         if again and self.source.given is not None:
-            again = frame.raw != last.raw  # what is injected is shown at once, over the image that there is
+            again = frame.raw != last.raw  # a change of an injection publishes the same raw image again
         if frame.cycle < last.cycle or again:
-            self._say(frame, f"cycle {last.cycle} was here before, in frame {last.number}")
+            self._say(frame, f"cycle {last.cycle} came before, in frame {last.number}")
         if frame.publish_ns < last.publish_ns:
             self._say(frame, f"published before frame {last.number}, {last.publish_ns}")
 
@@ -121,7 +131,7 @@ class FrameCheck:
         if frame.clock_ns != frame.publish_ns - self._started_ns:
             self._say(frame, f"the clock says {frame.clock_ns}, the instance started at {self._started_ns}")
         late_ns = frame.publish_ns - self._started_ns - frame.cycle * self.source.period_ns
-        # A change of what is injected repeats the last image with its age: after a restart, the predecessor's.
+        # A change of an injection repeats the last image with its age; after a restart, the predecessor's image.
         if frame.quality is Quality.GOOD and (late_ns < 0 or late_ns - 1000 * frame.delay_us > HELD_UP_NS):
             age_ms = frame.delay_us / 1e3
             self._say(frame, f"published {late_ns / 1e6:.1f} ms after its cycle was due, its image {age_ms:.1f} ms old")
@@ -137,7 +147,7 @@ class FrameCheck:
         if self.source.given is not None:
             self._injected(frame, self.source.given)
         if frame.quality is not Quality.GOOD and not any(frame.raw):
-            return  # never had one
+            return  # there was no image yet
         if frame.quality is not Quality.GOOD and repeats and self._last is not None and frame.raw != self._last.raw:
             self._say(frame, "is bad, but its bytes are not those of the frame before")
         words = generations(frame.image[: self._own], self._places)
@@ -147,11 +157,11 @@ class FrameCheck:
             self._say(frame, f"mixes generations {found[:8]}")
         if self.source.truth is None:
             if found[-1] - found[0] > FOREIGN:
-                self._say(frame, f"holds bytes that the PLC never had: {found[:8]}")
+                self._say(frame, f"contains bytes that the PLC never had: {found[:8]}")
             return
         for generation in found:
             if self.source.truth.since_ns(generation) is None:
-                self._say(frame, f"holds {generation:#x}, which the PLC never had or long ago")
+                self._say(frame, f"contains {generation:#x}, which the PLC never had, or long ago")
                 return
         if self._words is not None and (back := np.flatnonzero(words < self._words)).size:
             place = int(back[0])
@@ -159,15 +169,18 @@ class FrameCheck:
         self._words = words
         if frame.quality is Quality.GOOD and (since_ns := self.source.truth.since_ns(found[-1])) is not None:
             if since_ns > frame.publish_ns:
-                self._say(frame, f"holds generation {found[-1]} of later, {since_ns}")
+                self._say(frame, f"contains generation {found[-1]}, which the PLC got later, {since_ns}")
             self.counts.since_ns = max(self.counts.since_ns, since_ns)
 
     def _injected(self, frame: Frame, given: Truth) -> None:
-        """Of words that are injected over the PLC has 0, and consumers see that or what had been given by then."""
+        """Check words under injections: the PLC has 0 there.
+
+        Consumers see 0, or a value that an injection had given by then.
+        """
         places = (SHOWN_AT, DECLARED_AT, CHAINED_AT)
         for raw in (word_at(frame.raw, place) for place in places):
             if raw:
-                self._say(frame, f"tells {raw}, which was injected, as what the PLC has")
+                self._say(frame, f"has {raw}, which was injected, as the PLC's value")
         if _without(frame.image, places) != _without(frame.raw, places):
             self._say(frame, "an injection over one word has changed others")
         if any(frame.raw):
@@ -183,7 +196,7 @@ class FrameCheck:
         self._shown = shown
 
     def _declared(self, frame: Frame) -> None:
-        """What the configuration declares stands in every frame, and over what clients give."""
+        """Check declared injections: they apply in every frame, above those of clients."""
         declared, chained = word_at(frame.image, DECLARED_AT), word_at(frame.image, CHAINED_AT) - CHAINED
         if declared != DECLARED:
             self._say(frame, f"shows {declared}, where declared injections make {DECLARED}")
@@ -203,7 +216,7 @@ class FrameCheck:
         return all(since_ns is not None and since_ns <= when_ns for since_ns in times_ns)
 
     def age(self, frame: Frame, now_ns: int) -> None:
-        """What is good now was in the PLC not long ago."""
+        """Check that a value that is good now was in the PLC recently."""
         if frame.assess(self.source.stale_ns, now_ns)[0] is not Quality.GOOD or len(frame.image) != self.source.size:
             return
         self.counts.good += 1
@@ -223,7 +236,7 @@ class FrameCheck:
 
 
 def word_at(image: bytes, place: int) -> int:
-    """One of the words that the program leaves to others."""
+    """Return one of the last words of a block, which the PLC's program does not write."""
     at = len(image) - OTHERS + place
     return int.from_bytes(image[at : at + WORD], "big")
 
@@ -238,7 +251,7 @@ def _without(image: bytes, places: Iterable[int]) -> bytes:
 
 @dataclass
 class ValueCheck:
-    """Holds one stream of single values (the block's first word) to the truth. For readers of other kinds."""
+    """Checks a stream of single values (the block's first word) by the truth."""
 
     source: Source
     complain: Complain
@@ -246,7 +259,7 @@ class ValueCheck:
     _last: int = 0
 
     def value(self, generation: int, now_ns: int, *, slack_ns: int = 0) -> None:
-        """A good value, in the reader's hands at ``now_ns``, at most ``slack_ns`` after it was sent."""
+        """Check a good value, read at ``now_ns`` and at most ``slack_ns`` after it was sent."""
         self.counts.values += 1
         if self.source.truth is None:
             self.counts.since_ns = now_ns
@@ -254,7 +267,7 @@ class ValueCheck:
         since_ns = self.source.truth.since_ns(generation)
         age_ns = self.source.truth.age_ns(generation, now_ns)
         if since_ns is None or age_ns is None:
-            self.complain(f"{self.source.name}: value {generation:#x} is none the PLC had")
+            self.complain(f"{self.source.name}: value {generation:#x} is one that the PLC never had")
             return
         if generation < self._last:
             self.complain(f"{self.source.name}: value {generation} comes after {self._last}")
@@ -266,7 +279,7 @@ class ValueCheck:
 
 @dataclass(frozen=True)
 class Process:
-    """A process as the instance's status shows it."""
+    """A process in the instance's status."""
 
     pid: int | None
     restarts: int
@@ -275,13 +288,17 @@ class Process:
 Processes = Mapping[str, Process]
 
 UNTOUCHED_NS = 2_000_000_000
-"""Who does not need what is broken has values that are no older than this on a machine that is not overloaded."""
+"""Maximum age of values of unaffected readers, on a machine that is not overloaded."""
 BYSTANDERS = ("grpc", "stream", "newest")
-"""How the counts begin of those who follow a source without a pause, and do not need the broker."""
+"""Name prefixes of the readers that follow a source all the time and do not need the broker."""
 
 
 def check_bystanders(counts: Mapping[str, Counts], now_ns: int, allowed_ns: float, complain: Complain) -> bool:
-    """While the broker alone is broken the others go on; whether they do."""
+    """Check readers that do not need the broker while only the broker is broken.
+
+    Returns:
+        Whether all of them still get values.
+    """
     for name, each in counts.items():
         age_ns = now_ns - each.since_ns
         if name.startswith(BYSTANDERS) and each.since_ns and age_ns > allowed_ns:
@@ -293,9 +310,15 @@ def check_bystanders(counts: Mapping[str, Counts], now_ns: int, allowed_ns: floa
 def check_restarts(
     before: Processes, after: Processes, hit: set[str], renewed: set[str], *, replaced: bool, complain: Complain
 ) -> None:
-    """Who was hit or ``renewed`` has a successor; nobody else was touched.
+    """Check that the targets of faults were replaced, and no other process.
 
-    ``replaced``: all of the instance was, since it has another segment: then no process is of before.
+    Args:
+        before: The processes before the faults.
+        after: The processes now.
+        hit: Names of processes that were restarted.
+        renewed: Names of processes that were replaced and whose restarts count from 0.
+        replaced: Whether the instance has another segment, so that every process must be new.
+        complain: Takes each violation.
     """
     if set(before) != set(after):
         complain(f"processes were {sorted(before)}, now they are {sorted(after)}")

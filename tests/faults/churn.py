@@ -1,4 +1,4 @@
-"""Fifty readers in C that come and go: each a process of its own, some killed in the middle of their work."""
+"""Fifty readers in C, each in a separate process, that start and end all the time."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from tests.faults.checks import Counts, Source, ValueCheck
 
 READERS = 50
 ON_FASTEST = 4
-"""So many of them follow the fastest source, since each of its frames is a line to be looked at here."""
+"""Number of readers of the fastest source. This process reads a line for each of its frames."""
 TURN_S = 0.1
 LINE = re.compile(rb"(\d+) cycle (\d+) missed (\d+) (good|uncertain|bad) (\d+) (.*)")
 GONE = re.compile(r"no instance|.* is starting|.* has stopped|source \S+ was changed")
-"""What a reader may say when its instance is not there or stops."""
+"""Messages of a reader whose instance is not running or stops."""
 
 
 class Reader:
-    """One of them, from its start to its end."""
+    """One reader, from its start to its end."""
 
     def __init__(self, checker: Checker, source: Source, counts: Counts, chance: random.Random) -> None:
         self._checker = checker
@@ -42,9 +42,9 @@ class Reader:
         )
 
     def take(self, data: bytes) -> None:
-        """Look at what it has printed."""
+        """Check what the reader has printed."""
         *lines, self._tail = (self._tail + data).split(b"\n")
-        printed_ns, self._looked_ns = self._looked_ns, time.monotonic_ns()  # after the last look, for it took all
+        printed_ns, self._looked_ns = self._looked_ns, time.monotonic_ns()  # newer than the last call, which took all
         for line in lines:
             match = LINE.fullmatch(line)
             if match is None:
@@ -64,7 +64,7 @@ class Reader:
                 self._check.value(int(match[5]), printed_ns, slack_ns=self._checker.slack_ns)
 
     def finish(self) -> None:
-        """It has ended, or does now: was that right?"""
+        """Wait for the reader's end, and check its exit status and messages."""
         assert self.popen.stdout is not None
         assert self.popen.stderr is not None
         words = self.popen.stderr.read(4096).decode("utf-8", "replace")
@@ -77,7 +77,7 @@ class Reader:
 
 
 def churn(checker: Checker) -> None:
-    """Keep them coming and going."""
+    """Start new readers, check their output, and kill some, until the end."""
     chance = random.Random(checker.description.seed)
     fastest = min(checker.sources, key=lambda source: source.period_ns)
     counts = {source.name: checker.counts(f"readers {source.name}") for source in checker.sources}

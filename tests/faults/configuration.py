@@ -1,4 +1,4 @@
-"""The configuration of the instance under test: written for its start, and written anew for each reload."""
+"""The configuration of the instance under test, written for its start and again for each reload."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SIZES: Final = {"fast": 408, "block": 2192, "demo": 408}
 PERIODS_MS: Final = {"fast": 5, "block": 20, "demo": 20}
 STALE_MS: Final = {"fast": 300, "block": 500, "demo": 500}
 NAMES: Final = ("rest", "other")
-"""What the words after the first are called; another name is another layout, of the same size."""
+"""Names of the array after the first word. Another name is another layout of the same size."""
 INJECTED: Final = ("fast", "block")
-"""The sources that the configuration declares injections for."""
+"""Sources with declared injections."""
 EXTRA: Final = "extra"
-"""A source that comes and goes."""
+"""Name of a source that reloads add and remove."""
 EMULATED: Final = "plc.db"
-"""The emulator's own layout: it does not change when the source ``demo`` does."""
+"""Layout of the emulator, which does not change with that of the source ``demo``."""
 
 _DB = """DATA_BLOCK DB{number}
 {{ S7_Optimized_Access := 'FALSE' }}
@@ -51,11 +51,11 @@ writable = ["command", "remote", "guarded"]
 armed = true
 """
 DECLARED: Final = (7 + 5) * 3
-"""What two declared injections, one over the other, make of the 0 that the PLC has: another order makes 22 of it."""
+"""Result of three declared injections on the PLC's 0. Another order gives another value."""
 CHAINED: Final = 1 << 32
-"""What the declared injection adds that is outermost of a chain."""
+"""Offset that the chain's declared injection, the outermost, adds."""
 PRIORITY: Final = 10
-"""Of that one: higher than any client's."""
+"""Priority of that injection, higher than any client's."""
 _INJECTIONS = """
 [[injection]]
 name = "{name}_times"
@@ -98,12 +98,12 @@ backlog_mb = 1
 
 
 class Configuration:
-    """supervisor.toml and the layouts. ``ports``: of the devices as the sources see them, and of others by name."""
+    """supervisor.toml and layouts. ``ports``: addresses of devices, by source, and of listeners."""
 
     def __init__(self, folder: Path, instance: str, ports: Mapping[str, Address]) -> None:
         self.file = folder / "supervisor.toml"
         self.changes = 0
-        """Of blocks, since :meth:`__init__`."""
+        """Number of blocks changed so far."""
         self._folder = folder
         self._instance = instance
         self._ports = ports
@@ -116,18 +116,18 @@ class Configuration:
 
     @property
     def names(self) -> dict[str, str]:
-        """By source, what the words after its first are called at present."""
+        """Present name of the array after the first word, by source."""
         texts = {source: (self._folder / f"{source}.db").read_text() for source in SIZES}
         return {source: next(name for name in NAMES if f" {name} :" in text) for source, text in texts.items()}
 
     def relayout(self, source: str) -> None:
-        """Give a source's registers other names."""
+        """Change the layout of a source by another name of its array."""
         now = (self._folder / f"{source}.db").read_text()
         self._write_layout(source, next(name for name in NAMES if name not in now))
         self.changes += 1
 
     def toggle_extra(self) -> None:
-        """Add a further source, on the same PLC as ``demo``, or remove it."""
+        """Add the source ``extra``, on the same PLC as ``demo``, or remove it."""
         self._extra = not self._extra
         self.changes += self._extra
         self._write()

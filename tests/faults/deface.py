@@ -1,4 +1,4 @@
-"""The next slot of a ring, by the page on the segment format alone: whether it is torn, and tearing it."""
+"""Finds and tears the next slot of a ring. Written from the page on the segment format alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _FRAMES: Final = 2
 
 
 class Slot(NamedTuple):
-    """Where the slot after the newest frame is, and the number of the frame to come."""
+    """The slot after the newest frame. ``number``: of the next frame."""
 
     number: int
     offset: int
@@ -20,7 +20,7 @@ class Slot(NamedTuple):
 
 
 def next_slot(memory: memoryview, source: str) -> Slot:
-    """Find it; KeyError when there is no ring of this source."""
+    """Find the next slot. KeyError: the source has no ring."""
     (count,) = struct.unpack_from("<I", memory, 52)
     (table,) = struct.unpack_from("<Q", memory, 56)
     for entry in range(table, table + _ENTRY * count, _ENTRY):
@@ -34,14 +34,14 @@ def next_slot(memory: memoryview, source: str) -> Slot:
 
 
 def torn(memory: memoryview, source: str) -> bool:
-    """Whether the slot after the newest frame was begun and not finished."""
+    """Return whether the next slot is half-written."""
     slot = next_slot(memory, source)
     sequence: int = struct.unpack_from("<Q", memory, slot.offset)[0]
     return sequence == 2 * slot.number + 1
 
 
 def deface(memory: memoryview, source: str, seed: int) -> None:
-    """Leave the next slot as a writer does that dies in the middle of it: begun, half of it rubbish."""
+    """Leave the next slot as a writer that dies in it: begun, and half filled with random bytes."""
     slot = next_slot(memory, source)
     struct.pack_into("<Q", memory, slot.offset, 2 * slot.number + 1)
     rubbish = random.Random(seed).randbytes(slot.size // 2)

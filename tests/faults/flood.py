@@ -1,8 +1,8 @@
-"""A whole cell under a flood of calls that nobody serves: ``python -m tests.faults.flood --for 60``.
+"""Floods a whole cell with calls to unknown methods: ``python -m tests.faults.flood --for 60``.
 
-Two threads at each of a port that asks for a token, a port with TLS and a UNIX socket send calls, of names that are not
-UTF-8 and of names that nobody serves, as fast as they are answered. Beside them a client that stays connected and a
-client that connects anew for each call read; an injection is kept all the time.
+Two threads each at a plain-text port, a TLS port and a UNIX socket send calls as fast as they are
+answered. Their method names are not UTF-8, or unknown. Meanwhile two clients read: one stays
+connected, the other connects anew for each call. An injection is kept all the time.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ ROOT = Path(__file__).parents[2]
 TOKEN: Final = "flood-0123456789abcdefghij"
 REGISTER: Final = "cell/Outputs/100"  # of no meaning to the controller's program
 CALL_S: Final = 60.0
-"""When a call counts as failed, on however busy a host."""
+"""Time-out of a call, long enough for a busy host."""
 SETTLE_S: Final = 20.0
-"""A long flood's memory is looked at again after this time."""
+"""Maximum time between the flood and the last measurement of memory."""
 MOST_LOG_BYTES: Final = 100_000
 MOST_RSS_MB: Final = 500.0
 MORE: Final = """
@@ -60,7 +60,7 @@ token_file = "token"
 
 @dataclass
 class Seen:
-    """What happened. ``open_calls``, ``fresh_calls``: tried, and served."""
+    """Results of a flood. ``open_calls``, ``fresh_calls``: calls tried, and calls answered."""
 
     flooded: int = 0
     lost: int = 0
@@ -68,27 +68,27 @@ class Seen:
     fresh_calls: tuple[int, int] = (0, 0)
     log_bytes: int = 0
     rss_mb: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Before, at most, and some seconds after."""
+    """Memory of the endpoint before, at its maximum, and after the flood."""
     restarted: bool = False
     injected: bool = False
 
     @property
     def faults(self) -> list[str]:
-        """Promises that were broken."""
+        """Broken promises."""
         promises = {
             "the endpoint was restarted": not self.restarted,
             "the kept injection is gone": self.injected,
             "calls on an open channel failed": self.open_calls[0] == self.open_calls[1] > 0,
             "calls on fresh channels failed": self.fresh_calls[1] >= 0.9 * self.fresh_calls[0] > 0,
-            "the log is not rationed": self.log_bytes < MOST_LOG_BYTES,
-            "memory is not bounded": self.rss_mb[1] < MOST_RSS_MB,
-            "nothing was flooded": self.flooded > 0,
+            "the log is not limited": self.log_bytes < MOST_LOG_BYTES,
+            "memory is not limited": self.rss_mb[1] < MOST_RSS_MB,
+            "no call of the flood was answered": self.flooded > 0,
         }
         return [fault for fault, kept in promises.items() if not kept]
 
 
 def prepare(folder: Path, instance: str, plc: Address, plain: Address, secure: Address) -> tuple[Cell, ssl.SSLContext]:
-    """Write the cell's folder; what a client needs to trust it."""
+    """Write the cell's folder; return the cell, and the TLS context of its clients."""
     shutil.copy(ROOT / "db201.db", folder)
     (folder / "token").write_text(TOKEN + "\n")
     (folder / "token").chmod(0o600)
@@ -110,7 +110,7 @@ def prepare(folder: Path, instance: str, plc: Address, plain: Address, secure: A
 def run(
     cell: Cell, plain: Address, secure: Address, context: ssl.SSLContext, for_s: float, window: int = WINDOW
 ) -> Seen:
-    """Flood a running cell; what happened."""
+    """Flood a running cell, and return the results."""
     seen, pid = Seen(), cell.processes()["grpc"]["pid"]
     log = cell.folder / "logs"
     logged = _size(log)
@@ -143,7 +143,7 @@ def run(
 
 
 def _once(address: Address) -> None:
-    """A call over a connection of its own."""
+    """Make a call on a new connection."""
     with grpc.insecure_channel(str(address), [("grpc.use_local_subchannel_pool", 1)]) as channel:
         stub: Any = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
         stub.GetTopic(TopicDescriptor(path=REGISTER), timeout=CALL_S, metadata=[("authorization", f"Bearer {TOKEN}")])
@@ -167,10 +167,10 @@ def _rss_mb(pid: int) -> float:
 
 
 def main() -> int:
-    """Flood a cell of its own; 1 if a promise was broken."""
-    parser = argparse.ArgumentParser(description="flood a cell with calls that nobody serves")
+    """Start a cell and flood it; return 1 if a promise was broken."""
+    parser = argparse.ArgumentParser(description="flood a cell with calls to unknown methods")
     parser.add_argument("--for", dest="for_s", type=float, default=60.0, metavar="SECONDS")
-    parser.add_argument("--window", type=int, default=WINDOW, metavar="CALLS", help="most unanswered on a connection")
+    parser.add_argument("--window", type=int, default=WINDOW, metavar="CALLS", help="most open calls of a connection")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         plc, plain, secure = (stack.enter_context(reserved_port()) for _ in range(3))

@@ -1,4 +1,4 @@
-"""Carries faults out. Each returns when it is over: what was broken is whole again, or dead and to be replaced."""
+"""Carries out faults. Each call returns when the fault is over: removed, or its target killed."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from tests.faults.rig import Device, Instance, Rig
 from tests.faults.schedule import SUPERVISOR, Fault
 
 GONE_S: Final = 20.0
-"""A frozen process is found out and replaced within this time."""
+"""Maximum time until a frozen process is detected and replaced."""
 DAY_NS: Final = 86_400 * 10**9
 SHM: Final = Path("/dev/shm")
 OWN_SHM: Final = "SHMIO_FAULTS_OWN_SHM"
-"""In the environment of a suite whose /dev/shm is its own: that of the host is not filled."""
+"""Environment variable that is set if /dev/shm belongs to the suite, so that it may be filled."""
 GARBAGE: Final = (
     b"\0" * 64,
     b"\xff" * 64,
     b"\x03",
     b"HTTP/1.1 400 Bad Request\r\n\r\n",
-    bytes.fromhex("0300001602f080320300000001000200000000"),  # a header that promises more than comes
+    bytes.fromhex("0300001602f080320300000001000200000000"),  # a header that announces more bytes than follow
 )
 
 
@@ -39,7 +39,7 @@ Kinds = dict[str, Callable[[Fault], None]]
 
 
 class ProcessInflictor:
-    """Knows how to break the processes of an instance."""
+    """Carries out the faults of an instance's processes."""
 
     def __init__(self, instance: Instance) -> None:
         self._of = instance
@@ -53,7 +53,7 @@ class ProcessInflictor:
         }
 
     def inflict(self, fault: Fault) -> None:
-        """Do it, at once."""
+        """Carry out a fault at once."""
         self.kinds[fault.kind](fault)
 
     def _pid(self, name: str) -> int:
@@ -81,7 +81,7 @@ class ProcessInflictor:
 
 
 class Inflictor(ProcessInflictor):
-    """Knows the rig, and how to break each part of it."""
+    """Carries out all faults on the rig."""
 
     def __init__(self, rig: Rig, mid_write: MidWrite) -> None:
         super().__init__(rig)
@@ -99,14 +99,14 @@ class Inflictor(ProcessInflictor):
         }
 
     def inflict(self, fault: Fault) -> None:
-        """Do it, at once."""
+        """Carry out a fault at once."""
         if fault.kind in self.kinds:
             super().inflict(fault)
         else:
             self._device(fault, self._rig.devices[fault.target.rpartition(" ")[2]])
 
     def _torn(self, fault: Fault) -> None:
-        """The writer dies in the middle of a slot, for certain."""
+        """Kill a source's process so that it leaves a half-written slot."""
         pid = self._pid(fault.target)
         kill(pid, signal.SIGSTOP)
         until(lambda: _stopped(pid), f"{fault.target} stopped")
@@ -149,20 +149,20 @@ class Inflictor(ProcessInflictor):
 
 
 def pause(pid: int, for_s: float) -> None:
-    """Stop a process for a while."""
+    """Stop a process for this time (SIGSTOP, SIGCONT)."""
     kill(pid, signal.SIGSTOP)
     time.sleep(for_s)
     kill(pid, signal.SIGCONT)
 
 
 def broker(pid: int) -> int:
-    """The broker itself: mosquitto, a child of the instance's process ``pid``; or that one, where it is in Python."""
+    """Return the pid of the broker itself: mosquitto, a child of process ``pid``, else ``pid``."""
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     return int(children[0]) if children else pid
 
 
 def fill(folder: Path, for_s: float) -> None:
-    """Leave no room in a file system for a while, if it is ours."""
+    """Fill a file system for this time, if it belongs to the suite."""
     if OWN_SHM not in os.environ:
         return
     with tempfile.TemporaryFile(dir=folder) as file:
@@ -178,6 +178,6 @@ def fill(folder: Path, for_s: float) -> None:
 
 
 def _stopped(pid: int) -> bool:
-    """Whether a process is in state T, proc_pid_stat(5)."""
+    """Return whether a process is stopped: state T in proc_pid_stat(5)."""
     with open(f"/proc/{pid}/stat", encoding="utf-8") as stat:  # noqa: PTH123
         return stat.read().rpartition(")")[2].split()[0] == "T"

@@ -1,4 +1,4 @@
-"""The invariants of injections: what goes past one toward the PLC, and how long one stands without its client."""
+"""The invariants of injections: nothing passes one, and it ends with its client."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from tests.faults.checks import Complain, Counts, Source
 from tests.faults.write_checks import SURELY_NOT
 
 LIFTED_NS: Final = 1_000_000_000
-"""So long an injection may stand that nobody keeps, when its client is gone and who has to lift it is awake."""
+"""Maximum time until an injection is lifted after its client's end, unless it is to be kept."""
 
 
 @dataclass
 class GuardCheck:
-    """Holds the word that injections stand before to what was written and what they gave.
+    """Checks the word ``guarded``: written values, their replacements, and what the PLC got.
 
-    A value that is written is even and is written once; an injection gives the next higher one in its place.
+    A written value is even, and is written once. An injection replaces it by the next higher value.
     """
 
     source: Source
@@ -27,11 +27,19 @@ class GuardCheck:
     _known: dict[int, OutcomeKind] = field(default_factory=dict)
 
     def written(self, value: int, kind: OutcomeKind, text: str, *, stood: bool, free: bool) -> None:
-        """What the writer of ``value`` was told. ``stood``: one injection stood all the while; ``free``: none could."""
+        """Check the outcome that a writer got.
+
+        Args:
+            value: The value.
+            kind: The outcome.
+            text: Text of the outcome.
+            stood: Whether an injection covered the word all the time.
+            free: Whether no injection can have covered the word.
+        """
         self._known[value] = kind
         self.counts.values += 1
         if kind is OutcomeKind.WRITTEN and stood:
-            self._say(f"{value} was written past the injection that stood before it")
+            self._say(f"{value} was written past the injection that covered the word")
         elif kind is OutcomeKind.TAKEN and free:
             self._say(f"{value} was taken, but there was no injection")
         elif kind not in SURELY_NOT | {OutcomeKind.WRITTEN, OutcomeKind.TAKEN, OutcomeKind.UNKNOWN}:
@@ -39,7 +47,7 @@ class GuardCheck:
         self.counts.good += kind is OutcomeKind.TAKEN
 
     def look(self, value: int) -> None:
-        """See what has come of it, and of what was given in its place; values before it are forgotten."""
+        """Check whether the PLC got a value or its replacement, and forget earlier values."""
         assert self.source.guarded is not None
         assert self.source.given is not None
         kind, landed_ns = self._known[value], self.source.guarded.since_ns(value)
@@ -59,7 +67,7 @@ class GuardCheck:
 
 @dataclass
 class LifeCheck:
-    """Holds one injection, whose client has ended, to how long it is to stand."""
+    """Checks how long an injection remains after its client has ended."""
 
     name: str
     keep: bool
@@ -68,9 +76,14 @@ class LifeCheck:
     _told: bool = False
 
     def look(self, now_ns: int, *, stands: bool, awake_since_ns: int, slack_ns: int, renewed: bool = False) -> None:
-        """It stands, or not. ``awake_since_ns``: since when all who have to lift it run; ``renewed``: the block is new.
+        """Check whether the injection may or must still be there.
 
-        A reload that makes the block anew, and the instance's own end, take what is kept with them.
+        Args:
+            now_ns: CLOCK_MONOTONIC.
+            stands: Whether it is there.
+            awake_since_ns: Since when all processes that must lift it run without a pause.
+            slack_ns: Additional time on a loaded machine.
+            renewed: Whether the block was replaced or the instance ended; both end kept injections.
         """
         if self._told or renewed:
             return
@@ -78,7 +91,7 @@ class LifeCheck:
         if self.keep and not stands:
             self._tell("was to be kept, but is gone")
         elif not self.keep and stands and for_ns > LIFTED_NS + slack_ns:
-            self._tell(f"still stands {for_ns / 1e9:.1f} s after its client's end")
+            self._tell(f"still exists {for_ns / 1e9:.1f} s after its client's end")
 
     def _tell(self, problem: str) -> None:
         self._told = True
@@ -88,16 +101,16 @@ class LifeCheck:
 INNER: Final = "inner"
 OUTER: Final = "outer"
 SHOWN_NS: Final = 200_000_000
-"""A frame that was published so long after what stands has changed shows that."""
+"""Maximum time until frames show a change of the injections."""
 QUIET_NS: Final = 600_000_000
-"""Who has given no heartbeat for this long, three of them, has not run all the time."""
+"""Time without a heartbeat (three are due in it) after which a process counts as paused."""
 
 
 @dataclass
 class ChainCheck:
-    """Holds the word that two clients inject over to who of them stands; see :mod:`~tests.faults.chaining`.
+    """Checks the word ``chained``, over which two clients inject. See :mod:`.chaining`.
 
-    The inner one gives multiples of 4, and the outer one gives 1 more.
+    The inner client gives multiples of 4; the outer client adds 1.
     """
 
     source: Source
@@ -109,13 +122,17 @@ class ChainCheck:
     _missed_ns: dict[str, int] = field(default_factory=dict)
 
     def begin(self) -> None:
-        """Another pair."""
+        """Begin with a new pair of clients."""
         self._missed_ns = {}
 
     def look(self, shown: int, publish_ns: int, now_ns: int, standing: AbstractSet[str] | None) -> bool:
-        """See the newest frame; whether it shows what the outer one gave.
+        """Check the newest frame; return whether it shows a value of the outer client.
 
-        ``standing``: who stood before it was read and afterwards; None: that was not the same.
+        Args:
+            shown: The value of the word.
+            publish_ns: CLOCK_MONOTONIC when the frame was published.
+            now_ns: CLOCK_MONOTONIC.
+            standing: The injections when the frame was read; None: they changed meanwhile.
         """
         if standing is None or standing != self._standing:
             self._standing, self._since_ns, self._relayed = standing, now_ns, False
@@ -130,18 +147,25 @@ class ChainCheck:
             self.counts.good += outer
             return outer
         if settled and standing == {INNER} and outer:
-            self._say(f"shows {shown}, which the outer injection gave, but only the inner one stands")
+            self._say(f"shows {shown}, which the outer injection gave, but only the inner one exists")
         if settled and not standing and shown:
-            self._say(f"shows {shown}, but none stands")
+            self._say(f"shows {shown}, but there is no injection")
         return False
 
     def stay(self, laid: AbstractSet[str], standing: AbstractSet[str], now_ns: int, undisturbed_ns: int) -> None:
-        """Who was laid stands until its client ends; ``undisturbed_ns``: since when nobody who carries it was hit."""
+        """Check that an injection remains until its client ends.
+
+        Args:
+            laid: The injections whose clients are alive.
+            standing: The injections that exist.
+            now_ns: CLOCK_MONOTONIC.
+            undisturbed_ns: Since when no fault hit the processes that keep them.
+        """
         self._missed_ns = {part: at_ns for part, at_ns in self._missed_ns.items() if part in laid - standing}
         for part in laid - standing:
             missed_ns = self._missed_ns.setdefault(part, now_ns)
             if now_ns - missed_ns > 2 * QUIET_NS and undisturbed_ns < missed_ns - QUIET_NS:
-                self._say(f"the {part} injection is gone, but its client is there")
+                self._say(f"the {part} injection is gone, but its client is alive")
                 self._missed_ns[part] = now_ns
 
     def _say(self, problem: str) -> None:

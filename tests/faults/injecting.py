@@ -1,4 +1,4 @@
-"""Clients that inject into each PLC's signals, one after another, and die: what they leave, and what goes past them."""
+"""Runs injecting clients one after the other, and checks their injections during and after that."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from tests.faults.plc import SHOWN_AT
 
 PAUSE_S: Final = 0.05
 BEGIN_S: Final = 20.0
-"""A client that has not laid its injection by then is given up."""
+"""Maximum time for a client to lay its injection."""
 EFFECT_NS: Final = 90 * 10**9
-"""Some injection has an effect within this time, whatever happens."""
+"""Maximum time without any effect of an injection."""
 KEPT_NS: Final = 1_500_000_000
-"""So long one that is kept is watched."""
+"""Time for which a kept injection is observed after its client's end."""
 NUMBERS: Final = 1000
-"""Values that are set aside for one client."""
+"""Number of values that are reserved for one client."""
 REMEMBERED: Final = 100
 
 
 class Client:
-    """One of them, a process of its own."""
+    """An injecting client in a separate process."""
 
     def __init__(self, order: Order) -> None:
         self.order = order
@@ -56,18 +56,18 @@ class Client:
 
     @property
     def over(self) -> bool:
-        """Whether it has ended."""
+        """True if the client has ended."""
         return self._popen.poll() is not None
 
     def end(self, *, kill: bool) -> int:
-        """Kill it, or have it lift what it laid; when it ended."""
+        """Kill the client, or let it lift its injection; return CLOCK_MONOTONIC of its end."""
         assert self._popen.stdin is not None
         if kill:
             self._popen.kill()
         self._popen.stdin.close()
         try:
             self._popen.wait(BEGIN_S)
-        except subprocess.TimeoutExpired:  # it waits for an endpoint that is frozen
+        except subprocess.TimeoutExpired:  # it waits for a frozen endpoint
             self._popen.kill()
             self._popen.wait()
         ended_ns = time.monotonic_ns()
@@ -78,14 +78,14 @@ class Client:
 
 
 class Awake:
-    """Since when processes have run without a pause, by their heartbeats."""
+    """Times since which processes have run without a pause, by their heartbeats."""
 
     def __init__(self, attachment: Attachment) -> None:
         self._attachment = attachment
         self._since_ns: dict[str, tuple[int, int]] = {}
 
     def look(self) -> None:
-        """Take note; several times a second."""
+        """Read all heartbeats. Call it several times a second."""
         now_ns = time.monotonic_ns()
         for slot in self._attachment._segment.processes:
             pid, since_ns = self._since_ns.get(slot.name, (0, now_ns))
@@ -94,13 +94,13 @@ class Awake:
             self._since_ns[slot.name] = slot.report.pid, since_ns
 
     def since_ns(self, *names: str) -> int:
-        """Since when all of these have."""
+        """Return CLOCK_MONOTONIC since which all of these have run without a pause."""
         return max(self._since_ns.get(name, (0, time.monotonic_ns()))[1] for name in names)
 
 
 @dataclass
 class Target:
-    """A source, and what is known of writes to it."""
+    """A source, the check of its writes, and the last values written."""
 
     source: Source
     guard: GuardCheck
@@ -108,7 +108,7 @@ class Target:
 
 
 class Injecting:
-    """Has one client after another inject."""
+    """Runs one injecting client after the other, and checks the effects."""
 
     def __init__(self, checker: Checker) -> None:
         self._checker = checker
@@ -126,12 +126,12 @@ class Injecting:
         self._turns = cycle(product(("out", "in"), targets))
 
     def work(self, attachment: Attachment) -> None:
-        """Go on as long as this instance is there."""
+        """Run clients until this instance stops."""
         self._attachment, self._awake = attachment, Awake(attachment)
         while self._goes_on:
             try:
                 self._turn()
-            except (CommandError, PathError, QualityError):  # the source is just being restarted, or made anew
+            except (CommandError, PathError, QualityError):  # the source is being restarted or replaced
                 self._checker.stopping.wait(PAUSE_S)
             if time.monotonic_ns() - self._effect_ns > EFFECT_NS + self._checker.slack_ns:
                 self._effect_ns = time.monotonic_ns()
@@ -142,7 +142,7 @@ class Injecting:
         return self._attachment.current and not self._checker.stopping.is_set()
 
     def _turn(self) -> None:
-        """One client, from its start until nothing of it is left."""
+        """Run one client, from its start until its injection is lifted."""
         chance = self._chance
         direction, target = next(self._turns)
         self._lift_rest(target)
@@ -170,7 +170,7 @@ class Injecting:
             self._after(target, order, ended_ns, section)
 
     def _after(self, target: Target, order: Order, ended_ns: int, section: int) -> None:
-        """See it go, or stay and be lifted; then consumers see the PLC again."""
+        """Check that the injection ends or is kept, lift it, and check that readers see the PLC."""
         life = LifeCheck(
             f"{order.name} of {order.word}/{order.direction}", order.keep, ended_ns, self._checker.complain
         )
@@ -199,7 +199,7 @@ class Injecting:
             self._tick(target)
 
     def _lift_rest(self, target: Target) -> None:
-        """Nothing stands afterwards; CommandError."""
+        """Lift all remaining injections of these clients. CommandError: it is not possible."""
         for one in self._standing(target.source.name):
             self._attachment.lift(target.source.name, one.number)
 
@@ -207,7 +207,7 @@ class Injecting:
         return standing(self._attachment, source, "n")
 
     def _tick(self, target: Target, order: Order | None = None) -> None:
-        """Write before the injection, and look at what is shown, as its neighbours do."""
+        """Write a value under the injection, and read the injected word in the newest frame."""
         self._checker.stopping.wait(PAUSE_S)
         self._awake.look()
         self._write(target, free=order is None)
@@ -236,12 +236,15 @@ class Injecting:
 
 
 def standing(attachment: Attachment, source: str, initial: str) -> list[Injection[Mapping[str, Any]]]:
-    """The injections over a source whose names begin so. SimlogAPI v1 names them by the path of their shadow."""
+    """Return the injections over a source whose names begin with ``initial``.
+
+    In SimlogAPI v1 the name is the last part of the shadow's path.
+    """
     return [one for one in attachment.injections(source) if one.name.rpartition("/")[2].startswith(initial)]
 
 
 def _shown(image: bytes) -> int:
-    """What the word that is injected over shows."""
+    """Return the value of the word ``shown``."""
     return word_at(image, SHOWN_AT)
 
 

@@ -1,7 +1,8 @@
-"""One client that injects, to be killed: ``python -m tests.faults.injector ORDER``; ``injecting`` starts it.
+"""A client that injects until it is killed: ``python -m tests.faults.injector ORDER``.
 
-It lays an injection over one word, prints a line when it stands, and gives values until its standard input ends; then
-it lifts it. It ends by itself when it is told that its injection is gone, or cannot reach the instance any more.
+``injecting`` and ``chaining`` start it. It lays an injection over one word, prints a line when that
+is done, and gives values until its standard input ends. Then it lifts the injection. It also ends
+when its injection is lifted, or when it cannot reach the instance any more.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from tests.faults.truth import Truth
 PAUSE_S = 0.05
 CALL_S = 20.0
 WAYS = ("local", "v1", "shmio")
-"""Attached, by SimlogAPI v1, which keeps nothing, and by shmio.v1."""
+"""How a client injects: attached, by SimlogAPI v1 (which keeps no injection), or by shmio.v1."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """What the client is to do.
+    """The order to a client.
 
-    ``first``: the first of the values to give over ``/out``, each ``step`` above the last. ``relay``: instead it gives
-    one more than what comes from further in.
+    Over ``/out`` it gives values from ``first`` on, each ``step`` above the last. With ``relay`` it
+    gives instead the value that it receives from injections further in, plus 1.
     """
 
     instance: str
@@ -42,25 +43,25 @@ class Order:
     name: str
     first: int
     given: str
-    """The file of truth for what it is about to give."""
+    """Path of the truth file for the values that it is about to give."""
     register: str
-    """The word that it injects over."""
+    """Name of the word under the injection."""
     step: int = 1
     priority: int = 0
     relay: bool = False
 
     @property
     def word(self) -> str:
-        """Its path."""
+        """Path of the word."""
         return f"{self.source}/{self.register}"
 
     def to_json(self) -> str:
-        """As an argument of a command line."""
+        """Encode the order as a command-line argument."""
         return json.dumps(asdict(self))
 
 
 class Client:
-    """What all ways share: the values, noted before they are given."""
+    """The common part of all ways: values, which are recorded before they are given."""
 
     def __init__(self, order: Order) -> None:
         self.order = order
@@ -69,7 +70,7 @@ class Client:
         self.when_told(self.stopping.set, sys.stdin.read)
 
     def when_told(self, act: Callable[[], object], told: Callable[[], object] | None = None) -> None:
-        """Do something as soon as it is told to end."""
+        """Call ``act`` in a thread when the client is to end, or when ``told`` returns."""
 
         def wait() -> None:
             (told or self.stopping.wait)()
@@ -78,25 +79,28 @@ class Client:
         threading.Thread(target=wait, daemon=True).start()
 
     def stands(self) -> None:
-        """Tell that the injection stands."""
+        """Print that the injection is laid."""
         print("stands", flush=True)
 
     def numbers(self) -> Iterator[int]:
-        """Values to give, with time between, until told to stop."""
+        """Yield values to give, at intervals, until the client is to end."""
         number = self.order.first
         while not self.stopping.wait(PAUSE_S):
             yield self.note(number)
             number += self.order.step
 
     def note(self, number: int) -> int:
-        """Put down that this value may be seen from now on; the same original may come to a client more than once."""
+        """Record that readers may see this value from now on, and return it.
+
+        Only the first time is recorded: a client may receive the same original more than once.
+        """
         if self._given.since_ns(number) is None:
             self._given.land(number, time.monotonic_ns())
         return number
 
 
 def local(client: Client) -> None:
-    """A program that is attached. Over ``/in`` each value goes on as the next higher one."""
+    """Inject as an attached program. Over ``/in`` it replaces each value by the next higher one."""
     order = client.order
     with (
         shmio.attach(order.instance, writable=True) as cell,
@@ -118,12 +122,12 @@ def local(client: Client) -> None:
 
 
 def gone(outcomes: list[Outcome]) -> bool:
-    """Whether the injection was lifted under its client."""
+    """Return whether the outcomes show that the injection was lifted."""
     return any(outcome.kind is OutcomeKind.REJECTED and "no injection" in outcome.text for outcome in outcomes)
 
 
 def v1(client: Client) -> None:
-    """A client of SimlogAPI v1: a stream of the originals, and values that are published to the shadow."""
+    """Inject by SimlogAPI v1: read the stream of originals, and publish values to the shadow."""
     import grpc
 
     from shmio.wire.simlog_v1_pb2 import InjectRequest, PubRequest, ROSMessage, TopicDescriptor
@@ -152,13 +156,13 @@ def v1(client: Client) -> None:
             for original in originals:
                 publish(int(original.value) + 1)
         except grpc.RpcError:
-            return  # its server has gone, or it was told to end
+            return  # the server has gone, or the client is to end
         finally:
             originals.cancel()
 
 
 def own(client: Client) -> None:
-    """A client of shmio.v1."""
+    """Inject by shmio.v1."""
     from shmio.client import Client as Remote
     from shmio.client import Target
 
@@ -178,7 +182,7 @@ def own(client: Client) -> None:
             return
         client.when_told(shadow.close)
         for update in shadow:
-            if value := int(update[order.word]):  # 0: nobody gives anything
+            if value := int(update[order.word]):  # 0: no injection gives a value
                 shadow.send({order.word: client.note(value + 1)})
 
 

@@ -1,4 +1,4 @@
-"""Local readers of all sources: one that follows each frame, one slower than its ring, one that looks at the newest."""
+"""Local readers: of every frame and of the newest frame, and one slower than its ring."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ PAUSE_S = 0.05
 LOOK_S = 0.007
 TURN_S = 0.2
 FRAMES, SLEEP_S = 20, 3.0
-"""The slow reader sleeps so long after so many frames: longer than its ring."""
+"""The slow reader sleeps after this many frames, longer than the ring keeps a frame."""
 
 
 def attached(checker: Checker, work: Callable[[Attachment], None], *, writable: bool = False) -> None:
-    """Work on the instance as long as it is there, and on the next one when there is one."""
+    """Attach and call ``work``, again after each restart of the instance."""
     while not checker.stopping.is_set():
         try:
             with shmio.attach(checker.description.instance, writable=writable) as attachment:
                 work(attachment)
-        except (NotRunningError, SegmentError):  # not there, half-made, stopped: try again
+        except (NotRunningError, SegmentError):  # not running, incomplete or stopped: try again
             checker.stopping.wait(PAUSE_S)
 
 
 def started_ns(attachment: Attachment) -> int:
-    """CLOCK_MONOTONIC of the instance's start."""
+    """Return CLOCK_MONOTONIC of the instance's start."""
     return attachment._segment.header.started_ns
 
 
 def follow(checker: Checker, source: Source, *, slow: bool) -> None:
-    """Every frame, once; or, slow, what is left of them."""
+    """Read every frame once; with ``slow``, those that are left in the ring."""
     check = FrameCheck(source, checker.complain, checker.counts(f"{'slow' if slow else 'stream'} {source.name}"))
 
     def work(attachment: Attachment) -> None:
@@ -69,7 +69,7 @@ def follow(checker: Checker, source: Source, *, slow: bool) -> None:
 
 
 def look(checker: Checker, source: Source) -> None:
-    """The newest frame and value, again and again, also while nothing new comes."""
+    """Read the newest frame and value repeatedly, even while no new frame arrives."""
     check = FrameCheck(source, checker.complain, checker.counts(f"newest {source.name}"))
 
     def work(attachment: Attachment) -> None:
@@ -82,7 +82,7 @@ def look(checker: Checker, source: Source) -> None:
                 continue  # no frame yet
             now_ns = time.monotonic_ns()
             frame = view.frame
-            if view.section != section:  # a reload has made the block anew
+            if view.section != section:  # a reload has replaced the block
                 number, section = 0, view.section
                 check.begin(started_ns(attachment))
             if frame.number < number:

@@ -1,6 +1,6 @@
-"""A writer that is killed in the middle of a slot: it publishes as fast as it can, frames that take long to copy.
+"""Kills a writer in the middle of a slot: one that publishes large frames as fast as it can.
 
-As a module, ``python -m tests.faults.midwrite INSTANCE``, it is that publisher.
+``python -m tests.faults.midwrite INSTANCE`` is this writer.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ TURN_S: Final = 0.05
 
 
 class MidWrite:
-    """A segment of its own, whose writer is killed again and again. Use as a context manager."""
+    """A separate segment whose writer is killed repeatedly. A context manager."""
 
     def __init__(self, instance: str, environment: dict[str, str], complain: Complain) -> None:
         self._environment = environment
@@ -44,7 +44,10 @@ class MidWrite:
         self._segment.close()
 
     def strike(self, number: int) -> None:
-        """Start a publisher, read what it writes, kill it at a moment that ``number`` determines, look what is left."""
+        """Start a writer, read its frames, kill it, and check what is left.
+
+        ``number`` determines the time of the kill.
+        """
         command = [sys.executable, "-P", "-m", "tests.faults.midwrite", self._segment.instance]
         stopping = threading.Event()
         reader = threading.Thread(target=self._read, args=(stopping,))
@@ -63,7 +66,7 @@ class MidWrite:
             self._complain(f"after a writer's death the newest frame is {newest and newest.number}")
 
     def _read(self, stopping: threading.Event) -> None:
-        """Follow the ring, and look at its newest frame, until told to stop."""
+        """Check each frame and the newest frame until ``stopping`` is set."""
         missed = self._cursor.missed
         while not stopping.is_set():
             frame = self._cursor.next(TURN_S)
@@ -86,7 +89,7 @@ class MidWrite:
 
 
 def whole(frame: Frame) -> bool:
-    """Whether all words of a frame are its number, as the publisher writes them."""
+    """Return whether each word of a frame is its number, as the writer writes them."""
     return bool((np.frombuffer(frame.raw, np.uint64) == frame.number).all())
 
 

@@ -1,4 +1,4 @@
-"""MQTT subscribers of all sources, by the instance's own broker: one for each, connected anew whenever that ends."""
+"""MQTT subscribers of all sources at the instance's broker, connected again when they lose it."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from tests.faults.remote import UNDER_WAY_NS
 PAUSE_S = 0.1
 TURN_S = 0.2
 KEEPALIVE_S = 5
-"""A broker that is frozen for longer is left."""
+"""Time after which a client disconnects from a frozen broker."""
 
 
 def late(message: MQTTMessage) -> bool:
-    """Whether it was kept for a broker that was away: these alone tell of when they are."""
+    """Return whether the bridge kept a message for an absent broker. Only these have a time."""
     given: list[tuple[str, str]] = getattr(message.properties, "UserProperty", [])
     return any(name == "source_time" for name, _ in given)
 
 
 def subscribe(checker: Checker, source: Source) -> None:
-    """Follow the block's first word."""
+    """Check the values of the block's first word."""
     check = ValueCheck(source, checker.complain, checker.counts(f"mqtt {source.name}"))
     address = Address.parse(checker.description.mqtt)
 
@@ -35,7 +35,7 @@ def subscribe(checker: Checker, source: Source) -> None:
         client.subscribe(f"shmio/{checker.description.instance}/{source.name}/stamp/out")
 
     def take(_client: Client, _data: Any, message: MQTTMessage) -> None:
-        if message.payload and not late(message):  # else it is bad, or history
+        if message.payload and not late(message):  # otherwise the value is bad or old
             check.value(int(message.payload), time.monotonic_ns(), slack_ns=checker.slack_ns + UNDER_WAY_NS)
 
     while not checker.stopping.wait(PAUSE_S):
@@ -47,7 +47,7 @@ def subscribe(checker: Checker, source: Source) -> None:
                 pass
             client.disconnect()
         except OSError:
-            continue  # it is not there
+            continue  # the broker is not running
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""All checking processes, and what they have told so far."""
+"""All checking processes, and what they have reported so far."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from tests.faults.checks import Counts
 
 MODULES: Final = ("local", "remote", "mqtt", "churn", "writing", "injecting", "chaining", "recorded")
 LATE: Final = ("slow", "recorded", "injected")
-"""How the counts begin of those who see values long after they were published, or one source after the other."""
+"""Name prefixes of the counters of checkers that see values late, or one source after the other."""
 END_S: Final = 200.0
-"""The one of recordings reads, at the end, all that it has not come to before: on a loaded machine that takes time."""
+"""Maximum time for a checker to end. That of the recordings first reads those that remain."""
 
 
 class Panel:
-    """Runs the checkers. Use as a context manager; after it, the counts are final."""
+    """Runs the checkers. A context manager; after its end, the counters are final."""
 
     def __init__(self, description: Description, environment: dict[str, str], complain: Callable[[str], None]) -> None:
         self.counts: dict[str, Counts] = {}
@@ -50,12 +50,12 @@ class Panel:
                 self.counts |= {name: Counts(**counts) for name, counts in message["counts"].items()}
 
     def behind(self, when_ns: int) -> list[str]:
-        """Who has not seen a good value yet that the PLC got after ``when_ns``. Who is late anyway is not asked."""
+        """Return the checkers (except :data:`LATE`) without a good value newer than ``when_ns``."""
         late = [n for n, counts in self.counts.items() if counts.since_ns <= when_ns and not n.startswith(LATE)]
         return [*self._silent, *late]
 
     def check(self) -> None:
-        """Complain of checkers that are not there any more."""
+        """Complain about checkers that have ended."""
         for popen, _ in self._checkers:
             if popen.poll() is not None:
                 self._complain(f"a checker ended with status {popen.returncode}: {popen.args!r}")

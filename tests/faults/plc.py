@@ -1,9 +1,9 @@
-"""An emulated S7 PLC, as a process, whose block changes all the time and that keeps the truth about it.
+"""An emulated S7 PLC in a separate process. Its block changes all the time; it records the truth.
 
-``python -m tests.faults.plc TRUTH LANDED GUARDED PORT SIZE PERIOD_MS``. The program leaves the last six words of the
-block to others. What is written to the first two of them is noted in LANDED, what is written to the fourth in
-GUARDED, further files of truth, before it is answered. It prints a line when it listens, and ends with its standard
-input.
+``python -m tests.faults.plc TRUTH LANDED GUARDED PORT SIZE PERIOD_MS``. The program does not write
+the last six words of the block. What others write to the first two of them is recorded in LANDED,
+and to the fourth in GUARDED, before the write is answered. Both are files like TRUTH. The process
+prints a line when it listens, and ends when its standard input ends.
 """
 
 from __future__ import annotations
@@ -20,17 +20,25 @@ from tests.faults.truth import Truth, image, places
 NUMBER = 7
 WORD = 8
 OTHERS = 6 * WORD
-"""What the program leaves to others, at the block's end: a word for local writers, one for those by gRPC, one that
-nobody writes and injections show something else for, one that injections stand before, and two more that nobody writes:
-one for declared injections alone, and one for a chain of them and of clients'."""
+"""Size of the last words of the block, which the program does not write.
+
+In order:
+
+- ``command``: for local writers.
+- ``remote``: for writers by gRPC.
+- ``shown``: never written; clients inject over ``/out``.
+- ``guarded``: written; clients inject over ``/in``.
+- ``declared``: never written; only declared injections.
+- ``chained``: never written; a chain of a declared injection and those of clients.
+"""
 SHOWN_AT = 2 * WORD
-"""Where among them the one is that one client's injection shows something else for."""
+"""Offset of ``shown`` among them."""
 DECLARED_AT = 4 * WORD
 CHAINED_AT = 5 * WORD
 
 
 class Noting:
-    """The server's lock, which is held over each job: notes what a job has written before it lets go."""
+    """The server's lock for each job. It records what the job has written before it is released."""
 
     def __init__(self, block: bytearray, landed: Truth, guarded: Truth) -> None:
         self._lock = threading.Lock()
@@ -52,11 +60,11 @@ class Noting:
 
 
 def play(server: S7Server, block: bytearray, truth: Truth, period_s: float, stopping: threading.Event) -> None:
-    """Run the program until told to stop."""
+    """Run the PLC's program until ``stopping`` is set."""
     of = places(len(block) - OTHERS)
     due_s = time.monotonic()
     while True:
-        with server.lock:  # nobody reads between what is told and what is
+        with server.lock:  # no client reads between the record and the change
             generation = truth.newest + 1
             truth.record(generation, time.monotonic_ns())
             block[:-OTHERS] = image(generation, of)

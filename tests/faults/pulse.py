@@ -1,4 +1,4 @@
-"""How the machine treats us: how long it keeps waiting who wants to run, and how much slower it makes who works."""
+"""Measures the machine's load: waits for a processor, and how much longer work takes."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Final
 
 PULSE_S: Final = 0.05
 REMEMBERED: Final = 200
-"""Pulses, 10 s of them and more."""
+"""Number of measurements that are kept: those of 10 s or more."""
 LEAST_NS: Final = 20_000_000
-"""Of less work nothing is concluded."""
+"""Minimum CPU time from which :attr:`Pulse.slowness` is computed."""
 
 
 class Pulse:
-    """Measures both for the process it is in; for one thread, other threads may look."""
+    """Measures the load for its process. One thread calls :meth:`beat`; others may read."""
 
     def __init__(self) -> None:
         self._held_up_ns: deque[int] = deque([0], maxlen=REMEMBERED)
         self._worked: deque[tuple[int, int]] = deque([_worked()], maxlen=REMEMBERED)
 
     def beat(self) -> None:
-        """Sleep for a pulse, and take note."""
+        """Sleep for :data:`PULSE_S`, and measure."""
         due_ns = time.monotonic_ns() + round(PULSE_S * 1e9)
         time.sleep(PULSE_S)
         self._held_up_ns.append(max(0, time.monotonic_ns() - due_ns))
@@ -30,29 +30,30 @@ class Pulse:
 
     @property
     def held_up_ns(self) -> int:
-        """The longest that a thread that wanted to run was lately kept waiting."""
+        """Longest recent wait of a thread for a processor, in ns."""
         return max(self._held_up_ns)
 
     @property
     def slowness(self) -> float:
-        """How many times longer work has lately taken than on an idle machine; at least 1.
+        """Factor by which recent work took longer than on an idle machine; at least 1.
 
-        Who sleeps most of the time is woken at once on a loaded machine too, so :attr:`held_up_ns` does not show it.
+        :attr:`held_up_ns` is not enough: a thread that mostly sleeps soon gets a processor, even
+        on a loaded machine.
         """
         (run_ns, wait_ns), (ran_ns, waited_ns) = self._worked[0], self._worked[-1]
-        if ran_ns - run_ns < LEAST_NS or waited_ns < wait_ns:  # a thread that has ended takes its figures with it
+        if ran_ns - run_ns < LEAST_NS or waited_ns < wait_ns:  # the figures of ended threads are missing
             return 1.0
         return 1.0 + (waited_ns - wait_ns) / (ran_ns - run_ns)
 
 
 def _worked() -> tuple[int, int]:
-    """For how many ns the threads of this process have run, and waited for a processor."""
+    """Return how many ns this process's threads have run, and have waited for a processor."""
     run_ns = wait_ns = 0
     for task in Path("/proc/self/task").iterdir():
         try:
             run, wait, _ = (task / "schedstat").read_text().split()
         except (OSError, ValueError):
-            continue  # it has just ended, or the kernel does not tell
+            continue  # the thread has just ended, or the kernel has no figures
         run_ns += int(run)
         wait_ns += int(wait)
     return run_ns, wait_ns

@@ -1,6 +1,6 @@
-"""What the instance's recorder leaves: every file it has ended, or was killed over, is read and held to the truth.
+"""Checks the recordings: compares every file that has ended, even by a kill, with the truth.
 
-Files are removed when they were checked, but for the newest ones, in which a new recorder looks where to go on.
+Checked files are removed, except the newest, which a new recorder reads to continue.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from tests.faults.checks import Complain, Counts, FrameCheck, Source
 
 LOOK_S: Final = 0.1
 KEPT: Final = 3
-"""So many files remain beside the one being written."""
+"""Number of files that remain in addition to the one being written."""
 START_NS: Final = 2 * 10**9
-"""How long a recorder may take, on a loaded machine, from making its file to its first look at the rings."""
+"""Maximum time from the creation of a file until its recorder first reads the rings."""
 REMEMBERED_NS: Final = 600 * 10**9
-"""The truth of what was published longer ago is not held any more."""
+"""Maximum age of frames that are compared with the truth, whose file has limited room."""
 
 
 @dataclass
 class BlockCheck:
-    """Holds the recordings of one source, one file after the other, to what is promised of them."""
+    """Checks the recordings of one source, file after file."""
 
     source: Source
     ring_ns: int
-    """For how long a frame is in the source's ring."""
+    """Time for which the source's ring keeps a frame, in ns."""
     complain: Complain
     counts: Counts = field(default_factory=Counts)
     _block: tuple[str, int] | None = None
-    """Epoch of the instance, section of the block: numbers go on from file to file within it."""
+    """Epoch of the instance and section of the block, whose numbers continue across files."""
     _last: dict[str, int] = field(default_factory=dict)
     _missed: dict[str, int] = field(default_factory=dict)
     _publish_ns: int = 0
@@ -47,12 +47,12 @@ class BlockCheck:
         self._frames = FrameCheck(self.source, self.complain, self.counts)
 
     def begin(self, epoch: str, started_ns: int, away_ns: int) -> None:
-        """A file begins. ``away_ns``: at most so long nobody had written into a file before."""
+        """Begin a file. ``away_ns``: maximum time before it in which nothing was recorded."""
         self._away_ns = away_ns
         self._epoch, self._started_ns = epoch, started_ns
 
     def item(self, item: Frame | Event | Gap, section: int) -> None:
-        """The next frame, event or gap of this source, of the block in this section."""
+        """Check the next frame, event or gap of this source, of the block in this section."""
         if (self._epoch, section) != self._block:
             self._block = self._epoch, section
             self._last, self._missed = {}, {}
@@ -96,14 +96,14 @@ class BlockCheck:
 
 
 def check(file: Path, away_ns: int, checks: Mapping[str, BlockCheck]) -> None:
-    """Read one file to its end; RecordingError: it is damaged."""
+    """Read and check one file to its end. RecordingError: it is damaged."""
 
     def wanted(channel: Channel) -> bool:
         return not channel.source or channel.source in checks
 
     begun = False
     with Reader(file) as reader:
-        survey(reader)  # a gap at the beginning comes before its block is described
+        survey(reader)  # a first gap comes before the description of its block
         for message in reader.messages(wanted):
             if not begun:
                 begun = True
@@ -119,7 +119,7 @@ def check(file: Path, away_ns: int, checks: Mapping[str, BlockCheck]) -> None:
 
 
 class Watch:
-    """Looks for files, and has them checked in the order in which they were written."""
+    """Finds files, and passes them to ``check`` in the order in which they were written."""
 
     def __init__(self, folder: Path, check: Callable[[Path, int], None]) -> None:
         self._folder = folder
@@ -128,13 +128,13 @@ class Watch:
         self._checked: list[Path] = []
 
     def look(self, *, ended: bool, slack_ns: int) -> None:
-        """Check what is not being written any more: all but the newest, or, ``ended``, all."""
+        """Check the files that have ended: all but the newest; with ``ended``, all."""
         now_ns = time.time_ns()
         for file in self._folder.glob("*.mem"):
-            self._seen_ns.setdefault(file, now_ns)  # names are no help: the clock they are of is set
+            self._seen_ns.setdefault(file, now_ns)  # not by name: faults set the clock of the names
         files = sorted(self._seen_ns, key=self._seen_ns.__getitem__)
         for file in files if ended else files[:-1]:
-            if file not in self._checked and file.stat().st_size:  # empty: its recorder was killed before it wrote
+            if file not in self._checked and file.stat().st_size:  # empty: the recorder was killed before it wrote
                 before_ns = self._checked[-1].stat().st_mtime_ns if self._checked else self._seen_ns[file]
                 self._check(file, self._seen_ns[file] - before_ns + slack_ns)
                 self._checked.append(file)

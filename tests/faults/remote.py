@@ -1,4 +1,4 @@
-"""gRPC subscribers of all sources: a stream for each, on a connection of its own, taken up again whenever it breaks."""
+"""gRPC subscribers of all sources: streams on separate connections, renewed when they break."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from tests.faults.checks import Source, ValueCheck
 STREAMS = 2
 PAUSE_S = 0.1
 BREAKS = {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED, grpc.StatusCode.DEADLINE_EXCEEDED}
-"""How a stream may end when its server is killed, stopped or away."""
+"""Status codes of a stream whose server was killed, stopped or is not running."""
 CALL_S = 20.0
-"""A stream is begun anew after this long: a server that is frozen for ever does not hold its client."""
+"""Maximum duration of a stream, so that a frozen server does not block its client for ever."""
 UNDER_WAY_NS = 3_000_000_000
-"""What an endpoint had sent off when it was stopped (``pause``) comes when it goes on; a v1 message has no quality."""
+"""Additional delay of values: a paused endpoint delivers old messages when it continues.
+
+A message of v1 has no quality.
+"""
 OPTIONS = [
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.min_reconnect_backoff_ms", 100),
@@ -29,7 +32,7 @@ OPTIONS = [
 
 
 def subscribe(checker: Checker, source: Source, name: str) -> None:
-    """Follow the block's first word."""
+    """Check the values of the block's first word."""
     check = ValueCheck(source, checker.complain, checker.counts(name))
     while not checker.stopping.wait(PAUSE_S):
         with grpc.insecure_channel(checker.description.grpc, options=OPTIONS) as channel:

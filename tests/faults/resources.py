@@ -1,4 +1,4 @@
-"""Memory and descriptors of the processes that live long: neither may grow without end."""
+"""Checks memory and descriptors of long-running processes, which must not grow without limit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PAGE_MB: Final = os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 class Resources:
-    """Looks at processes now and then."""
+    """Measures processes from time to time."""
 
     def __init__(self, complain: Complain) -> None:
         self._complain = complain
@@ -25,7 +25,7 @@ class Resources:
         self.peaks: dict[str, tuple[float, int]] = {}
 
     def look(self, pids: Mapping[str, int | None]) -> None:
-        """Look at the present processes, by name."""
+        """Measure the present processes, given by name."""
         present = {(name, pid) for name, pid in pids.items() if pid is not None}
         self._first = {key: first for key, first in self._first.items() if key in present}
         for name, pid in present:
@@ -37,7 +37,7 @@ class Resources:
             self.note(name, pid, private_mb, descriptors)
 
     def note(self, name: str, pid: int, private_mb: float, descriptors: int) -> None:
-        """Judge one process by what it uses now."""
+        """Check what one process uses now."""
         first_mb = self._first.setdefault((name, pid), private_mb)
         peak = self.peaks.get(name, (0.0, 0))
         self.peaks[name] = (max(peak[0], private_mb), max(peak[1], descriptors))
@@ -48,6 +48,6 @@ class Resources:
 
 
 def _private_mb(pid: int) -> float:
-    """Resident memory but the shared: proc_pid_statm(5)."""
+    """Return resident minus shared memory in MB; see proc_pid_statm(5)."""
     _, resident, shared = Path(f"/proc/{pid}/statm").read_text().split()[:3]
     return (int(resident) - int(shared)) * _PAGE_MB

@@ -1,4 +1,4 @@
-"""What the broker keeps for whoever subscribes next: how things are now, and of nothing that is not there any more."""
+"""Checks the broker's retained messages: the present state, and no topics of earlier layouts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WORDS: Final = ("stamp", "command", "remote", "shown", "guarded", "declared", "c
 
 
 def retained(address: Address, prefix: str) -> dict[str, bytes]:
-    """By topic without the prefix; nothing, if the broker is not there."""
+    """Return the retained messages by topic, without the prefix; none without a broker."""
     found: dict[str, bytes] = {}
     client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5, reconnect_on_failure=False)
     quiet = False
@@ -40,7 +40,7 @@ def retained(address: Address, prefix: str) -> dict[str, bytes]:
     until_s = time.monotonic() + MOST_S
     try:
         client.connect(address.host, address.port)
-        while time.monotonic() < until_s and not (found and quiet):  # they come first, at once
+        while time.monotonic() < until_s and not (found and quiet):  # retained messages come first, all at once
             look_s, quiet = time.monotonic() + TURN_S, True
             while time.monotonic() < look_s:
                 if client.loop(TURN_S) != MQTTErrorCode.MQTT_ERR_SUCCESS:
@@ -54,7 +54,7 @@ def retained(address: Address, prefix: str) -> dict[str, bytes]:
 def wrong(
     found: Mapping[str, bytes], sources: Sequence[Source], names: Mapping[str, str], slowness: float
 ) -> list[str]:
-    """What is not as it should be. ``names``: of each source, what the words after its first are called."""
+    """Return what is wrong. ``names``: present name of each source's array after the first word."""
     return list(_wrong(found, sources, names, round((SLACK_NS + UNDER_WAY_NS) * slowness)))
 
 
@@ -69,7 +69,7 @@ def _wrong(
         there = {topic for topic in found if topic.startswith(f"{name}/")}
         due = {f"{name}/status", *(f"{name}/{word}/out" for word in (*WORDS, names[name]))}
         if there != due:
-            yield f"missing of {name}: {sorted(due - there)}, too many: {sorted(there - due)}"
+            yield f"missing topics of {name}: {sorted(due - there)}, unexpected: {sorted(there - due)}"
             continue
         if (quality := json.loads(found[f"{name}/status"])["quality"]) != "good":
             yield f"{name} is {quality}"

@@ -1,4 +1,4 @@
-"""The instance under test and what surrounds it: PLCs, the network to them, the host's clock."""
+"""The instance under test and its environment: PLCs, the network to them, the host's clock."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ ROOT: Final = Path(__file__).parents[2]
 HERE: Final = Path(__file__).parent
 COMMAND_S: Final = 180.0
 OTHERS: Final = ("plc", "grpc", "mqtt")
-"""What listens beside the devices of :data:`~tests.faults.schedule.SOURCES`."""
+"""Listeners other than the devices of :data:`~tests.faults.schedule.SOURCES`."""
 MARK: Final = "SHMIO_FAULTS"
-"""A variable in the environment of every process of a run: none of them can hide."""
+"""Environment variable that identifies every process of a run."""
 TOLERANCE_MS: Final = 100
-"""What a loaded machine and the way through the network may add to an age."""
+"""Time that a loaded machine and the network may add to an age."""
 
 
 class Device:
-    """An emulated PLC in a process of its own, behind a proxy, with the truth about its block."""
+    """An emulated PLC in a separate process behind a proxy. It records its block's truth."""
 
     def __init__(self, name: str, folder: Path, address: Address, environment: dict[str, str]) -> None:
         self._file = folder / f"{name}.truth"
@@ -51,7 +51,7 @@ class Device:
         self.start()
 
     def start(self) -> None:
-        """Start the PLC; returns when it listens."""
+        """Start the PLC, and wait until it listens."""
         command = [sys.executable, "-P", "-m", "tests.faults.plc", *self._command]
         pipe = subprocess.PIPE
         self._popen = subprocess.Popen(command, stdin=pipe, stdout=pipe, env=self._environment)
@@ -60,24 +60,24 @@ class Device:
 
     @property
     def pid(self) -> int:
-        """The present process."""
+        """Pid of the present process."""
         return self._popen.pid
 
     def kill(self) -> None:
-        """Cut its power."""
+        """Kill the PLC, as a power failure does."""
         self._popen.kill()
         self._popen.communicate()
         self.truth.bury(time.monotonic_ns())
 
     def stop(self) -> None:
-        """End it, and the network to it."""
+        """End the PLC and the network to it."""
         self._popen.communicate(timeout=COMMAND_S)
         self.proxy.stop()
         self.truth.close()
 
 
 class Instance:
-    """An instance as its user has it. ``file``: its configuration."""
+    """An instance, controlled by its commands. ``file``: its configuration."""
 
     def __init__(self, folder: Path, instance: str, file: Path) -> None:
         self.folder = folder
@@ -103,13 +103,13 @@ class Instance:
         )
 
     def up(self) -> None:
-        """Start the instance, or take up what a dead supervisor has left; returns when it runs."""
+        """Start the instance, or take it over from a dead supervisor; wait until it runs."""
         done = self.supervisor("up", "--detach")
         if done.returncode:
             raise RuntimeError(f"up failed: {done.stderr}")
 
     def ask(self, verb: str, *arguments: str) -> None:
-        """Have the instance do something; repeat that while another change is in progress, or /dev/shm is full."""
+        """Run a supervisor command. Repeat it while a change is in progress or /dev/shm is full."""
         until_s = time.monotonic() + COMMAND_S
         while (done := self.supervisor(verb, *arguments)).returncode:
             passing = "try again" in done.stderr or "/dev/shm has no room" in done.stderr
@@ -123,22 +123,22 @@ class Instance:
             raise RuntimeError(f"down failed: {done.stderr}")
 
     def clear(self) -> None:
-        """Stop it, if it is there."""
+        """Stop the instance if it is running."""
         if self.status().running:
             self.supervisor("down")
 
     def status(self) -> InstanceStatus:
-        """The instance as ``status`` tells it."""
+        """Return the status of the instance."""
         return read_status(self.instance)
 
     def processes(self) -> dict[str, Process]:
-        """The processes that the supervisor started, as ``status`` tells it, but for the source that comes and goes."""
+        """Return the processes in the status, except guests and the source that reloads add."""
         processes = [p for p in self.status().processes if p.kind != "guest" and p.name != EXTRA]
         return {p.name: Process(p.pid, p.restarts) for p in processes}
 
 
 class Rig(Instance):
-    """Everything that is not a checker. Use as a context manager; the instance is running inside."""
+    """The whole setup except the checkers. A context manager; the instance runs inside."""
 
     def __init__(self, folder: Path, instance: str) -> None:
         super().__init__(folder, instance, folder / "supervisor.toml")
@@ -173,7 +173,7 @@ class Rig(Instance):
         self.configuration = Configuration(self.folder, self.instance, ports)
 
     def description(self, seed: int) -> Description:
-        """What checkers are told."""
+        """Return the description that the checkers get."""
         sources = []
         for source in self.sources():
             name = source.name
@@ -189,7 +189,7 @@ class Rig(Instance):
         )
 
     def sources(self) -> list[Source]:
-        """All that are always there, with the truth of those whose PLC is ours."""
+        """Return the permanent sources, with the truth of those whose PLC belongs to the suite."""
         found = []
         for name, size in SIZES.items():
             period_ns, stale_ns, tolerance_ns = (ms * 10**6 for ms in (PERIODS_MS[name], STALE_MS[name], TOLERANCE_MS))
@@ -198,13 +198,13 @@ class Rig(Instance):
         return found
 
     def reload(self, change: Callable[[Configuration], None]) -> None:
-        """Change the configuration and have the instance take it."""
+        """Change the configuration, and reload the instance."""
         with self._turn:
             change(self.configuration)
             self.ask("reload")
 
     def set_clock(self, offset_ns: int) -> None:
-        """Set the clock of the instance's host, relative to the true one."""
+        """Set the host's clock, as the instance sees it, to this offset from the real one."""
         if not self._clock.exists():
             self._clock.write_bytes(bytes(8))
         with self._clock.open("r+b") as clock:
@@ -220,7 +220,7 @@ def compile_c(source: Path, program: Path, *arguments: str) -> None:
 
 
 def marked(instance: str) -> dict[int, str]:
-    """The processes of a run that are alive, whoever started them, by their command lines."""
+    """Return the living processes of a run with their command lines, whoever started them."""
     found = {}
     mark = f"{MARK}={instance}".encode()
     for entry in Path("/proc").iterdir():

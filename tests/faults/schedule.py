@@ -1,4 +1,4 @@
-"""What goes wrong, and when: a stream of rounds that a seed determines, whatever happens on the way."""
+"""The schedule of faults: an endless series of rounds that depends on the seed alone."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 SOURCES: Final = ("fast", "block")
-"""Sources whose PLC is behind a proxy and keeps the truth."""
+"""Sources whose PLC is behind a proxy and records the truth."""
 BROKER: Final = "broker"
 WORKERS: Final = ("fast", "block", "demo", "plc", "grpc", "mqtt", BROKER, "recorder")
-"""Processes that the supervisor starts: sources, an emulator of ``demo``, endpoints, the broker, the recorder."""
+"""Processes that the supervisor starts; ``plc`` emulates the PLC of ``demo``."""
 SUPERVISOR: Final = "supervisor"
 
 PROCESS_FAULTS: Final = {"kill": 6, "pause": 3, "hang": 1, "restart": 3, "torn": 2, "relayout": 2}
@@ -30,24 +30,24 @@ OTHER_FAULTS: Final = {
     "broker_pause": 2,
 }
 WEIGHTS: Final = PROCESS_FAULTS | DEVICE_FAULTS | OTHER_FAULTS
-"""How often each kind comes, relative to the others."""
+"""Relative frequency of each kind of fault."""
 
 RESTARTING: Final = {"kill", "hang", "restart", "torn", "broker_kill"}
-"""Kinds after which the target is another process."""
+"""Kinds of faults that replace the target's process."""
 RENEWING: Final = {"relayout"}
-"""Kinds after which the target is new: another process, and its restarts count from 0."""
+"""Kinds of faults that replace the target and reset its number of restarts to 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing that goes wrong. ``after_s`` from its round's begin; what lasts does so for ``for_s``."""
+    """A fault. It begins ``after_s`` after its round, and lasts ``for_s`` if its kind lasts."""
 
     kind: str
     target: str
     after_s: float
     for_s: float
     number: int
-    """A random number of its own, for whatever else is left open."""
+    """Random number for all other choices."""
 
     def __str__(self) -> str:
         return f"{self.kind} {self.target} at +{self.after_s:.2f} s for {self.for_s:.2f} s ({self.number})"
@@ -55,15 +55,15 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Faults that come together. After them all must be well again before the next round."""
+    """Faults that happen together. Everything must recover before the next round."""
 
     faults: tuple[Fault, ...]
     rest_s: float
-    """Time of peace after it."""
+    """Time without faults after the recovery."""
 
 
 def rounds(seed: int) -> Iterator[Round]:
-    """The rounds of a seed, for ever. Never two faults on one target, nor one beside the death of the supervisor."""
+    """Yield a seed's rounds, endlessly. A round's targets differ; the supervisor is hit alone."""
     chance = random.Random(seed)
     kinds, weights = list(WEIGHTS), list(WEIGHTS.values())
     while True:
@@ -84,6 +84,6 @@ def _fault(kind: str, chance: random.Random) -> Fault:
         target = f"device of {chance.choice(SOURCES)}"
     elif kind.startswith((SUPERVISOR, BROKER)):
         target = kind.partition("_")[0]
-    # Short of the 5 s after which a process counts as hanging, or long enough for it to be replaced.
+    # Shorter than the 5 s after which the supervisor replaces a process that does not respond.
     for_s = chance.uniform(0.05, 3.0)
     return Fault(kind, target, chance.uniform(0, 1), for_s, chance.getrandbits(32))

@@ -1,4 +1,4 @@
-"""The invariants of steps: one is done whole, or fails by name; the next one works, and time has one owner."""
+"""The invariants of steps: a step is complete, or names the cause of its failure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Lead(Model):
 
 
 class Follow(Model):
-    """Shows what the other one had counted before the step."""
+    """Shows the count of the other model before the step."""
 
     lead = Input("LINT")
     seen = Output("LINT")
@@ -39,7 +39,7 @@ class Follow(Model):
 PARTICIPANTS: Final = ("lead", "follow", "panel")
 DISPATCHERS: Final = ("grpc", "recorder")
 NAMED: Final = re.compile(rf"\b({'|'.join(PARTICIPANTS + DISPATCHERS)})\b|another program \(pid \d+\)")
-"""What a step that fails names: who has not done it, or who owns time."""
+"""Causes that a failed step may name: a process that did not complete it, or the owner of time."""
 
 
 class Answer(NamedTuple):
@@ -53,44 +53,52 @@ class Answer(NamedTuple):
 
 @dataclass
 class StepCheck:
-    """Holds the steps of a program that alone moves time to what is promised."""
+    """Checks the steps of a program that is the only one to move time."""
 
     complain: Complain
 
     def done(self, before: Clock, number: int, dt_ns: int, after: Clock, answers: Mapping[str, Answer]) -> None:
-        """A step is over: its number as the call told it, the page before and after, each source's frame for it."""
+        """Check a step that was done.
+
+        Args:
+            before: The clock page before the call.
+            number: The step's number, as the call returned it.
+            dt_ns: Length of the step.
+            after: The clock page after the call.
+            answers: The frame of each source for the step.
+        """
         self._page(before, after, dt_ns)
         if number != after.step or after.done != number or after.step != before.step + 1:
-            self._say(before, after, f"step {number} is told to be done")
+            self._say(before, after, f"step {number} is reported as done")
         for name in PARTICIPANTS:
             answer = answers.get(name)
             if answer is None or answer.cycle != number:
-                self._say(before, after, f"step {number} is told to be done, but {name} has no frame for it")
+                self._say(before, after, f"step {number} is reported as done, but {name} has no frame for it")
             elif answer.quality is Quality.BAD:
-                self._say(before, after, f"step {number} is told to be done, but {name} is bad in it")
+                self._say(before, after, f"step {number} is reported as done, but {name} is bad in it")
             elif answer.clock_ns != after.time_ns:
                 self._say(before, after, f"{name} has the time {answer.clock_ns} for step {number}")
             elif "at_s" in answer.values and answer.values["at_s"] != after.time_ns / 1e9:
                 self._say(before, after, f"{name} has computed step {number} for {answer.values['at_s']} s")
         if lead := answers.get("lead"):
             follow = answers.get("follow")
-            # One whose input was bad in the step before has kept what it had, and is uncertain.
+            # If its input was bad in the step before, it kept the old value and is uncertain.
             if follow and follow.quality is Quality.GOOD and follow.values["seen"] != _before(lead.values["count"]):
                 seen, counted = follow.values["seen"], lead.values["count"]
                 self._say(before, after, f"follow has seen {seen} in step {number}, which made it {counted}")
 
     def failed(self, before: Clock, text: str, dt_ns: int, after: Clock) -> None:
-        """A step has failed with this text."""
+        """Check a step that failed with this message."""
         if not NAMED.search(text):
-            self._say(before, after, f"a step has failed and names nobody: {text}")
+            self._say(before, after, f"the message of a failed step names no cause: {text}")
         self.unclear(before, dt_ns, after)
 
     def unclear(self, before: Clock, dt_ns: int, after: Clock) -> None:
-        """Nobody has told what became of a step: it was done, or not."""
+        """Check a step of which it is unknown whether it was done."""
         if after.step not in (before.step, before.step + 1):
             self._say(before, after, "one step has used up more than its number")
         if after.done not in (before.done, after.step):
-            self._say(before, after, "a step that was not asked for is done")
+            self._say(before, after, "a step that nobody requested is done")
         if after.step != before.step:
             self._page(before, after, dt_ns)
 
@@ -111,7 +119,7 @@ def _before(count: object) -> int:
 
 @dataclass
 class RecordedSteps:
-    """Holds a recording of a stepped instance to the steps that were told to be done. Of one run of the instance."""
+    """Checks the recording of one run of a stepped instance against the steps that were done."""
 
     complain: Complain
 
@@ -123,17 +131,22 @@ class RecordedSteps:
         cycles: Mapping[str, set[int]],
         missed: Mapping[str, int],
     ) -> None:
-        """``done``: steps that were told to be, ``failed``: not to be. ``marks``: those that it tells of.
+        """Check the recording.
 
-        ``cycles``: of the frames in it, by source. ``missed``: frames that its gaps tell of.
+        Args:
+            done: Numbers of the steps that were reported as done.
+            failed: Numbers of the steps that failed.
+            marks: Numbers of the steps that are recorded as done.
+            cycles: Cycles of the recorded frames, by source.
+            missed: Number of frames that the recording's gaps report, by source.
         """
         for name in PARTICIPANTS:
             lost = done - cycles.get(name, set())
             if len(lost) > missed.get(name, 0):
                 some = sorted(lost)[:5]
                 self.complain(
-                    f"{len(lost)} frames of {name} are not recorded, of steps {some}, ..., and its gaps tell of "
+                    f"{len(lost)} frames of {name} are not recorded, of steps {some}, ..., but its gaps report "
                     f"{missed.get(name, 0)}"
                 )
         if wrong := marks & failed:
-            self.complain(f"the recording tells that steps {sorted(wrong)[:5]} are done, which have failed")
+            self.complain(f"failed steps {sorted(wrong)[:5]} are recorded as done")

@@ -1,7 +1,7 @@
-"""A program that moves time, to be killed: ``python -m tests.faults.stepper INSTANCE GRPC WAY SEED``.
+"""A program that moves time: ``python -m tests.faults.stepper INSTANCE GRPC WAY SEED``.
 
-It steps, by attaching or through the endpoint, looks what each step has left, and prints a JSON line for each; it ends
-with its standard input.
+It steps, attached or through the endpoint, checks the result of each step, and prints a JSON line
+for each. It ends when its standard input ends.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DTS_MS: Final = (1, 20, 50)
 
 
 class Stepper:
-    """Steps one instance after another, as long as it is told to."""
+    """Steps the instance, and again after each restart of the instance."""
 
     def __init__(self, instance: str, grpc: str, way: str, seed: int) -> None:
         self._instance, self._grpc, self._way = instance, grpc, way
@@ -36,20 +36,20 @@ class Stepper:
         self.stopping = threading.Event()
 
     def run(self) -> None:
-        """Until it is told to stop."""
+        """Step until ``stopping`` is set."""
         while not self.stopping.wait(PAUSE_S):
             try:
                 with shmio.attach(self._instance, writable=self._way == "local") as cell:
                     self._attached(cell)
-            except (NotRunningError, SegmentError):  # not there, half-made, stopped: try again
+            except (NotRunningError, SegmentError):  # not running, incomplete or stopped: try again
                 continue
-            except ShmioError as error:  # who had time before is not known to be dead yet, or its endpoint is gone
+            except ShmioError as error:  # the death of the last owner is not known yet, or the endpoint is gone
                 say(refused=str(error))
 
     def _attached(self, cell: Attachment) -> None:
         remote = Client(Target(self._grpc)) if self._way == "shmio" else None
         try:
-            # Takes time over, behind any step of another that is under way.
+            # This takes control of time after any step that is under way.
             remote.pause() if remote else cell.pause()
             while cell.current and not self.stopping.is_set():
                 self._step(cell, remote)
@@ -63,7 +63,7 @@ class Stepper:
         before, begun_ns = cell.clock, time.monotonic_ns()
         try:
             number = (remote or cell).step(dt_ms / 1000).step
-        except RemoteError as error:  # nobody knows what has become of it
+        except RemoteError as error:  # it is unknown whether the step was done
             self._check.unclear(before, dt_ms * 10**6, cell.clock)
             raise SegmentError(str(error)) from None
         except ShmioError as error:
@@ -80,12 +80,15 @@ class Stepper:
 
 
 def _epoch(cell: Attachment) -> str:
-    """What tells one run of an instance from the next, as recordings have it."""
+    """Return the epoch, which identifies a run of the instance, as in recordings."""
     return f"{cell._segment.header.epoch:016x}"
 
 
 def _answer(block: Block, number: int) -> Answer | None:
-    """The first frame for a step: what comes after it is of a process that was restarted, or stopped."""
+    """Return the first frame for a step.
+
+    Later frames with the same cycle come from a restarted process, or from one that stopped.
+    """
     found = None
     for at in range(block.ring.head(), 0, -1):
         frame = block.read(at)
@@ -101,7 +104,7 @@ def _answer(block: Block, number: int) -> Answer | None:
 
 
 def say(**message: object) -> None:
-    """Tell who watches."""
+    """Print a message as a JSON line."""
     print(json.dumps(message), flush=True)
 
 

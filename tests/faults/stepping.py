@@ -1,4 +1,4 @@
-"""The second run: an instance whose time is stepped, and the death of whoever steps, takes part or listens."""
+"""The second run: faults of an instance with stepped time, and of the program that steps it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.faults.suite import LOOK_S, RECOVERY_S, Run
 WORKERS: Final = (*PARTICIPANTS, *DISPATCHERS)
 STEPPER: Final = "stepper"
 KINDS: Final = {"kill": 6, "pause": 3, "hang": 2, "restart": 2, "supervisor_kill": 2, "stepper_kill": 4}
-"""How often each kind comes, relative to the others."""
+"""Relative frequency of each kind of fault."""
 END_S: Final = 20.0
 CONFIG: Final = """
 [instance]
@@ -59,7 +59,7 @@ listen = ["{grpc}"]
 
 
 def faults(seed: int) -> Iterator[Fault]:
-    """The faults of a seed, for ever, one at a time."""
+    """Yield the faults of a seed, endlessly, to be carried out one at a time."""
     chance = random.Random(seed)
     kinds, weights = list(KINDS), list(KINDS.values())
     while True:
@@ -69,17 +69,17 @@ def faults(seed: int) -> Iterator[Fault]:
 
 
 class Moving:
-    """The program that moves time, and what it has told. Use as a context manager; killed, it has a successor."""
+    """The program that moves time, and what it has reported. A context manager."""
 
     def __init__(self, run: Stepping, rig: Instance, grpc: str) -> None:
         self._run, self._rig, self._grpc = run, rig, grpc
         self._seed = run.record.seed
         self.begun_ns = 0
-        """When the newest step began that was done."""
+        """CLOCK_MONOTONIC of the beginning of the newest step that was done."""
         self.done: defaultdict[str, set[int]] = defaultdict(set)
-        """The steps that were, by the instance's epoch."""
+        """Numbers of the steps that were done, by the instance's epoch."""
         self.failed: defaultdict[str, set[int]] = defaultdict(set)
-        """Those that were asked for, and were not."""
+        """Numbers of the steps that failed, by epoch; 0 for a call that left no step undone."""
         self._start()
 
     def _start(self) -> None:
@@ -95,11 +95,11 @@ class Moving:
 
     @property
     def pid(self) -> int:
-        """Of the present one."""
+        """Pid of the present process."""
         return self._popen.pid
 
     def replace(self) -> None:
-        """Kill it, and start another one, which moves time in another way."""
+        """Kill the program, and start a successor that steps the other way."""
         self._popen.kill()
         self._end()
         self._start()
@@ -110,7 +110,7 @@ class Moving:
         for line in self._popen.stdout:
             try:
                 message = json.loads(line)
-            except ValueError:  # it was killed within it
+            except ValueError:  # the program was killed while it printed the line
                 return
             if "violation" in message:
                 self._run.complain(f"{self.way}: {message['violation']}")
@@ -122,7 +122,7 @@ class Moving:
                 steps["failed"] += 1
                 self.failed[message["epoch"]].add(message["undone"])
             else:
-                steps["refused while nobody was sure who owns time"] += 1
+                steps["refused while the owner of time was unclear"] += 1
 
     def _end(self) -> None:
         assert self._popen.stdin is not None
@@ -146,10 +146,10 @@ class Moving:
 
 
 class Stepping(Run):
-    """A run on an instance whose time is stepped."""
+    """A run on an instance with stepped time."""
 
     def run(self, for_s: float, given: list[Fault] | None = None) -> None:
-        """Run for so long, or through the faults given. What is left behind is a violation too."""
+        """Run for this time or through the given faults. Things left behind are violations, too."""
         begun_s = time.monotonic()
         self._folder.mkdir()
         with ExitStack() as stack:
@@ -182,7 +182,7 @@ class Stepping(Run):
         self._history.append(f"{time.monotonic_ns()}: {fault}")
         try:
             inflictor.inflict(fault)
-        except Exception as error:  # noqa: BLE001 - an error of a command, or of the suite: a finding in any case
+        except Exception as error:  # noqa: BLE001 - an error of a command or of the suite: always a violation
             self.complain(f"{fault} failed: {error!r}")
             return
         ended_ns = time.monotonic_ns()
@@ -193,7 +193,7 @@ class Stepping(Run):
         self.record.rounds += 1
         self.record.faults[kind] += 1
         self.record.recoveries[kind].append(took_s)
-        self._say(f"{self.record.rounds:5d}  stepped: {fault}: well again after {took_s:.2f} s")
+        self._say(f"{self.record.rounds:5d}  stepped: {fault}: recovered after {took_s:.2f} s")
         hit = {fault.target} if fault.kind in RESTARTING else set()
         check_restarts(before, rig.processes(), hit, set(), replaced=self._epoch() != epoch, complain=self.complain)
         self.check_processes(rig)
@@ -211,7 +211,10 @@ class Stepping(Run):
         return False
 
     def _contend(self, moving: Moving) -> None:
-        """Time has one owner: another program is told who it is. The endpoint gives time up when its clients rest."""
+        """Check that a second program is refused, and is told the owner of time.
+
+        Only if the first one is attached: the endpoint releases time when its clients pause.
+        """
         if moving.way != "local":
             return
         try:
@@ -220,9 +223,9 @@ class Stepping(Run):
         except TimeError as error:
             self.record.steps["refused to another program"] += 1
             if f"pid {moving.pid}" not in str(error):
-                self.complain(f"another program is refused with: {error}")
+                self.complain(f"the refusal of another program does not name the owner of time: {error}")
         except ShmioError as error:
-            self.complain(f"another program that wants to step is told: {error}")
+            self.complain(f"another program that wants to step gets another error than TimeError: {error}")
         else:
             self.complain(f"two programs have moved time, pid {moving.pid} and this one")
 
@@ -235,7 +238,7 @@ class Stepping(Run):
         missed: defaultdict[str, defaultdict[str, int]] = defaultdict(lambda: defaultdict(int))
         for file in (self._folder / "dumps").glob("*.mem"):
             if not file.stat().st_size:
-                continue  # its recorder was killed before it wrote: the steps must be in the next one
+                continue  # the recorder was killed before it wrote anything; the steps must be in the next file
             try:
                 with Reader(file) as reader:
                     survey(reader)

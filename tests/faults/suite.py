@@ -1,4 +1,4 @@
-"""The run: round after round of faults, recovery awaited after each, everything recorded for the report."""
+"""The main run: rounds of faults, each followed by a wait for recovery, recorded for the report."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from tests.faults.rig import Instance, Rig, marked
 from tests.faults.schedule import BROKER, RENEWING, RESTARTING, Fault, Round, rounds
 
 RECOVERY_S: Final = 30.0
-"""All is well again within this time after a fault, at the latest."""
+"""Maximum time to recover from a fault."""
 LOOK_S: Final = 0.02
 SEEN_S: Final = 90.0
-"""So long at most the checkers are given to see enough after the last fault."""
+"""Maximum time after the last fault for the checkers to see enough."""
 MOST_CHANGES: Final = 30
-"""So many blocks are changed by reloads before the instance is started anew; it has room for 40."""
+"""Number of blocks changed by reloads after which the instance is restarted; it has room for 40."""
 HISTORY: Final = 20
 MOST_VIOLATIONS: Final = 10
-"""So many are kept; the others are counted."""
+"""Maximum number of violations that are kept; further ones are only counted."""
 END_S: Final = 5.0
 RETAINED_S: Final = 5.0
-"""So long after all is well something else may be retained than what is so."""
+"""Maximum time after recovery in which retained messages may still be out of date."""
 
 Say = Callable[[str], None]
 
 
 @dataclass
 class Record:
-    """What a run has seen, for its report."""
+    """Results of a run, for its report."""
 
     seed: int
     begun_utc: str = field(default_factory=lambda: time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()))
@@ -57,15 +57,15 @@ class Record:
     mid_torn: int = 0
     mid_frames: int = 0
     peaks: dict[str, tuple[float, int]] = field(default_factory=dict)
-    """Most MB of memory and most descriptors of each process."""
+    """Maximum memory in MB and maximum number of descriptors of each process."""
     steps: Counter[str] = field(default_factory=Counter)
-    """Of the instance that is stepped: what became of the steps."""
+    """Number of steps of the stepped instance, by result."""
     violations: list[str] = field(default_factory=list)
     violated: int = 0
 
 
 class Run:
-    """One run on one instance. ``say`` gets a line for each round, and each violation with its evidence."""
+    """A run on one instance. ``say`` prints a line for each round, and violations with evidence."""
 
     def __init__(self, folder: Path, instance: str, record: Record, say: Say) -> None:
         self.record = record
@@ -77,7 +77,7 @@ class Run:
         self._stopping = threading.Event()
 
     def complain(self, problem: str) -> None:
-        """Record a violation with all that is needed to find its cause, and end the run."""
+        """Record a violation with the evidence to find its cause, and end the run."""
         with self._turn:
             self.record.violated += 1
             if len(self.record.violations) < MOST_VIOLATIONS:
@@ -93,7 +93,7 @@ class Run:
         self._stopping.set()
 
     def check_processes(self, rig: Instance) -> None:
-        """No process of the instance but those it shows."""
+        """Check that the instance has no process that its status does not list."""
         deadline_s = time.monotonic() + END_S
         ours = ("shmio.connectors", "shmio.emulators", "shmio.endpoints", "shmio.recorder", "shmio.cli.supervisor up")
         while True:
@@ -107,12 +107,12 @@ class Run:
             if not strays:
                 return
             if time.monotonic() > deadline_s:
-                self.complain(f"processes that belong to nobody: {strays}")
+                self.complain(f"processes that are not in the status: {strays}")
                 return
             time.sleep(LOOK_S)
 
     def check_leftovers(self) -> None:
-        """Nothing is left: no segment, no process, no socket in the file system, no file but configuration and logs."""
+        """Check that no segment, process, socket or unknown file is left."""
         if left := [name for name in instances() if name.startswith(self._instance)]:
             self.complain(f"segments left behind: {left}")
         if processes := marked(self._instance):
@@ -131,9 +131,10 @@ class Suite(Run):
     def run(
         self, for_s: float, faults: Iterable[Round] | None = None, seen: Callable[[Mapping[str, Counts]], bool] = bool
     ) -> Record:
-        """Run for so long, or through the rounds given; the record. What is left behind is a violation too.
+        """Run for this time, or through the given rounds; return the record.
 
-        ``seen``: whether the checkers have seen enough by then; default: anything. On a loaded machine that takes time.
+        Things left behind are violations, too. ``seen``: True if the checkers have seen enough to
+        end the run; by default, if they have seen anything. On a loaded machine that takes time.
         """
         begun_s = well_s = time.monotonic()
         self._pulse = Pulse()
@@ -187,7 +188,7 @@ class Suite(Run):
         self.record.faults.update(fault.kind for fault in turn.faults)
         if took_s is not None:
             self.record.recoveries[last].append(took_s)
-        well = f"well again after {took_s:.2f} s" if took_s is not None else "NOT well again"
+        well = f"recovered after {took_s:.2f} s" if took_s is not None else "NOT recovered"
         self._say(f"{self.record.rounds:5d}  {'; '.join(map(str, turn.faults))}: {well}")
         if took_s is None:
             return
@@ -205,7 +206,7 @@ class Suite(Run):
         self._stopping.wait(turn.rest_s)
 
     def _renew(self, rig: Rig, panel: Panel) -> None:
-        """Stop and start the instance, as one does when its shared memory has no room for further blocks."""
+        """Restart the instance, as users must when its memory has no room for more blocks."""
         rig.down()
         rig.up()
         rig.configuration.changes = 0
@@ -216,17 +217,17 @@ class Suite(Run):
         self._history.append(f"{time.monotonic_ns()}: {fault}")
         try:
             self._inflictor.inflict(fault)
-        except Exception:  # noqa: BLE001 - an error of a command, or of the suite: a finding in any case
+        except Exception:  # noqa: BLE001 - an error of a command or of the suite: always a violation
             self.complain(f"{fault} failed: {traceback.format_exc()}")
         ended.append((time.monotonic_ns(), fault.kind))
 
     def _go_on(self, panel: Panel) -> bool:
-        """Whether those who do not need the broker go on; else that is told."""
+        """Return whether readers that do not need the broker still get values; complain if not."""
         allowed_ns = UNTOUCHED_NS * self._pulse.slowness + 3 * self._pulse.held_up_ns
         return check_bystanders(panel.counts, time.monotonic_ns(), allowed_ns, self.complain)
 
     def _check_retained(self, rig: Rig) -> None:
-        """Who subscribes now gets what is so now, and nothing else."""
+        """Check that a new subscriber gets the present state from the broker, and nothing else."""
         until_s = time.monotonic() + RETAINED_S * self._pulse.slowness
         sources, names = rig.sources(), rig.configuration.names
         while problems := wrong(retained(rig.mqtt, f"shmio/{rig.instance}"), sources, names, self._pulse.slowness):
@@ -238,9 +239,17 @@ class Suite(Run):
     def _await_recovery(
         self, rig: Rig, panel: Panel, ended_ns: int, hit: Processes, *, bystanders: bool = False
     ) -> float | None:
-        """Wait until everybody has values newer than ``ended_ns``; how long that took in s, None: too long.
+        """Wait until all readers have values newer than ``ended_ns``; return the time taken in s.
 
-        ``hit``: processes of before that are to have successors. ``bystanders``: whether only the broker was broken.
+        Args:
+            rig: The instance.
+            panel: The checkers.
+            ended_ns: CLOCK_MONOTONIC of the end of the faults.
+            hit: Processes that must have been replaced.
+            bystanders: Whether only the broker was broken, so that other readers must get values.
+
+        Returns:
+            None if the recovery takes too long, which is a violation.
         """
         while (took_ns := time.monotonic_ns() - ended_ns) < RECOVERY_S * 1e9 * self._pulse.slowness:
             bystanders = bystanders and self._go_on(panel)
@@ -253,19 +262,19 @@ class Suite(Run):
         status = rig.status()
         ill = [f"{p.name}: {p.state} {p.note}" for p in status.processes if p.state != "running"]
         self.complain(
-            f"not well {took_ns / 1e9:.0f} s after a fault: {status.state} {status.note}, {ill}, behind: {behind}"
+            f"not recovered {took_ns / 1e9:.0f} s after a fault: {status.state} {status.note}, {ill}, behind: {behind}"
         )
         return None
 
     def _epoch(self, rig: Rig) -> str:
-        """What tells one segment of an instance from the next."""
+        """Return an identifier of the instance's present segment."""
         return str((Path("/dev/shm") / f"shmio-{rig.instance}").stat().st_ino)
 
 
 def pids(rig: Rig) -> dict[str, int | None]:
-    """Of the processes that must not grow: mosquitto, too, which is the broker's child."""
+    """Return the pids of processes that must not grow, including the broker's child mosquitto."""
     found = {name: process.pid for name, process in rig.processes().items()}
     if (pid := found[BROKER]) is not None:
-        with suppress(OSError):  # it is just gone
+        with suppress(OSError):  # it has just ended
             found["mosquitto"] = broker(pid)
     return found

@@ -1,4 +1,4 @@
-"""The checkers themselves: a good history passes, and each kind of bad one is found."""
+"""The checkers accept a correct history, and detect each kind of error."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SIZE = 72
 PERIOD_NS, STALE_NS, TOLERANCE_NS = 20 * MS, 500 * MS, 50 * MS
 STARTED_NS = 1_000 * MS
 FIRST = 50
-"""The PLC has generation g from 10 ms times g on, up to this one times two."""
+"""The PLC has generation g from g times 10 ms on; the last generation is 2 * FIRST - 1."""
 
 
 @pytest.fixture
@@ -62,13 +62,13 @@ def check(source: Source, found: list[str]) -> FrameCheck:
 
 
 def block(generation: int) -> bytes:
-    """The last words are not the program's; three of them stay 0, whatever is injected over them."""
+    """Return the image of a generation. The PLC's program does not write the last words."""
     others = b"\xff" * SHOWN_AT + bytes(WORD) + b"\xff" * WORD + bytes(2 * WORD)
     return image(generation, places(SIZE - OTHERS)) + others
 
 
 def frame(number: int, generation: int = FIRST, **changes: Any) -> Frame:
-    """Frame ``number``, read in time; what it holds is a few ms old."""
+    """Return frame ``number``, read in time, with an image that is a few ms old."""
     publish_ns = STARTED_NS + FIRST * 10 * MS + number * PERIOD_NS + 5 * MS
     made = Frame(
         number=number,
@@ -121,8 +121,8 @@ BAD: dict[str, tuple[list[tuple[Frame, int]], str]] = {
     "a lost frame": ([(good(1), 0), (good(3), 0)], "comes after frame 1 with 0 missed"),
     "a frame twice": ([(good(1), 0), (good(1), 0)], "comes after frame 1"),
     "a wrong count": ([(good(1), 0), (good(3), 2)], "with 2 missed"),
-    "an old incarnation": ([(good(1, incarnation=2), 0), (good(2), 0)], "incarnation 2 was here before"),
-    "a cycle twice": ([(good(1), 0), (good(2, cycle=good(1).cycle), 0)], "cycle 26 was here before"),
+    "an old incarnation": ([(good(1, incarnation=2), 0), (good(2), 0)], "incarnation 2 came before"),
+    "a cycle twice": ([(good(1), 0), (good(2, cycle=good(1).cycle), 0)], "cycle 26 came before"),
     "a cycle too early": ([(good(1, cycle=50), 0)], "after its cycle was due"),
     "a cycle too late": ([(good(200, cycle=1), 0)], "after its cycle was due"),
     "another clock": ([(good(1, clock_ns=5), 0)], "the clock says 5"),
@@ -139,7 +139,7 @@ BAD: dict[str, tuple[list[tuple[Frame, int]], str]] = {
         [(good(1), 0), (good(2, quality=Quality.BAD, reason="no answer"), 0)],
         "not those of the frame before",
     ),
-    "a value of later": ([(frame(1, FIRST + 20), 0)], "of later"),
+    "a value of later": ([(frame(1, FIRST + 20), 0)], "which the PLC got later"),
     "an old value": ([(frame(40, FIRST), 0)], "the PLC has not had generation 50 for"),
 }
 
@@ -160,7 +160,7 @@ def test_a_frame_that_stays_turns_bad_in_time(check: FrameCheck, found: list[str
 
 
 def injected(number: int, shown: int, declared: int = DECLARED, chained: int = CHAINED, **changes: Any) -> Frame:
-    """A good frame over which ``shown`` is injected, and what the configuration declares."""
+    """Return a good frame with these values in the words under injections."""
     one = good(number, **changes)
     effective = bytearray(one.raw)
     for place, word in ((SHOWN_AT, shown), (DECLARED_AT, declared), (CHAINED_AT, chained)):
@@ -182,7 +182,7 @@ def test_what_is_injected_was_given_and_leaves_the_rest_alone(source: Source, tm
     raw = good(11, raw=injected(11, 6).image, effective=None)
     feed(check, (injected(6, 6), 0), (injected(7, 8), 0), (injected(8, 6, publish_ns=good(1).publish_ns - 1), 0))
     feed(check, (injected(9, 7), 0), (other._replace(effective=effective), 0), (raw, 0))
-    expected = ("shows 6, injected before 7", "shows 8, which nobody", "has changed others", "tells 6, which was")
+    expected = ("shows 6, injected before 7", "shows 8, which nobody", "has changed others", "has 6, which was")
     assert [any(part in line for line in found) for part in expected] == [True] * 4
     given.close()
 
@@ -225,7 +225,7 @@ def test_who_does_not_need_the_broker_goes_on(found: list[str]) -> None:
 
 
 def test_good_beyond_its_age_is_found(check: FrameCheck, found: list[str]) -> None:
-    """The frame's own age is in order, but what it holds is older: the answer had waited somewhere."""
+    """The frame is recent, but its value is too old, because the answer was delayed."""
     one = frame(10, FIRST)
     feed(check, (one, 0))
     assert found == []
@@ -274,7 +274,7 @@ def test_values_are_held_to_the_truth(source: Source, found: list[str]) -> None:
     check.value(12345, now_ns)
     check.value(FIRST + 10, now_ns + 1000 * MS)
     check.value(FIRST + 11, now_ns + 1000 * MS, slack_ns=1000 * MS)
-    assert ["comes after" in found[0], "none the PLC had" in found[1], "is good, but" in found[2]] == [True] * 3
+    assert ["comes after" in found[0], "the PLC never had" in found[1], "is good, but" in found[2]] == [True] * 3
     assert len(found) == 3
 
 
@@ -304,7 +304,7 @@ def test_restarts_are_of_those_who_were_hit(found: list[str]) -> None:
         (
             "grpc was not hit",
             "cell was to be replaced",
-            "cell was restarted, but counts 0",  # beside its pid as before
+            "cell was restarted, but counts 0",  # in addition to the old pid
             "cell was restarted, but counts 0",
             "cell was not hit",
             "cell is not there",

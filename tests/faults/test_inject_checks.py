@@ -1,4 +1,4 @@
-"""The checks of injections: a true history passes, each kind of false one is found."""
+"""The checks of injections accept a correct history, and detect each kind of error."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_what_an_injection_takes_is_held_to_what_the_plc_got(source: Source, fou
     land(source, 8, 30)
     guard.written(2, OutcomeKind.WRITTEN, "", stood=False, free=True)
     guard.written(4, OutcomeKind.TAKEN, "", stood=True, free=False)
-    guard.written(6, OutcomeKind.TAKEN, "", stood=False, free=False)  # nothing was given in its place
+    guard.written(6, OutcomeKind.TAKEN, "", stood=False, free=False)  # the injection gave no replacement
     guard.written(8, OutcomeKind.UNKNOWN, "no answer", stood=True, free=False)
     guard.written(10, OutcomeKind.REJECTED, "not now", stood=False, free=True)
     for value in (2, 4, 6, 8, 10):
@@ -62,7 +62,7 @@ def test_what_an_injection_takes_is_held_to_what_the_plc_got(source: Source, fou
 @pytest.mark.parametrize(
     ("kind", "stood", "free", "landed", "answered", "problem"),
     [
-        (OutcomeKind.WRITTEN, True, False, True, False, "past the injection that stood"),
+        (OutcomeKind.WRITTEN, True, False, True, False, "past the injection that covered"),
         (OutcomeKind.TAKEN, False, True, False, False, "there was no injection"),
         (OutcomeKind.ACCEPTED, False, False, False, False, "ended as ACCEPTED"),
         (OutcomeKind.TAKEN, True, False, True, False, "was TAKEN, but the PLC got it"),
@@ -89,7 +89,7 @@ def test_what_goes_past_one_is_found(
 def test_one_that_nobody_keeps_goes_within_a_second(found: list[str]) -> None:
     life = LifeCheck("n1", keep=False, ended_ns=10 * S, complain=found.append)
     life.look(11 * S, stands=True, awake_since_ns=0, slack_ns=0)
-    life.look(14 * S, stands=True, awake_since_ns=13 * S, slack_ns=0)  # who lifts it was stopped
+    life.look(14 * S, stands=True, awake_since_ns=13 * S, slack_ns=0)  # the process that lifts it was paused
     life.look(16 * S, stands=True, awake_since_ns=13 * S, slack_ns=2 * S)
     life.look(20 * S, stands=True, awake_since_ns=0, slack_ns=0, renewed=True)
     life.look(30 * S, stands=False, awake_since_ns=0, slack_ns=0)
@@ -97,7 +97,7 @@ def test_one_that_nobody_keeps_goes_within_a_second(found: list[str]) -> None:
     late_ns = 10 * S + LIFTED_NS + 1
     life.look(late_ns, stands=True, awake_since_ns=0, slack_ns=0)
     life.look(late_ns + 1, stands=True, awake_since_ns=0, slack_ns=0)
-    assert found == ["the injection n1 still stands 1.0 s after its client's end"]
+    assert found == ["the injection n1 still exists 1.0 s after its client's end"]
 
 
 def test_one_that_is_kept_stays(found: list[str]) -> None:
@@ -132,7 +132,7 @@ def test_a_chain_shows_its_outermost(source: Source, found: list[str]) -> None:
     ]
     assert told == [False] * 5 + [True] * 2 + [False] * 2
     chain.look(16, SHOWN_NS + 9, SHOWN_NS + 9, {INNER})
-    chain.look(16, SHOWN_NS + 9, SHOWN_NS + 10, set())  # the frame is of before
+    chain.look(16, SHOWN_NS + 9, SHOWN_NS + 10, set())  # the frame is older than the change
     chain.look(0, 3 * SHOWN_NS, 3 * SHOWN_NS, set())
     assert found == []
     assert (chain.counts.values, chain.counts.good) == (5, 2)
@@ -144,7 +144,7 @@ def test_a_chain_shows_its_outermost(source: Source, found: list[str]) -> None:
         ((9, 12), BOTH, "shows 12, which the inner injection gives, past the outer one"),
         ((9, 0), BOTH, "shows 0, which the inner injection gives, past the outer one"),
         ((8, 9), {INNER}, "shows 9, which the outer injection gave"),
-        ((0, 9), set(), "shows 9, but none stands"),
+        ((0, 9), set(), "shows 9, but there is no injection"),
     ],
 )
 def test_a_chain_in_the_wrong_order_is_found(
@@ -161,9 +161,9 @@ def test_one_of_a_chain_that_goes_without_its_clients_end_is_found(source: Sourc
     chain = ChainCheck(source, found.append)
     for now_ns in range(0, 10 * QUIET_NS, QUIET_NS):
         chain.stay({INNER}, BOTH, now_ns, 0)
-        chain.stay(BOTH, {INNER}, now_ns, now_ns - 1)  # who carries it has just been killed
+        chain.stay(BOTH, {INNER}, now_ns, now_ns - 1)  # the process that keeps it has just been killed
         chain.stay({INNER}, {INNER}, now_ns, 0)
     assert found == []
     for now_ns in range(0, 4 * QUIET_NS, QUIET_NS):
         chain.stay(BOTH, {INNER}, now_ns, -2 * QUIET_NS)
-    assert found == ["cell, chain: the outer injection is gone, but its client is there"]
+    assert found == ["cell, chain: the outer injection is gone, but its client is alive"]

@@ -1,4 +1,4 @@
-"""The check of recordings: what a recorder may leave passes, and each kind of bad recording is found."""
+"""The check of recordings accepts what a recorder may write, and detects each kind of error."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def event(number: int, frame: int) -> Event:
 
 
 def feed(check: BlockCheck, *items: Item, epoch: str = "1", away_ns: int = 0, section: int = 0) -> None:
-    """One file."""
+    """Check one file."""
     check.begin(epoch, STARTED_NS, away_ns)
     for item in items:
         check.item(item, section)
@@ -63,7 +63,7 @@ def test_good_recordings_pass(check: BlockCheck, found: list[str]) -> None:
     feed(check, gap(5, 9), good(10, event=2), away_ns=RING_NS + 6 * PERIOD_NS)  # the ring was overrun
     feed(check, good(11, event=2), good(12, event=2))
     feed(check, good(1), epoch="2")  # another run
-    feed(check, good(1), epoch="2", section=5)  # a reload has made the block anew
+    feed(check, good(1), epoch="2", section=5)  # a reload has replaced the block
     assert found == []
     assert (check.counts.frames, check.counts.missed) == (7, 7)
 

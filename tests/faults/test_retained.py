@@ -1,4 +1,4 @@
-"""The check of what the broker keeps: what is so passes, and each kind of what is not is found."""
+"""The check of retained messages accepts the present state, and detects each kind of error."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def test_what_is_so_now_passes(source: Source) -> None:
     [
         ({"status": b"offline"}, "status is b'offline'"),
         ({"status": None}, "status is None"),
-        ({"cell_shown_out": None}, "missing of cell: ['cell/shown/out'], too many: []"),
-        ({"cell_other_out": b"1"}, "missing of cell: [], too many: ['cell/other/out']"),
+        ({"cell_shown_out": None}, "missing topics of cell: ['cell/shown/out'], unexpected: []"),
+        ({"cell_other_out": b"1"}, "missing topics of cell: [], unexpected: ['cell/other/out']"),
         ({"cell_status": b'{"quality": "bad"}'}, "cell is bad"),
         ({"cell_stamp_out": str(OLD).encode()}, "value 6 is good, but"),
         ({"cell_declared_out": b"0"}, "cell/declared is b'0'"),

@@ -1,4 +1,4 @@
-"""The schedule of faults: one for each seed, with all kinds in it, and none that would hide another."""
+"""The schedule of faults depends on the seed, has all kinds, and no two faults on one target."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fault suite itself, for a short time: each kind of fault, a piece of a seed's schedule, a broken promise."""
+"""Short runs of the fault suite: each kind of fault, part of a schedule, and a violation."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def one(*targets: tuple[str, str]) -> Round:
 
 
 def seen(counts: Mapping[str, Counts]) -> bool:
-    """Everybody has seen something, and the slow reader has missed something, however slow the machine is.
+    """Return whether each reader has seen values, and the slow reader has missed frames.
 
-    Recordings are looked at when they are over.
+    Recordings are checked only after they have ended.
     """
     readers = [each for name, each in counts.items() if not name.startswith("recorded")]
     return all(each.values > 0 for each in readers) and counts["slow fast"].missed > 0
@@ -47,7 +47,7 @@ def run(folder: Path, instance: str, faults: Iterable[Round]) -> Record:
 
 
 def test_each_kind_of_fault(tmp_path: Path, instance: str) -> None:
-    """Up to three at a time, those of the supervisor alone."""
+    """Up to three faults at a time; those of the supervisor come alone."""
     alone = [one((kind, SUPERVISOR)) for kind in WEIGHTS if kind.startswith(SUPERVISOR)]
     others = [kind for kind in WEIGHTS if not (kind in DEVICE_FAULTS or kind.startswith(SUPERVISOR))]
     together = []
@@ -79,7 +79,7 @@ def test_steps_are_whole_or_fail_by_name(tmp_path: Path, instance: str) -> None:
 def test_a_piece_of_a_schedule_and_then_a_broken_promise(
     tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A process restarts although nothing was to restart it: that is told, and nothing of the rounds before."""
+    """A restart that no fault explains is a violation. The rounds before have none."""
     piece: list[Round] = []
 
     def turns() -> Iterator[Round]:

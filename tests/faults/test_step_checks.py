@@ -1,4 +1,4 @@
-"""The checks of steps: a true history passes, each kind of false one is found."""
+"""The checks of steps accept a correct history, and detect each kind of error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def found() -> list[str]:
 
 
 def answers(**changed: dict[str, Any]) -> dict[str, Answer]:
-    """Of a step as it should be, but for these fields of these sources."""
+    """Return the answers of a correct step, with these fields of these sources changed."""
     return {
         name: Answer(8, 150 * MS, Quality.GOOD, VALUES[name])._replace(**changed.get(name, {})) for name in PARTICIPANTS
     }
@@ -63,8 +63,8 @@ def test_a_step_that_is_not_whole_is_found(changed: dict[str, Any], problem: str
 @pytest.mark.parametrize(
     ("after", "problem"),
     [
-        (AFTER._replace(step=9, done=9), "step 8 is told to be done"),
-        (AFTER._replace(done=7), "step 8 is told to be done"),
+        (AFTER._replace(step=9, done=9), "step 8 is reported as done"),
+        (AFTER._replace(done=7), "step 8 is reported as done"),
         (AFTER._replace(time_ns=160 * MS), "does not lead there"),
         (AFTER._replace(mode=ClockMode.WALL), "time is not virtual"),
     ],
@@ -77,9 +77,9 @@ def test_a_page_that_tells_something_else_is_found(after: Clock, problem: str, f
 @pytest.mark.parametrize(
     ("text", "after", "problem"),
     [
-        ("step 8: it was cancelled", AFTER._replace(done=7), "names nobody"),
+        ("step 8: it was cancelled", AFTER._replace(done=7), "names no cause"),
         ("step 8: lead: ?", AFTER._replace(step=9, done=7), "more than its number"),
-        ("step 8: lead: ?", BEFORE._replace(done=6), "not asked for is done"),
+        ("step 8: lead: ?", BEFORE._replace(done=6), "nobody requested is done"),
         ("step 8: lead: ?", AFTER._replace(done=7, time_ns=0), "does not lead there"),
     ],
 )
@@ -96,4 +96,4 @@ def test_recordings_are_held_to_what_was_done(found: list[str]) -> None:
     assert found == []
     check.check(done, {3}, {3}, cycles, {})
     check.check(done, {3}, {1}, cycles | {"panel": {1}}, {"panel": 1})
-    assert ["steps [3] are done, which have failed" in found[0], "2 frames of panel are not" in found[1]] == [True] * 2
+    assert ["failed steps [3] are recorded as done" in found[0], "2 frames of panel are not" in found[1]] == [True] * 2

@@ -1,4 +1,4 @@
-"""The checks of writes: a true history passes, each kind of false one is found."""
+"""The checks of writes accept a correct history, and detect each kind of error."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_writes_are_held_to_what_the_plc_got(source: Source, landed: Truth, foun
     check.outcome(2, OutcomeKind.UNKNOWN, "no answer")
     check.outcome(4, OutcomeKind.UNKNOWN, "no answer")
     check.outcome(5, OutcomeKind.EXPIRED, "too late")
-    landed.land(4, 10)  # nobody promised anything about it
+    landed.land(4, 10)  # allowed, because its outcome is unknown
     for value in (1, 2, 4, 5):
         check.again(value)
     assert found == []

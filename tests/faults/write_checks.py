@@ -1,4 +1,4 @@
-"""The invariants of writes: what a writer is told, and what the PLC got. Each value is written once."""
+"""The invariants of writes: the reported outcome agrees with what the PLC got."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from shmio.model.values import OutcomeKind
 from tests.faults.checks import Complain, Counts, Source
 
 SURELY_NOT = {OutcomeKind.REJECTED, OutcomeKind.REFUSED, OutcomeKind.EXPIRED}
-"""Outcomes after which the device has never had the value."""
+"""Outcomes after which the device must not have got the value."""
 
 
 @dataclass
 class _ValueCheck:
-    """Of values toward one source."""
+    """The common part of the checks of values written to one source."""
 
     source: Source
     complain: Complain
@@ -26,12 +26,12 @@ class _ValueCheck:
 
 @dataclass
 class WriteCheck(_ValueCheck):
-    """Holds what a writer is told of its values to what the PLC got; each value is written once."""
+    """Compares the outcomes that a writer gets with what the PLC got. Values are written once."""
 
     _known: dict[int, tuple[OutcomeKind, int | None]] = field(default_factory=dict)
 
     def outcome(self, value: int, kind: OutcomeKind, text: str) -> None:
-        """What the writer was told of ``value``."""
+        """Check the outcome of a value."""
         since_ns = self._since_ns(value)
         self._known[value] = kind, since_ns
         self.counts.values += 1
@@ -47,7 +47,7 @@ class WriteCheck(_ValueCheck):
             self.complain(f"{self.source.name}: {value} ended as {kind.name}")
 
     def again(self, value: int) -> None:
-        """Look later: what was surely not sent does not come late, what was written does not come twice."""
+        """Check a value again later: it must not have reached the PLC late or twice."""
         kind, before_ns = self._known[value]
         since_ns = self._since_ns(value)
         if kind is not OutcomeKind.UNKNOWN and since_ns != before_ns:
@@ -57,23 +57,26 @@ class WriteCheck(_ValueCheck):
 
 
 LATE_NS = 6_500_000_000
-"""How long after it was sent a published value may get to the PLC: its time-out of 2 s, and 4.5 s for two pauses."""
+"""Maximum time until a published value reaches the PLC: time-out 2 s, and 4.5 s for two pauses."""
 
 
 @dataclass
 class PublishCheck(_ValueCheck):
-    """Holds values sent by SimlogAPI v1 Publish, which tells no outcome, to what the PLC got: in time, and once."""
+    """Checks that values sent by SimlogAPI v1 ``Publish`` reach the PLC in time and once, or never.
+
+    ``Publish`` reports no outcome.
+    """
 
     _landed: dict[int, tuple[int, int | None]] = field(default_factory=dict)
-    """When a value was sent, and when it got to the PLC."""
+    """Times at which each value was sent, and at which the PLC got it."""
 
     def sent(self, value: int, now_ns: int) -> None:
-        """A value leaves."""
+        """Record that a value is sent."""
         self._landed[value] = now_ns, None
         self.counts.values += 1
 
     def look(self, values: Sequence[int], *, slack_ns: int = 0) -> None:
-        """See what has become of them, as often as one likes."""
+        """Check whether and when the PLC got these values. It may be called repeatedly."""
         for value in values:
             sent_ns, before_ns = self._landed[value]
             since_ns = self._since_ns(value)
@@ -88,6 +91,6 @@ class PublishCheck(_ValueCheck):
             self._landed[value] = sent_ns, since_ns
 
     def forget(self, value: int) -> None:
-        """Look no more at it and at those before it."""
+        """Stop checking this value and earlier ones."""
         for old in [key for key in self._landed if key <= value]:
             del self._landed[old]

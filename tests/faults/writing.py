@@ -1,4 +1,4 @@
-"""Programs that write into each PLC's block, locally and by gRPC, always other values, and ask it what came of them."""
+"""Programs that write to each PLC, locally and by gRPC, and check what the PLC got."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ REMEMBERED = 200
 
 
 def write(checker: Checker, source: Source) -> None:
-    """Write locally, look, and look again later."""
+    """Write locally, check each outcome at once, and check it again later."""
     chance = random.Random(checker.description.seed)
     counts = checker.counts(f"writes {source.name}")
     check = WriteCheck(source, checker.complain, counts)
     past: deque[int] = deque(maxlen=REMEMBERED)
-    value = 0  # even: those that are published are odd
+    value = 0  # even values; published ones are odd
 
     def work(attachment: Attachment) -> None:
         nonlocal value
@@ -51,7 +51,7 @@ def write(checker: Checker, source: Source) -> None:
 
 
 def publish(checker: Checker, source: Source) -> None:
-    """Publish by gRPC, a few values a call, and look, then and later, what got to the PLC."""
+    """Publish by gRPC, a few values a call, and check at once and later what the PLC got."""
     chance = random.Random(checker.description.seed)
     check = PublishCheck(source, checker.complain, checker.counts(f"published {source.name}"))
     values = count(1, 2)

@@ -1,8 +1,8 @@
-"""Breaks lines of the core at random, one at a time, and says which faults no test notices.
+"""Breaks lines of the core at random, one at a time, and reports the faults that no test notices.
 
-The project is copied to a temporary folder; one process collects the tests there and forks for each fault, so the
-modules, changed, need not be imported again. Faults in C, and in what runs while a module is imported, need a new
-process each. A fault counts as caught only when a test fails twice with it.
+It works on a copy of the project. One process collects the tests there and forks for each fault, so
+that modules need not be imported again. Faults in C, and in code that runs while a module is
+imported, need a new process each. A fault counts as caught only if a test fails twice with it.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ PR_SET_CHILD_SUBREAPER: Final = 36
 
 
 def main() -> int:
-    """Run the script; 1 when a fault survived that is not explained."""
+    """Run the script; return 1 if an unexplained fault survived."""
     parser = argparse.ArgumentParser(prog="scripts/mutate", description=__doc__)
     parser.add_argument("--group", choices=GROUPS, action="append", help="default: all, one after the other")
     parser.add_argument("--count", type=int, default=25, help="faults for each group (default: 25)")
-    parser.add_argument("--seed", type=int, default=1, help="the same faults again")
-    parser.add_argument("--limit-s", type=float, default=300.0, help="longest run of the tests of one fault")
+    parser.add_argument("--seed", type=int, default=1, help="determines which faults are made (default: 1)")
+    parser.add_argument("--limit-s", type=float, default=300.0, help="time limit for the tests of one fault")
     parser.add_argument(
         "--only", metavar="TEXT", help="all faults whose FILE:LINE begins with this, instead of random ones"
     )
-    parser.add_argument("--tests", nargs="+", metavar="PATH", help="only these of the group's tests, which is quicker")
+    parser.add_argument("--tests", nargs="+", metavar="PATH", help="run only these of the group's tests, to save time")
     parser.add_argument("--list", action="store_true", help="print the faults, run nothing")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -62,7 +62,7 @@ def main() -> int:
 
 
 def _in_a_copy(group: str, options: argparse.Namespace) -> int:
-    """Do it for one group in a copy of the project, which the processes that the tests start find, too."""
+    """Break one group in a copy of the project, which processes started by tests also import."""
     with tempfile.TemporaryDirectory(prefix="shmio-mutants-") as folder:
         tree = Path(folder)
         for name in ("shmio", "tests", "examples", "docs", "proto"):
@@ -89,7 +89,7 @@ def _in_a_copy(group: str, options: argparse.Namespace) -> int:
 
 
 def _drawn(root: Path, group: str, options: argparse.Namespace) -> list[Mutant]:
-    """One fault for each line that can have one, in an order by chance; or all faults of the lines asked for."""
+    """Return a random fault of each line, in random order; with ``--only``, all of those lines."""
     lines: dict[tuple[Path, int], list[Mutant]] = defaultdict(list)
     for path in expand(root, GROUPS[group].sources):
         for mutant in mutants(root, path.relative_to(root)):
@@ -108,7 +108,7 @@ def _drawn(root: Path, group: str, options: argparse.Namespace) -> list[Mutant]:
 
 
 class _Session:
-    """A plugin that judges mutants instead of running the tests."""
+    """A pytest plugin that tests mutants instead of running the tests once."""
 
     def __init__(self, group: str, options: argparse.Namespace) -> None:
         self._group = group
@@ -116,10 +116,10 @@ class _Session:
         self.status = 2
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        """All has been collected."""
+        """Test the mutants, after pytest has collected the tests."""
         if session.testsfailed:
             return False
-        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # orphans of a test come to us
+        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # adopt the orphans of tests
         capture: Any = session.config.pluginmanager.get_plugin("capturemanager")
         with capture.global_and_fixture_disabled():
             self.status = self._judge(session.items)
@@ -131,7 +131,7 @@ class _Session:
         sources = [path.relative_to(root) for path in expand(root, GROUPS[self._group].sources)]
         _say(f"{self._group}: {len(items)} tests without a fault ...")
         for name in judge.learn(items, sources):
-            _say(f"  left out, for it fails without a fault: {name}")
+            _say(f"  left out, because it fails without a fault: {name}")
         drawn = _drawn(root, self._group, options)
         explained = _explained(root)
         caught, survived, equivalent = 0, list[Verdict](), 0
@@ -158,7 +158,7 @@ class _Session:
 
 
 def _explained(root: Path) -> set[tuple[str, str, str]]:
-    """Faults that change nothing that anybody sees; the file says why."""
+    """Return the faults that change no behaviour that matters, as (file, before, after)."""
     table = tomllib.loads((root / EQUIVALENT).read_text())
     return {(entry["file"], entry["before"], entry["after"]) for entry in table.get("mutant", ())}
 

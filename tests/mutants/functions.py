@@ -1,4 +1,4 @@
-"""Has a running program do as a changed source says, without importing it again."""
+"""Changes functions of a running program to those of a changed source, without a new import."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Change:
 
     @property
     def lines(self) -> range:
-        """Those of the function, with what is defined within."""
+        """Lines of the function, including functions defined in it."""
         return range(self.old.co_firstlineno, max(_lines(self.old)) + 1)
 
     def apply(self, path: Path) -> bool:
-        """Exchange the code of the function wherever it is used; False if it cannot be found."""
+        """Replace the function's code wherever it is used; return False if it is not found."""
         gc.unfreeze()
         done = False
         for function in gc.get_objects():
@@ -36,7 +36,7 @@ class Change:
 
 
 def change(old: str, new: str, path: Path) -> Change | None:
-    """What differs; None if that is not in a function."""
+    """Return the function that differs; None if the difference is not in one function."""
     olds, news = _functions(compile(old, path, "exec")), _functions(compile(new, path, "exec"))
     pairs = [(before, after) for before, after in zip(olds, news, strict=False) if before != after]
     if len(pairs) != 1 or pairs[0][0].co_freevars != pairs[0][1].co_freevars:
@@ -45,7 +45,7 @@ def change(old: str, new: str, path: Path) -> Change | None:
 
 
 def watch(sources: Iterable[Path]) -> set[tuple[str, int]]:
-    """Return a set to which each outermost function of these files adds its file and first line when it is called."""
+    """Record calls: each outermost function adds its file and first line to the returned set."""
     called: set[tuple[str, int]] = set()
     vars(builtins)["_mutants_called"] = called.add
     watched: dict[tuple[str, str, int], CodeType] = {}
@@ -54,7 +54,7 @@ def watch(sources: Iterable[Path]) -> set[tuple[str, int]]:
         for function in _outermost(tree):
             first = function.decorator_list[0].lineno if function.decorator_list else function.lineno
             told = ast.parse(f"_mutants_called(({str(path)!r}, {first}))").body[0]
-            function.body.insert(0, told)  # the docstring is lost
+            function.body.insert(0, told)  # this removes the docstring
         for code in _functions(compile(ast.fix_missing_locations(tree), path, "exec")):
             watched[str(path), code.co_qualname, code.co_firstlineno] = code
     gc.unfreeze()

@@ -1,4 +1,4 @@
-"""What is broken, and the tests that should notice."""
+"""Groups of source files to break, with the tests that should notice."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 
 @dataclass(frozen=True)
 class Group:
-    """A part of the core. All paths are globs from the project's root; a test file may stand in several groups."""
+    """Source files and their tests, as globs from the project's root. Groups may share tests."""
 
     sources: tuple[str, ...]
     tests: tuple[str, ...]
@@ -82,9 +82,9 @@ GROUPS: Final = {
 
 
 def expand(root: Path, patterns: tuple[str, ...]) -> Iterator[Path]:
-    """The files that the globs name; SystemExit if one names none."""
+    """Yield the files that match the globs. SystemExit: a glob matches no file."""
     for pattern in patterns:
         found = sorted(root.glob(pattern))
         if not found:
-            raise SystemExit(f"{pattern} names nothing: correct tests/mutants/groups.py")
+            raise SystemExit(f"{pattern} matches no file: correct tests/mutants/groups.py")
         yield from found

@@ -1,4 +1,4 @@
-"""Which tests notice a fault: runs them in forks of one process that has collected them, or in new processes."""
+"""Finds the tests that notice a fault. It runs them in forks, or in new processes."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ from tests.mutants.functions import Change, change, watch
 from tests.mutants.mutations import Mutant
 
 MEMORY_BYTES: Final = 2 << 30
-"""A process that has more has been caught: a fault may ask for any amount."""
+"""Maximum memory of a test process. A fault that needs more counts as caught."""
 LOOK_S: Final = 0.2
 SLOWEST_S: Final = 20.0
-"""So long each test may take, and ten times what it takes without a fault."""
+"""Minimum time-out of a test; the time-out is at least ten times its duration without a fault."""
 PR_SET_PDEATHSIG: Final = 1
 NATIVE: Final = "tests/native/"
-"""The processes that these tests start run C alone."""
+"""Tests whose child processes run only C."""
 STARTS: Final = {"subprocess.Popen", "os.posix_spawn", "os.fork", "os.exec"}
 
 
 @dataclass
 class Known:
-    """What a run without a fault told of one test."""
+    """What a run without a fault showed about one test."""
 
     took_s: float = 0.0
     passed: bool = True
     starts_processes: bool = False
     calls: set[tuple[str, int]] = field(default_factory=set)
-    """File and first line of all code of the core that it called."""
+    """File and first line of each function of the core that it called."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of one mutant. ``caught_by``: the test that failed twice, or empty."""
+    """The result for one mutant. ``caught_by``: the test that failed twice, or empty."""
 
     mutant: Mutant
     caught_by: str
@@ -55,7 +55,7 @@ class Verdict:
 
 
 class Judge:
-    """Breaks the copy of the project in the current folder, and runs its tests. One at a time."""
+    """Runs the tests on one mutant at a time, in the copy of the project in the current folder."""
 
     def __init__(self, limit_s: float) -> None:
         self._tree = Path.cwd()
@@ -64,7 +64,7 @@ class Judge:
         self._known: dict[str, Known] = {}
 
     def learn(self, items: Sequence[pytest.Item], sources: Iterable[Path]) -> list[str]:
-        """Run all tests once without a fault; the names of those that fail, and will be left out."""
+        """Run all tests once without a fault; return those that fail, which are left out."""
         self._items = {item.nodeid: item for item in items}
         files = [self._tree / source for source in sources if source.suffix == ".py"]
         log = self._forked(list(self._items), lambda: None, 3600.0, files)
@@ -88,21 +88,21 @@ class Judge:
         return [name for name, known in self._known.items() if not known.passed]
 
     def judge(self, mutant: Mutant) -> Verdict | None:
-        """Run the tests on a mutant; None if it is none: the compiler refuses it."""
+        """Run the tests on a mutant. None: it does not compile."""
         begun_s = time.monotonic()
         broken, whole = self._tree / mutant.path, self._tree / "whole"
         shutil.copy2(broken, whole)
         broken.write_text(mutant.source)
         try:
             if mutant.path.suffix != ".py" and not self._build():
-                return None  # and nothing was exchanged
+                return None  # the extension was not replaced
             changed = None
             if mutant.path.suffix == ".py":
                 changed = change(whole.read_text(), mutant.source, broken)
             names, run = self._plan(changed, broken)
             suspect = self._first_failure(run(names, self._limit_s))
             caught = suspect if suspect and self._first_failure(run([suspect], self._limit_s)) else ""
-            if suspect and not caught:  # that one may fail by chance: the others decide
+            if suspect and not caught:  # it may have failed by chance, so the other tests decide
                 names = names[names.index(suspect) + 1 :]
                 suspect = self._first_failure(run(names, self._limit_s))
                 caught = suspect if suspect and self._first_failure(run([suspect], self._limit_s)) else ""
@@ -113,7 +113,10 @@ class Judge:
         return Verdict(mutant, caught, len(names), time.monotonic() - begun_s)
 
     def _plan(self, changed: Change | None, broken: Path) -> tuple[list[str], Callable[[list[str], float], list[str]]]:
-        """The tests, those of the module first, then those that end soonest, and what runs them."""
+        """Return the tests to run, and the function that runs them.
+
+        The tests of the changed module come first, then the fastest.
+        """
 
         def turn(name: str) -> tuple[bool, float]:
             return Path(name.partition("::")[0]).stem != f"test_{broken.stem}", self._known[name].took_s
@@ -128,14 +131,14 @@ class Judge:
             for name in usable
             if any(file == str(broken) and first in lines for file, first in self._known[name].calls)
         ]
-        if not covering:  # called while a module is imported, or in other processes only
+        if not covering:  # called only while a module is imported, or in other processes
             return python, self._anew
         beyond = [name for name in python if self._known[name].starts_processes and name not in covering]
 
         def run(names: list[str], limit_s: float) -> list[str]:
             def apply() -> None:
                 if not changed.apply(broken):
-                    raise RuntimeError(f"{changed.old.co_qualname} of {broken} is nowhere")
+                    raise RuntimeError(f"{changed.old.co_qualname} of {broken} is not loaded")
 
             return self._forked(names, apply, limit_s, ())
 
@@ -143,7 +146,7 @@ class Judge:
 
     @staticmethod
     def _first_failure(log: Iterable[str]) -> str:
-        """The test that failed, or did not end."""
+        """Return the first test that failed or did not end; empty: all passed."""
         begun = ""
         for line in log:
             kind, _, name = line.partition(" ")
@@ -167,7 +170,7 @@ class Judge:
                 apply()
                 self._run(names, log, traced)
                 status = 0
-            except BaseException as error:  # noqa: BLE001 - told by the parent
+            except BaseException as error:  # noqa: BLE001 - the parent reports it
                 with log.open("a") as lines:
                     lines.write(f"broken {error!r}\n")
             finally:
@@ -180,7 +183,10 @@ class Judge:
         return told
 
     def _run(self, names: list[str], log: Path, traced: Sequence[Path]) -> None:
-        """The tests, in the child, until one fails; all of them, and what they call, if ``traced``."""
+        """Run the tests in the child until one fails.
+
+        With ``traced`` files, run all tests, and log their calls to functions of these files.
+        """
         os.setsid()
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         items = [self._items[name] for name in names]
@@ -212,7 +218,7 @@ class Judge:
     # -- in a new process ----------------------------------------------------------------------------------------------
 
     def _anew(self, names: list[str], limit_s: float) -> list[str]:
-        """What is done while modules are imported, and C, need a new process."""
+        """Run the tests in a new process, for faults in C or in code that runs at import."""
         arguments = self._tree / "names"
         arguments.write_text("\n".join(names))
         command = [sys.executable, "-m", "pytest", "-x", "-v", "--tb=no", "-p", "no:cacheprovider", "--numprocesses=0"]
@@ -239,7 +245,7 @@ class Judge:
         if popen.returncode == 0:
             log.append("end")
         elif not log:
-            log.append(f"begin {names[0]}")  # not even collected
+            log.append(f"begin {names[0]}")  # collecting failed
         return log
 
     # -- the C extension -----------------------------------------------------------------------------------------------
@@ -271,7 +277,7 @@ class Judge:
 
 
 class _Told:
-    """A plugin that writes down which test fails, and in the log what else is known of it."""
+    """A pytest plugin that logs which test fails, and whether it starts processes."""
 
     def __init__(self, write: Callable[[str], object]) -> None:
         self._write = write
@@ -284,24 +290,24 @@ class _Told:
         self._write(f"begin {name}\n")
 
     def audit(self, event: str, _arguments: object) -> None:
-        """Something has happened in the interpreter."""
+        """Note an audit event of the interpreter: whether the test starts a process."""
         self._starts |= event in STARTS
 
     def flush(self) -> None:
-        """The test is over."""
+        """Log what is known at the end of a test."""
         if self._starts:
             self._starts = False
             self._write("starts\n")
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """One of its phases is over."""
+        """Log a failed phase of a test."""
         if report.failed:
             self.failed = True
             self._write(f"fail {self._name}\n")
 
 
 def _wait(pid: int, limit_s: float) -> None:
-    """Until it ends, or its time is over, or its memory."""
+    """Wait for a process; kill it if it exceeds its time or memory."""
     until_s = time.monotonic() + limit_s
     descriptor = os.pidfd_open(pid)
     try:
@@ -316,7 +322,7 @@ def _wait(pid: int, limit_s: float) -> None:
 
 
 def _end_all() -> None:
-    """What a test left running is ours, for orphans come to us: :func:`adopt`. Its segments go, too."""
+    """Kill the processes that a test left running. As orphans they are children of this process."""
     while True:
         found = [int(pid) for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]
         if not found:

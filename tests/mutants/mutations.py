@@ -1,4 +1,4 @@
-"""Small faults for a source file, one at a time. The number of lines stays, so that all else is where it was."""
+"""Makes small faults in a source file, one at a time. The number of lines stays the same."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _ARITHMETIC: Final[dict[type[ast.operator], type[ast.operator]]] = {
     ast.RShift: ast.LShift,
 }
 _UNTOUCHED: Final = {"log", "logging", "warnings"}
-"""What is called on these names only tells somebody something."""
+"""Calls on these names only log or warn, so they are not changed."""
 
 _C_SWAPS: Final = (
     (r"<=", "<"),
@@ -67,23 +67,23 @@ _C_DECLARATION: Final = re.compile(
 
 @dataclass(frozen=True)
 class Mutant:
-    """One fault."""
+    """A source file with one fault."""
 
     path: Path
     line: int
     before: str
     after: str
     source: str
-    """The whole file with the fault."""
+    """Text of the whole file with the fault."""
 
     @property
     def title(self) -> str:
-        """For people."""
+        """Description for people."""
         return f"{self.path}:{self.line}: {self.before}  ->  {self.after}"
 
 
 def mutants(root: Path, path: Path) -> Iterator[Mutant]:
-    """All faults that can be made in a file."""
+    """Yield all faults that can be made in a file."""
     text = (root / path).read_text()
     yield from (_of_python(path, text) if path.suffix == ".py" else _of_c(path, text))
 
@@ -126,7 +126,7 @@ def _faults(tree: ast.Module) -> Iterator[tuple[ast.expr | ast.stmt, ast.expr | 
 
 
 def _parts(node: ast.AST) -> Iterator[ast.AST]:
-    """What may be broken within it: no annotations, no text."""
+    """Yield the parts of a node that may be changed: no annotations, decorators or messages."""
     skipped: list[ast.AST | None] = []
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
         skipped += [node.returns, *node.decorator_list]
@@ -135,7 +135,7 @@ def _parts(node: ast.AST) -> Iterator[ast.AST]:
     elif isinstance(node, ast.arg | ast.AnnAssign):
         skipped.append(node.annotation)
     elif isinstance(node, ast.Raise):
-        return  # what it says is not behaviour; that it is raised, is broken as a whole
+        return  # the message is not behaviour; the whole statement is removed as a fault
     for part in ast.iter_child_nodes(node):
         if not any(part is other for other in skipped):
             yield part
@@ -200,7 +200,7 @@ def _of_expression(node: ast.expr) -> Iterator[ast.expr]:
     elif isinstance(fault, ast.Constant):
         if isinstance(fault.value, bool):
             yield ast.Constant(not fault.value)
-        elif isinstance(fault.value, int | float):  # one more hardly matters to a limit, so these double
+        elif isinstance(fault.value, int | float):  # one more would hardly change a large limit, so these double
             yield ast.Constant(fault.value + 1 if abs(fault.value) <= 16 else fault.value * 2)
 
 
