@@ -41,9 +41,9 @@ class Source:
     guarded: Truth | None = None
     """Values written into the word ``guarded``, over whose ``/in`` injections are laid."""
     given: Truth | None = None
-    """Values that injections were about to give, of the words ``shown`` and ``guarded``."""
+    """Values that clients were going to inject into the words ``shown`` and ``guarded``."""
     chained: Truth | None = None
-    """Values that the chain was about to give, of the word ``chained``.
+    """Values that clients were going to inject into the word ``chained``.
 
     The inner client gives multiples of 4, the outer client one more.
     """
@@ -63,7 +63,7 @@ class Counts:
     missed: int = 0
     values: int = 0
     since_ns: int = 0
-    """CLOCK_MONOTONIC at which the PLC got the newest good value; without a truth, when it was seen."""
+    """CLOCK_MONOTONIC when the PLC got the newest good value; without a truth, when it was read."""
 
 
 @dataclass

@@ -14,7 +14,7 @@ from tests.faults.checks import Counts, Source, ValueCheck
 
 READERS = 50
 ON_FASTEST = 4
-"""Number of readers of the fastest source. This process reads a line for each of its frames."""
+"""Number of readers of the fastest source: few, because each frame is a line to check here."""
 TURN_S = 0.1
 LINE = re.compile(rb"(\d+) cycle (\d+) missed (\d+) (good|uncertain|bad) (\d+) (.*)")
 GONE = re.compile(r"no instance|.* is starting|.* has stopped|source \S+ was changed")

@@ -1,4 +1,4 @@
-"""Finds and tears the next slot of a ring. Written from the page on the segment format alone."""
+"""Makes the next slot of a ring half-written, and detects such a slot, by the documented format."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _FRAMES: Final = 2
 
 
 class Slot(NamedTuple):
-    """The slot after the newest frame. ``number``: of the next frame."""
+    """The slot after the newest frame. ``number``: number of the next frame."""
 
     number: int
     offset: int

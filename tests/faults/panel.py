@@ -16,7 +16,7 @@ MODULES: Final = ("local", "remote", "mqtt", "churn", "writing", "injecting", "c
 LATE: Final = ("slow", "recorded", "injected")
 """Name prefixes of the counters of checkers that see values late, or one source after the other."""
 END_S: Final = 200.0
-"""Maximum time for a checker to end. That of the recordings first reads those that remain."""
+"""Maximum time for a checker to end: that of the recordings first reads the remaining files."""
 
 
 class Panel:

@@ -38,7 +38,7 @@ CHAINED_AT = 5 * WORD
 
 
 class Noting:
-    """The server's lock for each job. It records what the job has written before it is released."""
+    """The server's lock for each job. Before its release it records what the job has written."""
 
     def __init__(self, block: bytearray, landed: Truth, guarded: Truth) -> None:
         self._lock = threading.Lock()

@@ -11,7 +11,7 @@ from tests.faults.checks import Complain
 
 MOST_GROWTH_MB: Final = 100.0
 MOST_DESCRIPTORS: Final = 500
-"""Far more than an instance of this size needs with all its clients."""
+"""Maximum number of descriptors, far more than such an instance needs with all its clients."""
 
 _PAGE_MB: Final = os.sysconf("SC_PAGE_SIZE") / 1e6
 

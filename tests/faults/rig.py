@@ -37,7 +37,7 @@ TOLERANCE_MS: Final = 100
 
 
 class Device:
-    """An emulated PLC in a separate process behind a proxy. It records its block's truth."""
+    """An emulated PLC in a separate process behind a proxy. ``truth``: what its block had."""
 
     def __init__(self, name: str, folder: Path, address: Address, environment: dict[str, str]) -> None:
         self._file = folder / f"{name}.truth"

@@ -40,7 +40,7 @@ RENEWING: Final = {"relayout"}
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault. It begins ``after_s`` after its round, and lasts ``for_s`` if its kind lasts."""
+    """A fault. It begins ``after_s`` after its round. Faults with a duration last ``for_s``."""
 
     kind: str
     target: str

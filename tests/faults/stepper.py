@@ -27,7 +27,7 @@ DTS_MS: Final = (1, 20, 50)
 
 
 class Stepper:
-    """Steps the instance, and again after each restart of the instance."""
+    """Moves the time of an instance, also after each restart of the instance."""
 
     def __init__(self, instance: str, grpc: str, way: str, seed: int) -> None:
         self._instance, self._grpc, self._way = instance, grpc, way

@@ -200,7 +200,7 @@ class Stepping(Run):
         self._contend(moving)
 
     def _await_recovery(self, rig: Instance, moving: Moving, ended_ns: int) -> bool:
-        """Wait until a step that began since has been done, and all processes run."""
+        """Return True when all processes run and a step that began after ``ended_ns`` is done."""
         while (took_ns := time.monotonic_ns() - ended_ns) < RECOVERY_S * 1e9:
             if moving.begun_ns > ended_ns and rig.status().state == "running":
                 return True
