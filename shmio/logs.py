@@ -147,6 +147,8 @@ def fields(**values: object) -> dict[str, dict[str, object]]:
 
 def printable(text: str) -> str:
     """Return text as one line, without characters that would move a terminal's cursor."""
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

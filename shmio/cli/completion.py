@@ -129,5 +129,5 @@ def _running(options: argparse.Namespace) -> dict[str, list[str]]:
     if getattr(options, "host", None) is not None:
         return {}
     with Attachment(target(options).open()) as attachment:
-        layouts = {source: attachment.block(source).layout for source in attachment.sources}
-    return {source: [register.path for register in layout.registers] for source, layout in layouts.items()}
+        layouts = attachment.layouts()
+        return {source: [register.path for register in layout.registers] for source, layout in layouts.items()}

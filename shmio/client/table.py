@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -95,8 +94,7 @@ SimulateResponse = _message("SimulateResponse")
 # -- tables --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Register(model.Register):
+class Register(model.Register, frozen=True, gc=False, kw_only=True):
     """A register, or an array's element, as the wire describes it.
 
     Attributes:
@@ -106,8 +104,8 @@ class Register(model.Register):
         initial: The source's text of the initial value; only in layouts.
     """
 
-    column: Column = field(kw_only=True)
-    slot: int = field(kw_only=True)
+    column: Column
+    slot: int
 
     @property
     def element(self) -> ElementType:

@@ -36,6 +36,7 @@ from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.write import Write, apply
 from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record
+from shmio.segment.block import Layouts
 from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.standing_injections import StandingInjection
 
@@ -249,7 +250,7 @@ class DeclaredInjections:
 
         """
         self._blocks = dict(self._blocks_of())
-        layouts = {source: block.layout for source, block in self._blocks.items()}
+        layouts = Layouts(self._blocks)
         periods_ns = {source: block.period_ns for source, block in self._blocks.items()}
         program = compile_program(declaration, layouts, periods_ns)
         if program.source != self._own.source:
@@ -262,7 +263,7 @@ class DeclaredInjections:
             return
         blocks = dict(self._blocks_of())
         before, self._blocks = self._blocks, blocks
-        layouts = {source: block.layout for source, block in blocks.items()}
+        layouts = Layouts(blocks)
         for layer in self._layers:
             if all(before.get(source) is blocks.get(source) for source in layer.program.foreign):
                 continue

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
+import msgspec
 import numpy as np
 
 from shmio.config.faults import meant
@@ -23,7 +24,9 @@ class A50:
     def __init__(self, layout: Layout) -> None:
         """Find the registers; ConfigError names a missing register or one of another type."""
         # The printed DB201 has a space for the underscore in some names.
-        named = tuple(replace(register, path=register.path.replace(" ", "_")) for register in layout.registers)
+        named = tuple(
+            msgspec.structs.replace(register, path=register.path.replace(" ", "_")) for register in layout.registers
+        )
         try:
             self._runner = ModelRunner(A50Cell, replace(layout, registers=named))
         except ConfigError as error:

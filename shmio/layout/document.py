@@ -6,7 +6,9 @@ computed again and compared.
 
 from __future__ import annotations
 
+import hashlib
 import math
+from collections import Counter
 from typing import Annotated
 
 import msgspec
@@ -15,7 +17,6 @@ from shmio.errors import LayoutError, PathError
 from shmio.layout.model import (
     ALIASES,
     MAX_BLOCK_BYTES,
-    MAX_DIMENSIONS,
     MAX_ELEMENTS,
     MAX_REGISTERS,
     ByteOrder,
@@ -26,32 +27,17 @@ from shmio.layout.model import (
     element_type,
     shape_of,
 )
-from shmio.layout.topic import MAX_TOPIC, canonical_path
+from shmio.layout.topic import check_canonical
 
 MAX_JSON_BYTES = 128 << 20
-
-_Bound = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
-_Size = Annotated[int, msgspec.Meta(ge=0, le=MAX_BLOCK_BYTES)]
-
-
-class _Register(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    path: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_TOPIC)]
-    type: str
-    dims: Annotated[list[tuple[_Bound, _Bound]], msgspec.Meta(min_length=1, max_length=MAX_DIMENSIONS)] | None
-    offset: _Size
-    bit: Annotated[int, msgspec.Meta(ge=0, le=7)] | None
-    size: _Size
-    count: Annotated[int, msgspec.Meta(ge=1, le=MAX_ELEMENTS)]
-    comment: str
-    initial: str | None
 
 
 class _Layout(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     name: str
     number: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None
-    size: _Size
+    size: Annotated[int, msgspec.Meta(ge=0, le=MAX_BLOCK_BYTES)]
     optimized: bool
-    registers: Annotated[list[_Register], msgspec.Meta(max_length=MAX_REGISTERS)]
+    registers: Annotated[tuple[Register, ...], msgspec.Meta(max_length=MAX_REGISTERS)]
     byte_order: ByteOrder = "big"
 
 
@@ -72,46 +58,56 @@ def load_layout(data: bytes) -> Layout:
         document = _DECODER.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise LayoutError(f"layout: {error}") from None
-    registers: list[Register] = []
-    seen: set[str] = set()
+    registers = document.registers
+    for register in registers:
+        if not register.dims:
+            msgspec.structs.force_setattr(register, "dims", ())
+    _check(document)
+    layout = Layout(document.name, document.number, document.size, document.optimized, registers, document.byte_order)
+    vars(layout)["hash"] = hashlib.sha256(data).digest()  # to make the JSON anew would take longer than to read it
+    return layout
+
+
+def _check(document: _Layout) -> None:
+    """Raise LayoutError if a register is impossible, or two contradict each other."""
+    kinds: dict[tuple[str, Dims], tuple[int, int, bool]] = {}
     end_bits = elements = 0
-    for item in document.registers:
-        register = _register(item)
-        if register.path in seen:
-            raise LayoutError(f"layout: two registers have the path {register.path!r}")
-        first = register.offset * 8 + (register.bit or 0)
+    for register in document.registers:
+        kind = register.type, register.dims
+        size, count, has_bit = kinds.get(kind) or kinds.setdefault(kind, _kind(register))
+        if register.size != size or register.count != count or register.partial:
+            raise LayoutError(f"layout: {register.path!r} has a size or count that does not fit its type")
+        bit = register.bit
+        if (bit is not None) != has_bit or (bit and register.dims):
+            raise LayoutError(f"layout: {register.path!r} has a bit that does not fit its type")
+        first = register.offset * 8 + (bit or 0)
         if first < end_bits:
             raise LayoutError(f"layout: {register.path!r} overlaps the register before it")
-        alone = register.bit is not None and not register.dims
-        end_bits = first + (1 if alone else register.size * 8)
-        elements += register.count
-        seen.add(register.path)
-        registers.append(register)
+        end_bits = first + (1 if has_bit and not register.dims else size * 8)
+        elements += count
     if end_bits > document.size * 8 or elements > MAX_ELEMENTS:
         raise LayoutError(f"layout: the registers do not fit the block of {document.size} bytes")
-    return Layout(
-        document.name, document.number, document.size, document.optimized, tuple(registers), document.byte_order
-    )
-
-
-def _register(item: _Register) -> Register:
-    element = element_type(item.type)
-    if element is None or element.name != item.type or item.type in ALIASES:
-        raise LayoutError(f"layout: {item.path!r} has the unknown type {item.type!r}")
-    dims: Dims = tuple(item.dims or ())
-    if any(low > high for low, high in dims):
-        raise LayoutError(f"layout: {item.path!r} has inverted bounds")
-    shape = shape_of(dims)
-    if item.count != math.prod(shape) or item.size != array_size(element, shape):
-        raise LayoutError(f"layout: {item.path!r} has a size or count that does not fit its type")
-    if (item.bit is None) != (element.base != "BOOL") or (dims and item.bit):
-        raise LayoutError(f"layout: {item.path!r} has a bit that does not fit its type")
+    paths = [register.path for register in document.registers]
+    if len(set(paths)) < len(paths):
+        twice = next(path for path, times in Counter(paths).items() if times > 1)
+        raise LayoutError(f"layout: two registers have the path {twice!r}")
     try:
-        path = canonical_path(item.path)
+        check_canonical(paths)
     except PathError as error:
         raise LayoutError(f"layout: {error}") from None
-    if path != item.path:
-        raise LayoutError(f"layout: {item.path!r} is not a path in its canonical form")
-    return Register(
-        item.path, item.type, dims, item.offset, item.bit, item.size, item.count, item.comment, item.initial
-    )
+
+
+def _kind(register: Register) -> tuple[int, int, bool]:
+    """Return size, count and whether it has a bit, of each register of this type and these bounds.
+
+    Raises:
+        LayoutError: There is no such type, or a bound is wrong.
+
+    """
+    element = element_type(register.type)
+    if element is None or element.name != register.type or register.type in ALIASES:
+        raise LayoutError(f"layout: {register.path!r} has the unknown type {register.type!r}")
+    if any(low > high for low, high in register.dims):
+        raise LayoutError(f"layout: {register.path!r} has inverted bounds")
+    shape = shape_of(register.dims)
+    return array_size(element, shape), math.prod(shape), element.base == "BOOL"

@@ -7,8 +7,10 @@ import math
 import re
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
+
+import msgspec
 
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Dims, Register, flat_index, shape_of
@@ -204,7 +206,7 @@ def assign(
             report.add(assignment.position.error(f"expected a whole number for {target.part}"))
     result = list(found)
     for index, text in texts.items():
-        result[index] = replace(found[index], initial=str(text))
+        result[index] = msgspec.structs.replace(found[index], initial=str(text))
     return tuple(result)
 
 

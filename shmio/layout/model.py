@@ -9,14 +9,15 @@ of a block with standard access, as given in Siemens' STEP 7 help under "Data ty
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import re
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import msgspec
 
 from shmio.errors import PathError
 
@@ -33,6 +34,7 @@ MAX_STRUCTURES = 200_000  # of a block, including structures without registers
 _MAX_STRING = 254
 _MAX_WSTRING = 16_382
 DEFAULT_STRING = 254
+MAX_PATH = 16_384  # characters
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +131,18 @@ def element_type(name: str) -> ElementType | None:
     return ElementType(f"{base}[{length}]", base, size, 2, length)
 
 
-@dataclass(frozen=True, slots=True)
-class Register:
+_Path = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_PATH)]
+_Bound = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
+_Size = Annotated[int, msgspec.Meta(ge=0, le=MAX_BLOCK_BYTES)]
+_Bit = Annotated[int, msgspec.Meta(ge=0, le=7)]
+_Count = Annotated[int, msgspec.Meta(ge=1, le=MAX_ELEMENTS)]
+if TYPE_CHECKING:
+    _Dims = Dims
+else:  # a scalar's JSON has null, which the reader of layouts replaces
+    _Dims = Annotated[tuple[tuple[_Bound, _Bound], ...], msgspec.Meta(min_length=1, max_length=MAX_DIMENSIONS)] | None
+
+
+class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True):
     """A named, typed value at a fixed place in a block.
 
     Attributes:
@@ -148,13 +160,13 @@ class Register:
 
     """
 
-    path: str
+    path: _Path
     type: str
-    dims: Dims
-    offset: int
-    bit: int | None
-    size: int
-    count: int
+    dims: _Dims
+    offset: _Size
+    bit: _Bit | None
+    size: _Size
+    count: _Count
     comment: str = ""
     initial: str | None = None
     partial: bool = False
@@ -259,8 +271,11 @@ class Layout:
 
     def to_json(self) -> bytes:
         """Return canonical JSON: :meth:`describe` and ``byte_order``, keys in fixed order, no white space, UTF-8."""
-        document = self.describe() | {"byte_order": self.byte_order}
-        return json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
+        return self._json
+
+    @cached_property
+    def _json(self) -> bytes:
+        return msgspec.json.encode(self.describe() | {"byte_order": self.byte_order})
 
 
 def _describe(register: Register) -> Mapping[str, object]:

@@ -18,19 +18,19 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal, TypeVar, cast
 
 from shmio.config import RESERVED_SOURCES
 from shmio.errors import PathError
-from shmio.layout.model import INTEGERS, MAX_DEPTH, MAX_DIMENSIONS, Layout, Register, array_size
+from shmio.layout.model import INTEGERS, MAX_DEPTH, MAX_DIMENSIONS, MAX_PATH, Layout, Register, array_size
 
 Direction = Literal["in", "out"]
 
 _Found = TypeVar("_Found")
 
-MAX_TOPIC = 16_384
+MAX_TOPIC = MAX_PATH
 _MAX_SEGMENTS = MAX_DEPTH * (1 + MAX_DIMENSIONS)  # names, each with its indices
 _NEAR_CANDIDATES = 500
 _NEAR_CHARACTERS = 200
@@ -46,6 +46,8 @@ _WIDTHS: Final = {"B": ("BYTE", 1), "W": ("WORD", 2), "D": ("DWORD", 4)}
 _ESCAPE = re.compile(r"%([0-9A-Fa-f]{2})?")
 _RESERVED = re.compile(r"[/%+#]")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_NOT_PLAIN = re.compile(r"[%+#\x00-\x09\x0b-\x1f\x7f]|//|^/|/$|(?:^|/)(?:in|out)(?:/|$)", re.MULTILINE)
+"""Finds what a path without percent-encoding cannot contain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +127,25 @@ def canonical_path(path: str, *, parts: bool = False) -> str:
     if _CONTROL.search(canonical):
         raise PathError(f"{shorten(path)!r}: a path must not contain control characters")
     return canonical
+
+
+def check_canonical(paths: Sequence[str]) -> None:
+    """Check that paths are in canonical encoding; fast if none of them needs an encoding.
+
+    Raises:
+        PathError: A path is not in its canonical form.
+
+    """
+    text = "\n".join(paths)
+    if (
+        text.count("\n") < len(paths)
+        and _NOT_PLAIN.search(text) is None
+        and all(path.count("/") < _MAX_SEGMENTS for path in paths)
+    ):
+        return
+    for path in paths:
+        if canonical_path(path) != path:
+            raise PathError(f"{path!r} is not a path in its canonical form")
 
 
 def parse_topic(text: str, sources: Collection[str], default: str | None) -> Topic:

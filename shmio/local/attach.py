@@ -40,7 +40,7 @@ from shmio.local.writer import SourceWriter
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted, Running
 from shmio.model.values import Outcome, Quality, Reading
-from shmio.segment.block import Block, Cursor, Entry, Frame
+from shmio.segment.block import Block, Cursor, Entry, Frame, Layouts
 from shmio.segment.commands import Direction
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
@@ -91,10 +91,10 @@ class Attachment:
         """Whether the attached instance still runs. Once it has stopped, attach again."""
         return self._segment.shared.current()
 
-    def layouts(self, *sources: str) -> dict[str, Layout]:
+    def layouts(self, *sources: str) -> Mapping[str, Layout]:
         """Return the layouts of these sources, or of all, by source. PathError: no such source."""
         self._segment.require_running()
-        return {source: self.block(source).layout for source in dict.fromkeys(sources) or self._blocks()}
+        return Layouts({source: self.block(source) for source in sources} if sources else self._blocks())
 
     def real_sources(self) -> list[str]:
         """Return the names of the sources that steps do not move, such as those with a device."""
@@ -144,7 +144,7 @@ class Attachment:
         """
         self._segment.require_running()
         blocks = self._blocks()
-        chosen = choose(patterns, {source: block.layout for source, block in blocks.items()})
+        chosen = choose(patterns, Layouts(blocks))
         frames = {source: blocks[source].latest() for source in {source for source, _ in chosen}}
         return [reading(blocks[source], register, frames[source]) for source, register in chosen]
 

@@ -24,7 +24,7 @@ from shmio.local.subscription import Following
 from shmio.local.writer import PendingCommand, SourceWriter
 from shmio.model.injection import Declared, Happening
 from shmio.model.values import Outcome
-from shmio.segment.block import Block, Cursor
+from shmio.segment.block import Block, Cursor, Layouts
 from shmio.segment.commands import CommandAssembler, CommandWrites, Direction, apply, decode_writes
 from shmio.segment.events import Event, EventKind
 from shmio.segment.segment import Segment
@@ -239,7 +239,7 @@ def compile_declarations(
     from shmio.injection import compile_program  # noqa: PLC0415 - loads numpy, which nothing else here needs
 
     check_declarations(declarations)
-    layouts = {source: block.layout for source, block in blocks.items()}
+    layouts = Layouts(blocks)
     periods_ns = {source: block.period_ns for source, block in blocks.items()}
     programs = []
     for index, declaration in enumerate(declarations):

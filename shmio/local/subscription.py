@@ -18,7 +18,7 @@ from shmio.layout.model import Register
 from shmio.layout.topic import parse_topic
 from shmio.local.reading import reading
 from shmio.model.values import Provenance, Quality, Reading
-from shmio.segment.block import Block, Frame, FrameFollower
+from shmio.segment.block import Block, Frame, FrameFollower, Layouts
 from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.doorbell import Relay
 from shmio.segment.segment import Segment
@@ -177,7 +177,7 @@ class Subscription(Following[Update]):
     def _begin(self) -> None:
         """Follow the blocks that the patterns name. PathError: one names nothing."""
         blocks = self._blocks()
-        layouts = {source: block.layout for source, block in blocks.items()}
+        layouts = Layouts(blocks)
         wanted: dict[str, list[str]] = {}
         for pattern in self._patterns:
             choose([pattern], layouts)

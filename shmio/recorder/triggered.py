@@ -19,6 +19,7 @@ from shmio.recorder.instance_follower import TURN_S, BlockEntry, InstanceEntry, 
 from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Counters, RotatingRecorder, is_process_change
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.segment import Block, Frame, Quality
+from shmio.segment.block import Layouts
 
 ENTRY_BYTES: Final = 800
 """Approximate memory of an entry besides its images."""
@@ -48,7 +49,7 @@ class Trigger:
                 self._blocks, self._condition = blocks, NEVER
 
     def _bind(self, blocks: Mapping[str, Block]) -> None:
-        self._condition = compile_condition(self.when, {name: block.layout for name, block in blocks.items()})
+        self._condition = compile_condition(self.when, Layouts(blocks))
         self._blocks = blocks
         self._sections = {block.section: name for name, block in blocks.items()}
         self.sources = {source for source, _ in self._condition.reads}

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -216,7 +217,7 @@ class Collector:
 @lru_cache(maxsize=64)
 def record_codec(registers: tuple[Register, ...], size: int, byte_order: ByteOrder) -> FrameCodec:
     """Return a codec for registers in a batch's records: images of ``size`` bytes behind a header."""
-    shifted = tuple(replace(register, offset=register.offset + HEAD.itemsize) for register in registers)
+    shifted = tuple(msgspec.structs.replace(register, offset=register.offset + HEAD.itemsize) for register in registers)
     return FrameCodec(Layout("", None, HEAD.itemsize + size, False, shifted, byte_order))
 
 

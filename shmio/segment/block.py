@@ -10,9 +10,10 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 from shmio.errors import SegmentError
@@ -253,7 +254,7 @@ class Block:
     def __init__(
         self,
         source: str,
-        layout: Layout,
+        load_layout: Callable[[], Layout],
         ring: Ring,
         events: Ring,
         commands: CommandQueues,
@@ -269,7 +270,7 @@ class Block:
         self.source = source
         self.section = section
         """Index of the layout's section; unique among the blocks of one run of the instance."""
-        self.layout = layout
+        self._load_layout = load_layout
         self.ring = ring
         self.events = EventRing(events, retired)
         self.commands = commands
@@ -284,6 +285,15 @@ class Block:
         self.playhead = playhead
         """The playhead of the replayed recording; None if the block replays none."""
         self._retired = retired
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The layout of the block, which is read from the segment when it is first needed.
+
+        Raises:
+            FormatError: It is inconsistent.
+        """
+        return self._load_layout()
 
     @property
     def retired(self) -> bool:
@@ -347,6 +357,29 @@ class Block:
     def cursor(self, *, after: int | None = None) -> Cursor[Frame]:
         """Return a cursor that starts behind frame ``after`` (default: the newest one)."""
         return Cursor(self.ring, decode_frame, self.ring.head() if after is None else after, self._retired)
+
+
+class Layouts(Mapping[str, "Layout"]):
+    """The layouts of blocks, by source. A layout that nobody asks for is not read."""
+
+    def __init__(self, blocks: Mapping[str, Block]) -> None:
+        self._blocks = blocks
+
+    def __contains__(self, source: object) -> bool:
+        """Return whether there is such a source."""
+        return source in self._blocks
+
+    def __getitem__(self, source: str) -> Layout:
+        """Return the layout of a source. FormatError: it is inconsistent."""
+        return self._blocks[source].layout
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the sources."""
+        return iter(self._blocks)
+
+    def __len__(self) -> int:
+        """Return the number of sources."""
+        return len(self._blocks)
 
 
 Bytes = bytes | bytearray | memoryview

@@ -152,7 +152,11 @@ def read_block(
     layout_at: int,
     clock: ClockPage,
 ) -> Block:
-    """Open the block whose layout is in section ``layout_at``. FormatError: it is inconsistent."""
+    """Open the block whose layout is in section ``layout_at``; the layout itself is read later.
+
+    Raises:
+        FormatError: It is inconsistent.
+    """
     name = shared.name
     described = entries[layout_at]
     parts = {
@@ -165,7 +169,6 @@ def read_block(
         return parts[kind].offset, parts[kind].size
 
     try:
-        layout = load_layout(bytes(memory[described.offset : described.offset + described.size]))
         at, size = part(SectionKind.SOURCE)
         attributes = _ATTRIBUTES.decode(bytes(memory[at : at + size]))
         frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
@@ -178,11 +181,21 @@ def read_block(
         playhead = (
             Playhead(shared, memory, *part(SectionKind.PLAYHEAD), lock_byte, clock) if attributes.replay else None
         )
-    except (LayoutError, ValueError, msgspec.MsgspecError) as error:
+    except (ValueError, msgspec.MsgspecError) as error:
         raise FormatError(f"{name}: block {described.name}: {error}") from None
-    linked_size = layout.size if channel is None else channel.frame_size
-    if not frames.frame_size == linked_size == layout.size or events.frame_size != EVENT_SIZE:
-        raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
+    linked_size = frames.frame_size if channel is None else channel.frame_size
+    if frames.frame_size != linked_size or events.frame_size != EVENT_SIZE:
+        raise FormatError(f"{name}: block {described.name}: its rings differ in size")
+
+    def layout() -> Layout:
+        try:
+            found = load_layout(bytes(memory[described.offset : described.offset + described.size]))
+        except LayoutError as error:
+            raise FormatError(f"{name}: block {described.name}: {error}") from None
+        if found.size != frames.frame_size:
+            raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
+        return found
+
     return Block(
         described.name, layout, frames, events, queues, standing, declared, attributes,
         lambda: header.retired(memory, head, layout_at), layout_at, clock, channel, playhead,
@@ -443,7 +456,7 @@ class Segment:
 
     @property
     def outdated(self) -> bool:
-        """Whether a :meth:`refresh` is due; that may take a second for a large layout."""
+        """Whether a :meth:`refresh` is due."""
         return self.generation != self._generation
 
     def refresh(self) -> bool:

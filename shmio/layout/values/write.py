@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
+
+import msgspec
 
 from shmio.errors import PathError
 from shmio.layout.glob import Glob
@@ -42,7 +43,7 @@ def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> 
     """
     image = bytearray(register.size)
     # With offset 0, the image needs to be no larger than the register.
-    codec(replace(register, offset=0), byte_order).encode_into(value, image)
+    codec(msgspec.structs.replace(register, offset=0), byte_order).encode_into(value, image)
     if register.partial:
         writes = merge(image, bits_of(register), [(0, register.size)])
         return [write._replace(offset=register.offset + write.offset) for write in writes]

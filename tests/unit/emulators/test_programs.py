@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from shmio.emulators.programs import A50
 from shmio.errors import ConfigError
@@ -149,7 +150,7 @@ def test_runs_on_the_printed_source(db201: Layout) -> None:
 
 def test_goes_by_the_layout_not_by_offsets(db201: Layout) -> None:
     moved = replace(
-        db201, size=db201.size + 10, registers=tuple(replace(r, offset=r.offset + 10) for r in db201.registers)
+        db201, size=db201.size + 10, registers=tuple(structs.replace(r, offset=r.offset + 10) for r in db201.registers)
     )
     wide, plain = bytearray(moved.size), bytearray(db201.size)
     A50(moved).step(33.0, wide)
@@ -162,7 +163,9 @@ def test_names_the_register_that_is_missing_or_wrong(db201: Layout, path: str) -
     without = replace(db201, registers=tuple(r for r in db201.registers if r.path != path))
     with pytest.raises(ConfigError, match=f"needs a register {path.replace(' ', '_')}"):
         A50(without)
-    other = replace(db201, registers=tuple(replace(r, type="DINT") if r.path == path else r for r in db201.registers))
+    other = replace(
+        db201, registers=tuple(structs.replace(r, type="DINT") if r.path == path else r for r in db201.registers)
+    )
     with pytest.raises(ConfigError, match="DINT"):
         A50(other)
 

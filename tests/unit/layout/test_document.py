@@ -104,6 +104,7 @@ REGISTER_CHANGES: list[tuple[int, str, Any]] = [
     (2, "comment", None),
     (2, "initial", 5),
     (2, "more", 5),
+    (2, "partial", True),
 ]
 
 

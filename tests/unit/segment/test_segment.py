@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -200,11 +201,25 @@ def test_a_damaged_segment_is_refused_or_read_but_never_crashes(instance: str, e
             with opened:
                 for found in opened.blocks.values():
                     found.ring.latest()
+                    with suppress(FormatError):
+                        assert found.layout.size == found.ring.frame_size
                 for slot in opened.processes:
                     assert isinstance(slot.report.pid, int)
                     assert isinstance(slot.supervised.phase, Phase)
         finally:
             segment.unlink()
+
+
+def test_a_damaged_layout_is_refused_only_when_it_is_needed(instance: str) -> None:
+    with Segment.create(instance, [block("good"), block("damaged")], PROCESSES) as segment:
+        at = bytes(segment.memory).rindex(b'{"name":')
+        segment.memory[at : at + 1] = b"!"
+        with Segment.open(instance) as opened:
+            assert opened.blocks["good"].layout == LAYOUT
+            assert opened.blocks["damaged"].ring.frame_size == LAYOUT.size
+            with pytest.raises(FormatError, match="block damaged: layout"):
+                _ = opened.blocks["damaged"].layout
+        segment.unlink()
 
 
 def test_a_section_count_beyond_the_table_is_refused(instance: str) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from shmio.errors import ConfigError, LayoutError, ModelError, PathError, ShmioError, ValueRangeError
 from shmio.layout.compiler import Source, compile_sources
@@ -283,7 +284,9 @@ count = "DINT"''',
 
 def changed(**changes: Any) -> Layout:
     layout = layout_of(Counting)
-    return replace(layout, registers=tuple(replace(r, **changes) if r.path == "both" else r for r in layout.registers))
+    return replace(
+        layout, registers=tuple(structs.replace(r, **changes) if r.path == "both" else r for r in layout.registers)
+    )
 
 
 @pytest.mark.parametrize(
