@@ -10,6 +10,7 @@ import pytest
 
 import shmio
 from shmio.errors import NotRunningError, PathError, QualityError, SegmentError
+from shmio.layout.document import load_layout
 from shmio.layout.model import Layout, Register
 from shmio.local.attach import Attachment
 from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
@@ -59,6 +60,30 @@ def test_each_method_says_that_the_instance_has_stopped(instance: str, writer: B
         for call in calls:
             with pytest.raises(NotRunningError, match="has stopped"):
                 call()
+
+
+def test_a_program_reads_only_the_layouts_that_it_needs(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of a large cell would take it long."""
+    read: list[int] = []
+
+    def counting(data: bytes) -> Layout:
+        read.append(len(data))
+        return load_layout(data)
+
+    monkeypatch.setattr("shmio.segment.segment.load_layout", counting)
+    blocks = [BlockSpec(name, LAYOUT, 20_000_000, 60_000_000_000, 1 << 20) for name in ("one", "two", "three")]
+    with Segment.create(instance, blocks, []) as segment:
+        segment.writer("two").publish(image(1.5), cycle=1)
+        read.clear()
+        with shmio.attach(instance) as cell:
+            assert (cell.sources, read) == (["one", "two", "three"], [])
+            assert len(cell.get("two/on", "two/counts")) == 2
+            with cell.subscribe("two/axis") as updates:
+                assert next(updates).source == "two"
+            assert len(read) == 1
+            assert [*cell.layouts("one", "two")] == ["one", "two"]
+            assert (cell.layouts()["three"], len(read)) == (LAYOUT, 2)
+        segment.unlink()
 
 
 def test_values_by_path(cell: Attachment, writer: BlockWriter) -> None:
