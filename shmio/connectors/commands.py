@@ -22,7 +22,7 @@ from shmio.connectors.injection_layers import Layer, uncovered
 from shmio.connectors.injections import Blocks, InjectionProcessor, OwnerOf
 from shmio.connectors.output import Output, pieces
 from shmio.errors import ConnectorError
-from shmio.layout.model import Layout, Register
+from shmio.layout.model import Layout
 from shmio.layout.values.write import Write, apply, cover, merge, path_at
 from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
 
@@ -65,21 +65,14 @@ class FiniteCheck:
         allowed_bits = np.frombuffer(cover(layout, allowed), np.uint8)
         self._exponents = np.zeros(layout.size, np.uint8)
         self._starts = np.zeros(layout.size, np.int32)  # for each exponent byte, the offset of its number
-        for register in layout.registers:
-            if register.type in _EXPONENTS:
-                self._guard(register, allowed_bits)
+        for kind, exponent in _EXPONENTS.items():
+            starts = _starts_of(layout, kind)
+            starts = starts[allowed_bits[starts] != 0xFF]
+            for at, bits in enumerate(exponent[::-1] if layout.byte_order == "little" else exponent):
+                if bits:
+                    self._exponents[starts + at] = bits
+                    self._starts[starts + at] = starts
         self._guarded = (self._exponents != 0).tobytes()
-
-    def _guard(self, register: Register, allowed: np.ndarray[tuple[int], np.dtype[np.uint8]]) -> None:
-        exponent = _EXPONENTS[register.type]
-        if self._layout.byte_order == "little":
-            exponent = exponent[::-1]
-        starts = register.offset + np.arange(register.count, dtype=np.int32) * register.element.stride
-        starts = starts[allowed[starts] != 0xFF]
-        for at, bits in enumerate(exponent):
-            if bits:
-                self._exponents[starts + at] = bits
-                self._starts[starts + at] = starts
 
     def refusal(self, writes: Iterable[Write]) -> str:
         """Return why these writes are refused, naming one register; empty if they are fine.
@@ -101,6 +94,14 @@ class FiniteCheck:
                     f"{path}: NaN and infinities are written only if the source's `allow_nonfinite` names the register"
                 )
         return ""
+
+
+def _starts_of(layout: Layout, kind: str) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
+    """Return the offsets of all values of a type, those of arrays included."""
+    found = [register for register in layout.registers if register.type == kind]
+    arrays = (one.offset + np.arange(one.count) * one.element.stride for one in found if one.dims)
+    scalars = np.array([one.offset for one in found if not one.dims], np.int32)
+    return np.concatenate([scalars, *arrays]).astype(np.int32)
 
 
 # -- batches -----------------------------------------------------------------------------------------------------------

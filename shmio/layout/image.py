@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Final
 
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Layout, Register
+from shmio.layout.model import ElementType, Layout, Register
 from shmio.layout.topic import shorten
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.literal import default_text, parse_literal
@@ -24,6 +25,8 @@ def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
     frame = bytearray(layout.size)
     unread: list[str] = []
     for register in layout.registers:
+        if register.initial is None and _default_is_zeros(register.element):
+            continue
         value = _default(register) if register.initial is None else _given(register)
         if value is None:
             unread.append(register.path)
@@ -58,6 +61,15 @@ def _given(register: Register) -> Value | None:
         return parse_literal(register.initial or "", register)
     except ValueRangeError:
         return None
+
+
+@lru_cache(maxsize=1024)
+def _default_is_zeros(element: ElementType) -> bool:
+    bit = 0 if element.base == "BOOL" else None
+    register = Register("default", element.name, (), 0, bit, element.size, 1)
+    image = bytearray(element.size)
+    codec(register, "big").encode_into(_default(register), image)
+    return not any(image)
 
 
 def _default(register: Register) -> Value:
