@@ -1,1 +1,1 @@
-"""Endpoints: what serves the segment to remote programs, a process for each."""
+"""Endpoints: the processes that serve the segment to remote programs."""

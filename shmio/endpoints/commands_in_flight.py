@@ -1,4 +1,4 @@
-"""The in-flight table: commands to one source whose outcomes are not known yet."""
+"""The commands in flight to one source: those whose outcomes are not known yet."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from shmio.segment.commands import CommandOutcomes, End
 from shmio.segment.events import EVENT_DATA_SIZE
 
 MAX_OPEN: Final = 512
-"""Bound of outstanding events: a quarter of the ring, so that none is overwritten unread."""
+"""Maximum number of events that commands in flight may still cause.
+
+It is a quarter of the event ring, so that no event is overwritten before it is read.
+"""
 
 Done = Callable[[Sequence[End]], None]
-"""Called once, with the outcome of each of a command's values."""
+"""Called once for a command, with the outcome of each of its values."""
 
 
 def in_words(end: End) -> str:
@@ -26,14 +29,20 @@ def in_words(end: End) -> str:
 
 
 class CommandCost(NamedTuple):
-    """Upper bounds of what a command needs: bytes in the queue, and events until its end."""
+    """The most that a command can need: bytes in the queue, and events until its end."""
 
     record_bytes: int
     events: int
 
     @classmethod
     def of(cls, sizes: Collection[int], name: str = "") -> CommandCost:
-        """Return the cost of a command with items of these sizes, in bytes."""
+        """Return the cost of a command.
+
+        Args:
+            sizes: Size of each item, in bytes.
+            name: Name of the injection, if the command lays one.
+
+        """
         events = sum(2 + size // EVENT_DATA_SIZE for size in sizes)
         return cls(64 + 4 * len(name) + sum(24 + size for size in sizes), events)
 
@@ -43,9 +52,9 @@ class InFlightCommand:
     """A command in flight.
 
     Attributes:
-        incarnation: The source's process that the command was sent to.
-        until_ns: When waiting ends, by the monotonic clock.
-        cost: The space it may need.
+        incarnation: The process of the source that the command was sent to.
+        until_ns: Deadline for the outcomes, in ns of the monotonic clock.
+        cost: The queue space and the events that the command may need.
         values: For each value, the range of its items.
         outcomes: The outcomes of the items.
         done: Called once, with the outcome of each value.
@@ -61,19 +70,24 @@ class InFlightCommand:
     done: Done
     accepted: Callable[[], None] | None = None
     taken: bool = False
-    """Whether the source has taken the command out of the queue."""
+    """True if the source has taken the command out of the queue."""
     open_events: int = 0
-    """Upper bound of the events that are still to come."""
+    """The most events that the command may still cause."""
 
     def hear(self, event: Event) -> bool:
-        """Process one event; return whether all outcomes are known."""
+        """Process an event of the command, and return whether all outcomes are known."""
         if not self.taken and event.kind == EventKind.ACCEPTED and self.accepted is not None:
             self.accepted()
         self.taken = True
         return self.outcomes.follow(event)
 
     def finish(self, missing: str = "") -> None:
-        """Report the outcomes. ``missing``: why some of them are unknown."""
+        """Report the outcomes.
+
+        Args:
+            missing: Why some outcomes are unknown; empty if all are known.
+
+        """
         self.done([self.outcomes.of(items, missing) for items in self.values])
 
 
@@ -82,9 +96,9 @@ class InFlightTable:
 
     def __init__(self, writer: int) -> None:
         self.open_events = 0
-        """Upper bound of the events that are still to come."""
+        """The most events that all commands together may still cause."""
         self.untaken_bytes = 0
-        """Size of the records that may still be in the queue."""
+        """Size of the commands that the source may not have taken from the queue yet, in bytes."""
         self._writer = writer
         self._by_number: dict[int, InFlightCommand] = {}
 
@@ -93,7 +107,7 @@ class InFlightTable:
 
     @property
     def due_ns(self) -> int | None:
-        """When waiting for the first command ends, by the monotonic clock; None: there is none."""
+        """The earliest deadline of a command, in ns of the monotonic clock; None if there are none."""
         return min((pending.until_ns for pending in self._by_number.values()), default=None)
 
     def add(
@@ -107,7 +121,13 @@ class InFlightTable:
     ) -> None:
         """Add a command that was sent.
 
-        Arguments as of :class:`InFlightCommand` and :class:`CommandOutcomes`.
+        Args:
+            ticket: The command, as the source's writer returned it.
+            cost: The queue space and the events that it may need.
+            done: Called once, with the outcome of each value.
+            accepted: Called once, if the source accepts the command.
+            until_accepted: Acceptance already ends the command.
+
         """
         self._by_number[ticket.number] = InFlightCommand(
             ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values],
@@ -117,7 +137,12 @@ class InFlightTable:
         self.open_events += cost.events
 
     def hear(self, event: Event) -> bool:
-        """Process an event; return whether it concerns these commands or the source's start."""
+        """Process an event of the source.
+
+        Returns:
+            True if the event is about one of these commands, or about the start of the source.
+
+        """
         if event.kind == EventKind.STARTED:
             self._restarted(event.incarnation)
             return True
@@ -134,11 +159,16 @@ class InFlightTable:
         return True
 
     def hurry(self) -> None:
-        """Shorten all time-outs, because the awaited events may be among missed ones."""
+        """Shorten all time-outs after missed events, because outcomes may be among these."""
         self._hurry(self._by_number.values())
 
     def expire(self) -> bool:
-        """End the overdue commands; return whether the source has not even taken one of them."""
+        """End the commands whose deadline has passed.
+
+        Returns:
+            True if the source has not even taken one of them from the queue.
+
+        """
         now_ns = time.monotonic_ns()
         overdue = [(number, one) for number, one in self._by_number.items() if one.until_ns <= now_ns]
         for number, _ in overdue:
@@ -146,14 +176,20 @@ class InFlightTable:
         return any(not pending.taken for _, pending in overdue)
 
     def end(self, reason: str) -> None:
-        """End all commands, because no more events will come."""
+        """End all commands, because no more events will come.
+
+        Args:
+            reason: Why their outcomes are unknown.
+
+        """
         for number in list(self._by_number):
             self._end(number, reason)
 
     def _restarted(self, incarnation: int) -> None:
-        """End the commands that the source's previous process had taken: their outcome is unknown.
+        """Handle a restart of the source.
 
-        The new process rejects those that were not taken, so these only get a short time-out.
+        Commands that its previous process had taken end with an unknown outcome. The new process
+        rejects the others, so their time-outs are shortened.
         """
         before = [(number, one) for number, one in self._by_number.items() if one.incarnation != incarnation]
         for number, pending in before:

@@ -1,8 +1,11 @@
 """The gRPC endpoint.
 
-``wakeups`` wakes the event loop when a block has something new. ``streams.feed`` follows one
-block and encodes each change once for all listeners; ``streams.outbox`` queues messages for one
-client's stream. ``commands`` sends clients' values to sources, ``topics`` resolves their paths,
-and ``time`` steps and plays. ``services`` and ``shmio_v1`` are the services, which ``server``
-serves with health and reflection on every listening address.
+- ``wakeups`` wakes the event loop when a block has a new frame or event.
+- ``streams.feed`` follows one block, and encodes each change once for all listeners.
+- ``streams.outbox`` queues the messages of one client's stream.
+- ``commands`` sends clients' values to the sources.
+- ``topics`` resolves clients' paths.
+- ``time`` steps and plays virtual time.
+- ``services`` and ``shmio_v1`` implement the services. ``server`` serves them on each address,
+  with health and reflection.
 """

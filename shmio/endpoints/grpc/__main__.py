@@ -25,11 +25,11 @@ from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0
 FOREIGN_LOGGERS: Final = ("asyncio", "grpc._cython.cygrpc")
-"""Loggers of libraries that clients can cause to write."""
+"""Loggers of libraries to which clients can cause log lines."""
 
 
 def run(worker: Worker) -> None:
-    """Serve until the worker is stopped."""
+    """Serve clients until the worker is stopped."""
     limits.limit_arenas()
     rations = {name: LogRateLimit(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
     for name, ration in rations.items():
@@ -90,7 +90,7 @@ async def _serve(worker: Worker) -> None:
     reading: asyncio.Task[None] | None = None
     while not stopping.is_set():
         reading = reading or loop.create_task(_follow(worker, feeds, services))
-        await asyncio.wait((reading,), timeout=BEAT_S)  # a large layout takes long: the heartbeat goes on meanwhile
+        await asyncio.wait((reading,), timeout=BEAT_S)  # reading a large layout must not stop the heartbeat
         if reading.done():
             reading.result()
             reading = None
@@ -116,7 +116,10 @@ async def _serve(worker: Worker) -> None:
 
 
 async def _follow(worker: Worker, feeds: Feeds, services: Services) -> None:
-    """Adopt what a reload has changed: no call begins between the change of the feeds and the move of the others."""
+    """Adopt what a reload has changed.
+
+    No call may begin between the change of the feeds and the move of the services' streams.
+    """
     if changed := await feeds.follow():
         worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
         services.move(changed)
@@ -125,7 +128,7 @@ async def _follow(worker: Worker, feeds: Feeds, services: Services) -> None:
 def _end_now(worker: Worker) -> NoReturn:
     """End the process without cleaning up, because gRPC has stopped serving.
 
-    Cleaning up would free memory that gRPC's threads still write to.
+    A clean-up would free memory that gRPC's threads still write to.
     """
     worker.log.error("gRPC stopped serving; this process ends, and the supervisor starts another")
     logging.shutdown()
@@ -133,7 +136,7 @@ def _end_now(worker: Worker) -> NoReturn:
 
 
 async def _calls_end() -> None:
-    """Wait for the ending calls; otherwise each would log a traceback at the loop's end."""
+    """Wait for the calls that are ending; each would otherwise log a traceback when the loop ends."""
     if calls := asyncio.all_tasks() - {asyncio.current_task()}:
         await asyncio.wait(calls, timeout=CALLS_S)
 
@@ -154,7 +157,7 @@ def _settings(worker: Worker) -> tuple[Grpc, _Place]:
 
 async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: Server, turn: asyncio.Lock) -> None:
     """Reload tokens and roles, and end the calls that they no longer allow."""
-    async with turn:  # of two reloads, the one that reads later must win
+    async with turn:  # one reload at a time: the last one must win
         try:
             config = await asyncio.to_thread(load, file)
             if config.grpc is None:
@@ -165,7 +168,7 @@ async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: S
             return
         ended = server.calls.review()
     if not (ended or config.grpc.guarded):
-        return  # there are none, and it is likely that there were none
+        return  # no tokens are in use, so there is nothing to report
     worker.log.info("reloaded tokens and roles", extra=fields(tokens=len(config.grpc.token), calls_ended=ended))
 
 

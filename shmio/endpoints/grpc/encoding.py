@@ -1,7 +1,7 @@
-"""How images of blocks become messages: subjects, and Protobuf's wire format.
+"""Encodes images of blocks as messages: subjects, and Protobuf's wire format.
 
-Serialised fields may be concatenated to a message (protobuf.dev, "Encoding"), so messages are
-assembled from parts that all listeners share.
+Serialised fields may be concatenated to a message (protobuf.dev, "Encoding"). So messages are built
+from parts that all listeners share.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from shmio.layout.model import Register
 
 
 class BlockImage(Protocol):
-    """An image of a block with its number and time: a frame, or a future one."""
+    """An image of a block with its number and time: of a frame, of a step, or of writes."""
 
     @property
     def number(self) -> int:
-        """Number of the frame, or of the step."""
+        """Number of the frame or step."""
 
     @property
     def clock_ns(self) -> int:
@@ -31,7 +31,7 @@ class BlockImage(Protocol):
 
 
 class ShownImage(NamedTuple):
-    """A :class:`BlockImage` that is not a frame's: with writes in it, or of an injection."""
+    """A :class:`BlockImage` that is not a frame: with writes applied, or of an injection."""
 
     number: int
     clock_ns: int
@@ -39,7 +39,7 @@ class ShownImage(NamedTuple):
 
 
 class SourceImage(BlockImage, Protocol):
-    """An image together with the bytes that the source delivered."""
+    """An image that also has the bytes that the source delivered."""
 
     @property
     def raw(self) -> bytes:
@@ -47,21 +47,24 @@ class SourceImage(BlockImage, Protocol):
 
 
 Encode = Callable[[BlockImage], Sized | None]
-"""Encodes an image as a message, whose ``len`` is in bytes; None: the bytes hold no value."""
+"""Encodes an image as a message, or returns None if the bytes are not a valid value.
+
+``len`` of the message is its size in bytes.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A register, an array's element or a structure in the encoding of one service.
+    """A register, an array element or a structure, in the encoding of one service.
 
     Equal subjects are encoded once for all listeners.
 
     Attributes:
         wire: Name of the encoding.
         path: Canonical path in the block.
-        registers: The registers it shows.
-        encode: Makes a message of an image.
-        changed: Returns whether two images differ in the subject; None: compare the registers
+        registers: The registers of the subject.
+        encode: Encodes an image of the block as a message.
+        changed: Returns whether the subject differs between two images; None: compare the registers
             as consumers see them.
 
     """
@@ -77,7 +80,7 @@ _SHORT: Final = [bytes((number,)) for number in range(0x80)]
 
 
 def varint(number: int) -> bytes:
-    """Encode a number that is not negative."""
+    """Encode a non-negative number."""
     if number < 0x80:
         return _SHORT[number]
     if number < 0x4000:
@@ -91,15 +94,15 @@ def varint(number: int) -> bytes:
 
 
 def delimited(data: bytes) -> bytes:
-    """Encode bytes with their length in front."""
+    """Encode bytes, preceded by their length."""
     return varint(len(data)) + data
 
 
 def field(field_number: int, data: bytes) -> bytes:
-    """Encode a field that is bytes, text, a message, or packed numbers."""
+    """Encode a field of type bytes, text or message, or with packed numbers."""
     return varint(field_number << 3 | 2) + varint(len(data)) + data
 
 
 def number(field_number: int, value: int) -> bytes:
-    """Encode a field that is an enum or a whole number that is not negative."""
+    """Encode a field of type enum, or with a non-negative integer."""
     return varint(field_number << 3) + varint(value)

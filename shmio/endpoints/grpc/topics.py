@@ -14,27 +14,39 @@ from shmio.segment import Block
 
 
 class TimeTopic(Enum):
-    """The topics of time, which belong to no source; the values are canonical paths."""
+    """The time topics, which belong to no source; the values are canonical paths."""
 
     STEP = "simlog/step"
-    """Each step's number, sent after all values of the step."""
+    """Number of each step, sent after all values of the step."""
     CLOCK = "model/clock"
-    """Simulation time."""
+    """The simulation time."""
 
 
 _TIME_TOPICS: Final = {time_topic.value: time_topic for time_topic in TimeTopic}
 
 
 class Topics:
-    """Looks paths up among the present sources."""
+    """Resolves paths to the present sources."""
 
     def __init__(self, feeds: Mapping[str, Feed], default_source: str | None) -> None:
-        """``default_source``: for paths without a source; None: the only source there is."""
+        """Create the resolver.
+
+        Args:
+            feeds: The feeds of all sources, by name.
+            default_source: The source of paths that name none; None: the only source, if there is
+                just one.
+
+        """
         self._feeds = feeds
         self._default = default_source
 
     def topic(self, path: str) -> Topic:
-        """Parse a path. PathError: there is no such source."""
+        """Parse a path.
+
+        Raises:
+            PathError: There is no such source.
+
+        """
         topic = self._parse(path)
         if topic.source not in self._feeds:
             if self._time_topic(topic):
@@ -46,14 +58,19 @@ class Topics:
         return topic
 
     def time_topic(self, path: str) -> TimeTopic | None:
-        """Return the topic of time that a path names, or None. PathError as for :meth:`topic`."""
+        """Return the time topic that a path names, or None.
+
+        Raises:
+            PathError: There is no such source.
+
+        """
         return self._time_topic(self._parse(path))
 
     def _time_topic(self, topic: Topic) -> TimeTopic | None:
         return _TIME_TOPICS.get(f"{topic.source}/{topic.path}") if topic.direction != "in" else None
 
     def name(self, path: str) -> str:
-        """Return the canonical form of a path, even if it names nothing."""
+        """Return the canonical form of a path, whether or not it names a topic."""
         try:
             return str(self._parse(path))
         except PathError:
@@ -64,24 +81,44 @@ class Topics:
         return parse_topic(path, self._feeds, default)
 
     def feed(self, source: str) -> Feed:
-        """Return a source's feed. PathError: a reload has removed the source."""
+        """Return the feed of a source.
+
+        Raises:
+            PathError: A reload has removed the source.
+
+        """
         if source not in self._feeds:
             raise PathError(f"source {source} was removed by a reload")
         return self._feeds[source]
 
     def blocks(self, sources: Collection[str]) -> list[Block]:
-        """Return the blocks of these sources, or of all. PathError: no such source."""
+        """Return the blocks of these sources, or of all.
+
+        Raises:
+            PathError: There is no such source.
+
+        """
         for source in sources:
             if source not in self._feeds:
                 raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
         return [self._feeds[source].block for source in dict.fromkeys(sources) or self._feeds]
 
     def layout(self, topic: Topic) -> Layout:
-        """Return the layout of a topic's source. PathError as for :meth:`feed`."""
+        """Return the layout of a topic's source.
+
+        Raises:
+            PathError: A reload has removed the source.
+
+        """
         return self.feed(topic.source).block.layout
 
     def register(self, topic: Topic) -> Register:
-        """Return a topic's register. PathError: there is none; the message lists similar names."""
+        """Return the register of a topic.
+
+        Raises:
+            PathError: There is no such register; the message lists similar names.
+
+        """
         return look_up(self.layout(topic), topic)
 
 
@@ -90,7 +127,7 @@ class Shape(NamedTuple):
 
     Attributes:
         path: Canonical path in the block.
-        registers: One register or array element, or all registers below a structure.
+        registers: One register or array element, or all registers of a structure.
         whole: Whether the path names a register or an element, not a structure.
 
     """
@@ -106,7 +143,12 @@ class Shape(NamedTuple):
 
 
 def shape(layout: Layout, topic: Topic) -> Shape:
-    """Return what a topic names in a layout. PathError: nothing."""
+    """Return the registers that a topic names in a layout.
+
+    Raises:
+        PathError: There is no such register or structure.
+
+    """
     below = layout.members(topic.path)
     if below:
         return Shape(topic.path, tuple(layout.registers[index] for index in below), whole=False)

@@ -1,4 +1,4 @@
-"""Wakes the event loop when a block has something new, to read it in batches."""
+"""Wakes the event loop when a block has new frames or events, and reads these in batches."""
 
 from __future__ import annotations
 
@@ -21,11 +21,19 @@ REST_S: Final = 0.005
 class WakeUp:
     """Calls its listeners when a word in shared memory has changed.
 
-    Also at the start, and after ``turn_ns`` without a change. For the event loop's thread.
+    It also calls them at the start, and after ``turn_ns`` without a change. Use it only in the
+    event loop's thread.
     """
 
     def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
-        """``turn_ns``: the longest time between two calls."""
+        """Start to wait for changes.
+
+        Args:
+            word: The word in shared memory.
+            name: Name of the thread that waits.
+            turn_ns: Longest time between two calls, in ns.
+
+        """
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
         self.patient: set[Callback] = set()
         """Listeners that can wait for a while."""
@@ -36,15 +44,15 @@ class WakeUp:
 
     @property
     def alive(self) -> bool:
-        """Whether the thread that waits for the word is running."""
+        """True while the thread that waits for the word is running."""
         return self._relay.alive
 
     def mute(self) -> None:
-        """Call no listeners until :meth:`unmute`; then they are called for what they missed."""
+        """Stop calling the listeners until :meth:`unmute`, which makes up for a missed call."""
         self._loop.remove_reader(self._relay.descriptor)
 
     def unmute(self) -> None:
-        """Call listeners again."""
+        """Call the listeners again."""
         self._loop.add_reader(self._relay.descriptor, self._ring)
 
     def rest(self) -> None:
@@ -67,13 +75,13 @@ class WakeUp:
             self.unmute()
 
     def stop(self) -> None:
-        """Stop calling listeners, and have the thread end."""
+        """Stop calling the listeners, and make the thread end."""
         self.resume()
         self.mute()
         self._relay.stop()
 
     def join(self) -> None:
-        """Wait for the thread's end, after :meth:`stop`."""
+        """Wait for the end of the thread, after :meth:`stop`."""
         self._relay.join()
 
     def _ring(self) -> None:
@@ -83,7 +91,7 @@ class WakeUp:
 
 
 class WakeUps:
-    """The wake-ups of all blocks that are followed; for the event loop's thread."""
+    """The wake-ups of all blocks that are followed. Use it only in the event loop's thread."""
 
     def __init__(self) -> None:
         self._wake_ups: dict[int, WakeUp] = {}
@@ -92,7 +100,11 @@ class WakeUps:
     def join(self, block: Block, ring: Callback, *, patient: bool = False) -> None:
         """Call ``ring`` when the block has a new frame or event, and periodically.
 
-        ``patient``: the listener can wait while all others :meth:`rest`.
+        Args:
+            block: The block.
+            ring: The listener.
+            patient: The listener can wait while all other listeners :meth:`rest`.
+
         """
         wake_up = self._wake_ups.get(block.section)
         if wake_up is None:
@@ -105,7 +117,10 @@ class WakeUps:
             wake_up.resume()
 
     def rest(self, block: Block, ring: Callback) -> None:
-        """Mark ``ring`` as patient, so that wake-ups pause if all listeners of the block are."""
+        """Mark ``ring`` as patient.
+
+        The wake-ups pause while all listeners of the block are patient.
+        """
         if wake_up := self._wake_ups.get(block.section):
             wake_up.patient.add(ring)
             wake_up.rest()
@@ -117,10 +132,10 @@ class WakeUps:
             wake_up.resume()
 
     def leave(self, block: Block, ring: Callback) -> None:
-        """Remove ``ring``; the wake-up of a block ends with its last listener."""
+        """Remove ``ring``. The wake-up of a block ends with its last listener."""
         wake_up = self._wake_ups.get(block.section)
         if wake_up is None:
-            return  # all are closed
+            return  # close() was called before
         wake_up.listeners.pop(ring, None)
         wake_up.patient.discard(ring)
         if not wake_up.listeners:
@@ -138,9 +153,9 @@ class WakeUps:
 
 
 class BatchReader:
-    """Reads a block's frames or events at each wake-up, a batch at a time.
+    """Reads a block's frames or events in batches, at each wake-up.
 
-    Between two batches the event loop serves the streams. For that loop's thread.
+    Between two batches the event loop serves the streams. Use it only in the event loop's thread.
     """
 
     def __init__(
@@ -152,10 +167,10 @@ class BatchReader:
         passes: Callable[[], bool] | None = None,
         patient: bool = False,
     ) -> None:
-        """Prepare to read; see :meth:`start`.
+        """Prepare to read; :meth:`start` starts.
 
         Args:
-            block: The block that is read.
+            block: The block to read.
             wake_ups: Wakes this reader.
             read: Reads a batch, and returns whether more is waiting.
             passes: Returns whether to read nothing now. Then the reader is patient until
@@ -164,7 +179,7 @@ class BatchReader:
 
         """
         self.alive = False
-        """Whether the block is being followed."""
+        """True while the reader follows the block."""
         self._block = block
         self._wake_ups = wake_ups
         self._read = read
@@ -185,7 +200,7 @@ class BatchReader:
             self._wake_ups.leave(self._block, self.look)
 
     def look(self) -> None:
-        """Read a batch, unless it is better to pass."""
+        """Read a batch, unless ``passes`` says to read nothing now."""
         if not self.alive:
             return  # stopped during the wake-up
         if self._passes is not None and self._passes():
@@ -194,7 +209,7 @@ class BatchReader:
             self.read()
 
     def read(self) -> None:
-        """Read a batch now; if more is waiting, look again when the streams have been served."""
+        """Read a batch now. If more is waiting, read on when the streams have been served."""
         try:
             more = self._read()
         except Exception:
@@ -206,7 +221,7 @@ class BatchReader:
             self._loop.call_soon(self._look_again)
 
     def resume(self) -> None:
-        """Look at each wake-up again."""
+        """Check at each wake-up again."""
         self._wake_ups.resume(self._block, self.look)
 
     def _look_again(self) -> None:

@@ -1,1 +1,1 @@
-"""Commands to a block's source: values sent, outcomes returned, and the events about both."""
+"""Commands to a block's source: sends values, returns outcomes, and passes on the events."""

@@ -1,4 +1,7 @@
-"""Sends commands to one block's source and reports what became of each; for the event loop's thread."""
+"""Sends commands to one block's source, and reports their outcomes.
+
+Use it only in the event loop's thread.
+"""
 
 from __future__ import annotations
 
@@ -25,19 +28,19 @@ from shmio.segment import Block, Event, EventKind
 from shmio.segment.commands import End, InjectionOptions
 
 RETRY_S: Final = 0.25
-"""Pause before a source that has not lifted an injection is asked again."""
+"""Pause before asking a source again to lift an injection."""
 
 BATCH_EVENTS: Final = 32
-"""Events that are processed before the event loop serves the streams."""
+"""Events that are processed in a row, before the event loop serves the streams."""
 
 log = logging.getLogger("shmio.grpc")
 
 
 class CommandClient:
-    """Sends commands to a block's source in order, and reports what became of each.
+    """Sends commands to a block's source in order, and reports their outcomes.
 
-    No more commands are in flight than there is room for their events. For the event loop's
-    thread.
+    It waits while the commands in flight could cause more events than the event ring can buffer.
+    Use it only in the event loop's thread.
     """
 
     def __init__(
@@ -47,7 +50,15 @@ class CommandClient:
         wake_ups: WakeUps,
         stamp: Callable[[Event], tuple[int, int]],
     ) -> None:
-        """``writer``: this process's command queue. ``stamp``: see :class:`WriteSubscriptions`."""
+        """Create a client; :meth:`start` starts it.
+
+        Args:
+            block: The block whose source gets the commands.
+            writer: Number of this process's command queue.
+            wake_ups: Wakes this client when the block has new events.
+            stamp: Returns an event's number and time; see :class:`WriteSubscriptions`.
+
+        """
         self.block = block
         self.stamp = stamp
         self.write_subscriptions = WriteSubscriptions(block, stamp)
@@ -58,7 +69,7 @@ class CommandClient:
         self._preparing = asyncio.Lock()
         self._in_flight = InFlightTable(writer)
         self._silent = False
-        self._turn = asyncio.Lock()  # callers that wait for room are served in order
+        self._turn = asyncio.Lock()  # serves callers in order while they wait for room
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._events = block.events.cursor()
@@ -66,12 +77,12 @@ class CommandClient:
 
     @property
     def alive(self) -> bool:
-        """Whether the block's events are being followed, or the block has retired."""
+        """True while the client follows the block's events, or if the block has retired."""
         return self._reader.alive or self.block.retired
 
     @property
     def over(self) -> bool:
-        """Whether no events are followed, no command is in flight, and nobody listens to writes."""
+        """True if the client is idle and stopped: no events, commands, subscribers or listeners."""
         return not (
             self._reader.alive
             or self._in_flight
@@ -91,17 +102,17 @@ class CommandClient:
             self._timer.cancel()
 
     def catch_up(self) -> None:
-        """Process all events so far, which also delivers the writes to subscribers."""
+        """Process all events so far, and deliver the writes among them to subscribers."""
         newest = self.block.events.head()
         while self._reader.alive and self._events.last < newest:
             self._reader.read()
 
     def ready(self, values: Mapping[str, object]) -> bool:
-        """Return whether :meth:`send` or :meth:`give` of these values would not have to wait."""
+        """Return whether :meth:`send` and :meth:`give` would send these values without waiting."""
         return self._prepared and not self._turn.locked() and self._has_room(self._cost(values))
 
     async def writable(self, registers: Iterable[Register]) -> bool:
-        """Return whether the configuration allows all these registers to be written."""
+        """Return whether the configuration allows writing all of these registers."""
         await self._prepare()
         return all(map(self._source_writer.is_writable, registers))
 
@@ -114,18 +125,19 @@ class CommandClient:
         timeout_s: float | None = None,
         until_accepted: bool = False,
     ) -> None:
-        """Send registers' values, by path, as one command; wait for room if necessary.
+        """Send values of registers as one command; wait for room if necessary.
+
+        After an error nothing was sent, and neither ``done`` nor ``accepted`` is called.
 
         Args:
             values: Values by register path.
             done: Called once within a bounded time, with the outcome of each value.
             accepted: Called before that, if the source accepts the command.
             timeout_s: How long to wait for outcomes, in s; None: the default.
-            until_accepted: Whether acceptance already ends the command.
+            until_accepted: Acceptance already ends the command.
 
         Raises:
-            CommandError: A register is not writable, or the source does not answer. Nothing was
-                sent, and neither function is called; the same holds for the next error.
+            CommandError: A register is not writable, or the source does not answer.
             ValueRangeError: A value does not fit its register.
 
         """
@@ -141,17 +153,35 @@ class CommandClient:
         *,
         raw: Sequence[Write] = (),
     ) -> None:
-        """Send values, and ``raw`` bytes, as those of an injection; otherwise as :meth:`send`.
+        """Give values to an injection of this process, otherwise as :meth:`send`.
 
-        Outcomes are per write, not per value. ``accepted`` is only called for an injection over
-        ``/in``.
+        Args:
+            injection: Number of the injection.
+            values: Values by register path.
+            done: Called once, with the outcome of each write, not of each value.
+            accepted: Called if the source accepts the command, only for an injection over ``/in``.
+            raw: Bytes to give in addition to the values.
+
+        Raises:
+            CommandError: The source does not answer.
+            ValueRangeError: A value does not fit its register.
+
         """
         writes = self._source_writer.joined(values, raw)
         cost = CommandCost.of([len(write.data) for write in writes])
         await self._send(partial(self._source_writer.give, injection, writes), cost, done, accepted)
 
     def lay(self, bits: bytes, follower: InjectionFollower, done: Done, **laid: Unpack[InjectionOptions]) -> int:
-        """Ask the source to lay an injection over ``bits``, and return its number without waiting.
+        """Ask the source to lay an injection, without waiting for the outcome.
+
+        Args:
+            bits: Mask of the block, with the bits set that the injection covers.
+            follower: Receives the injection's events.
+            done: Called once, with the outcome.
+            laid: Options of the injection.
+
+        Returns:
+            The injection's number.
 
         Raises:
             CommandError: The command was not sent.
@@ -162,7 +192,21 @@ class CommandClient:
         return self._lay(self._source_writer.lay(writes, **laid), cost, follower, done)
 
     def declare(self, declaration: Declaration, follower: InjectionFollower, done: Done, *, keep: bool) -> int:
-        """Ask the source to lay a declared injection, which it runs itself; as :meth:`lay`."""
+        """Ask the source to lay a declared injection, without waiting for the outcome.
+
+        Args:
+            declaration: The injection, which the source runs itself.
+            follower: Receives the injection's events.
+            done: Called once, with the outcome.
+            keep: Keep the injection after this process has ended.
+
+        Returns:
+            The injection's number.
+
+        Raises:
+            CommandError: The command was not sent.
+
+        """
         cost = CommandCost.of([len(msgspec.json.encode(declaration))], declaration.name)
         return self._lay(self._source_writer.ask_to_declare(declaration, keep=keep), cost, follower, done)
 
@@ -173,7 +217,12 @@ class CommandClient:
         return ticket.number
 
     def lift(self, injection: int, done: Done) -> None:
-        """Ask the source to lift an injection, without waiting. CommandError: it was not sent."""
+        """Ask the source to lift an injection, without waiting for the outcome.
+
+        Raises:
+            CommandError: The command was not sent.
+
+        """
         self._in_flight.add(self._source_writer.ask_to_lift(injection), CommandCost.of(()), done)
         self._start_timer()
 
@@ -207,7 +256,12 @@ class CommandClient:
                 self._prepared = True
 
     def _cost(self, values: Collection[str]) -> CommandCost:
-        """Return the cost of a command with these values. PathError: no such register."""
+        """Return the cost of a command with these values.
+
+        Raises:
+            PathError: There is no such register.
+
+        """
         return CommandCost.of([size for path in values for size in sizes(find(self.block.layout, path))])
 
     def _has_room(self, cost: CommandCost) -> bool:
@@ -246,7 +300,7 @@ class CommandClient:
                 self._set_timer()
 
     def _missed(self, count: int) -> None:
-        """Process a gap in the events, which may have held outcomes of commands."""
+        """Handle missed events: outcomes of commands may have been among them."""
         reason = f"{count} events of source {self.block.source} were missed"
         self.write_subscriptions.skip()
         self.followers.skip()
@@ -295,7 +349,7 @@ class Answer:
         self._ends: asyncio.Future[Sequence[End]] = asyncio.get_running_loop().create_future()
 
     def done(self, ends: Sequence[End]) -> None:
-        """Set the outcomes; for ``done`` of :class:`CommandClient`."""
+        """Set the outcomes; pass this method as ``done`` to :class:`CommandClient`."""
         if not self._ends.done():
             self._ends.set_result(ends)
 
@@ -310,10 +364,12 @@ async def write(
     *,
     until_accepted: bool = False,
 ) -> Sequence[End]:
-    """Write values by path, as one command, and return the outcome of each.
+    """Write values by path as one command, and wait for the outcome of each.
+
+    After an error nothing was sent.
 
     Raises:
-        PathError: There is no such register. Nothing was sent, as with the other errors.
+        PathError: There is no such register.
         ValueRangeError: A value does not fit its register.
         CommandError: A register is not writable, or the source does not answer.
 
@@ -326,7 +382,10 @@ async def write(
 async def give(
     commands: CommandClient, injection: int, values: Mapping[str, object], raw: Sequence[Write] = ()
 ) -> Sequence[End]:
-    """Give an injection's values and raw bytes; return the outcomes, of adjacent writes as one."""
+    """Give values and raw bytes to an injection, and wait for the outcomes.
+
+    Adjacent writes have one outcome.
+    """
     answer = Answer()
     await commands.give(injection, values, answer.done, raw=raw)
     return await answer
@@ -335,7 +394,7 @@ async def give(
 async def lay(
     commands: CommandClient, bits: bytes, follower: InjectionFollower, **laid: Unpack[InjectionOptions]
 ) -> int:
-    """Lay an injection and return its number.
+    """Lay an injection, wait until the source has done so, and return its number.
 
     Raises:
         CommandError: The source refuses the injection, or does not answer.
@@ -345,10 +404,10 @@ async def lay(
 
 
 async def declare(commands: CommandClient, declaration: Declaration, follower: InjectionFollower, *, keep: bool) -> int:
-    """Lay a declared injection, which the source runs itself, and return its number.
+    """Lay a declared injection, which the source runs itself; return its number.
 
     Raises:
-        CommandError: As for :func:`lay`.
+        CommandError: The source refuses the injection, or does not answer.
 
     """
     return await _laid(commands, lambda done: commands.declare(declaration, follower, done, keep=keep))
@@ -384,10 +443,16 @@ async def lift(commands: CommandClient, injection: int) -> str:
 
 
 async def have_lifted(commands: CommandClient, injection: int, name: str) -> None:
-    """Lift an injection of this process, retrying until the source has done so.
+    """Lift an injection of this process, and retry until the source has done so.
 
-    No other process would lift it while this one lives. Its follower gets no more events.
-    ``name``: what the log calls the injection.
+    The retries are necessary because no other process lifts the injection while this one lives. The
+    injection's follower gets no more events.
+
+    Args:
+        commands: The client of the source.
+        injection: Number of the injection.
+        name: Name of the injection in log lines.
+
     """
     commands.followers.remove(injection)
     while stands(commands, injection) and (reason := await lift(commands, injection)):
@@ -396,7 +461,7 @@ async def have_lifted(commands: CommandClient, injection: int, name: str) -> Non
 
 
 def stands(commands: CommandClient, injection: int) -> bool:
-    """Return whether an injection still stands."""
+    """Return whether the source still has an injection."""
     standing = commands.block.standing.read()
     return not commands.block.retired and any(one.number == injection and not one.lifted for one in standing)
 

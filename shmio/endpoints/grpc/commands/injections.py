@@ -1,4 +1,4 @@
-"""Injections on one block: who receives their events, and the image beneath one."""
+"""Injections on one block: their followers, and the image that an injection replaces."""
 
 from __future__ import annotations
 
@@ -15,39 +15,47 @@ _STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.ACT
 
 
 class InjectionFollower:
-    """Receives an injection's events; subclasses override what they need.
+    """Receives the events of one injection; subclasses override what they need.
 
-    Called in the event loop's thread.
+    The event loop's thread calls the methods.
     """
 
     def happened(self, event: Event) -> None:
-        """Take an event: the injection was laid, activated, deactivated or lifted."""
+        """Handle an event: the injection was laid, activated, deactivated or lifted."""
 
     def divert(self, diverted: CommandWrites) -> None:
-        """Take the values of a command that the injection diverted."""
+        """Handle a command whose values the injection diverted."""
 
     def restack(self) -> None:
-        """React to another injection on the source: laid, lifted, activated or deactivated."""
+        """Handle a change of another injection on the source.
+
+        The other injection was laid, lifted, activated or deactivated.
+        """
 
     def lifted(self, reason: str) -> None:
-        """React to the injection's end. ``reason``: why it was lifted."""
+        """Handle the injection's end.
+
+        Args:
+            reason: Why the injection was lifted.
+
+        """
 
     def fail(self, reason: str) -> None:
-        """React to missed events."""
+        """Handle missed events."""
 
 
 class WriteListener(Protocol):
-    """Receives accepted writes; called in the event loop's thread."""
+    """Receives accepted writes. The event loop's thread calls the methods."""
 
     def accept(self, event: Event) -> None:
-        """Take a part of a command that the source has accepted."""
+        """Handle a part of a command that the source has accepted."""
 
     def fail(self, reason: str) -> None:
-        """React to missed events: the writes that follow are not complete."""
+        """Handle missed events: some writes will be missing."""
 
 
 class InjectionFollowers:
-    """The followers of a block's injections, by number, and the listeners of its writes."""
+    """The followers of a block's injections, by number, and the listeners to its writes."""
 
     def __init__(self) -> None:
         self._followers: dict[int, InjectionFollower] = {}
@@ -55,14 +63,14 @@ class InjectionFollowers:
         self._assembler = CommandAssembler()
 
     def follow(self, event: Event) -> None:
-        """Pass an event on to the followers and listeners that it concerns."""
+        """Pass an event to the followers and listeners that it concerns."""
         for diverted in self._assembler.follow(event):
             if follower := self._followers.get(diverted.injection):
                 follower.divert(diverted)
         if event.kind == EventKind.ACCEPTED:
             for listener in list(self._listeners):
                 listener.accept(event)
-        elif event.kind in _STACKED and not event.offset:  # of a long declaration, the first part
+        elif event.kind in _STACKED and not event.offset:  # only the first part of a long declaration
             if follower := self._followers.get(event.injection):
                 follower.happened(event)
                 if event.kind == EventKind.LIFTED:
@@ -72,11 +80,11 @@ class InjectionFollowers:
                 follower.restack()
 
     def skip(self) -> None:
-        """Forget incomplete commands after missed events."""
+        """Forget incomplete commands, because events were missed."""
         self._assembler = CommandAssembler()
 
     def add(self, injection: int, follower: InjectionFollower) -> None:
-        """Add an injection's follower, before any of its events can have come."""
+        """Add an injection's follower. Call this before the injection's first event can come."""
         self._followers[injection] = follower
 
     def remove(self, injection: int) -> None:
@@ -84,7 +92,7 @@ class InjectionFollowers:
         self._followers.pop(injection, None)
 
     def listen(self, listener: WriteListener) -> None:
-        """Add a listener for writes that are accepted from now on."""
+        """Add a listener to the writes that are accepted from now on."""
         self._listeners[listener] = None
 
     def leave(self, listener: WriteListener) -> None:
@@ -93,7 +101,7 @@ class InjectionFollowers:
 
     @property
     def busy(self) -> bool:
-        """Whether there is a listener of writes."""
+        """True if somebody listens to writes."""
         return bool(self._listeners)
 
     def fail(self, reason: str) -> None:
@@ -104,30 +112,41 @@ class InjectionFollowers:
             listener.fail(reason)
 
     def end(self, reason: str) -> None:
-        """Report to all followers that their injections are gone."""
+        """Report to all followers that their injections have ended."""
         followers, self._followers = self._followers, {}
         for follower in followers.values():
             follower.lifted(reason)
 
 
 class InjectionBase:
-    """The image beneath one injection: the source's bytes with inner injections applied."""
+    """The image that one injection replaces: the source's bytes with the inner layers applied."""
 
     def __init__(self, block: Block, image: bytes = b"") -> None:
-        """``image``: the initial values of inner injections; default: zeros."""
+        """Begin without inner layers.
+
+        Args:
+            block: The block of the injection.
+            image: Initial values of the inner layers; default: zeros.
+
+        """
         self.number = 0
-        """The injection's number, once it is known; 0 before."""
+        """The injection's number; 0 until the number is known."""
         self.given = bytearray(image or bytes(block.layout.size))
         """The values that were diverted to the injection so far, as an image."""
         self._block = block
-        self._inner: tuple[bytes, bytes] | None = None  # bits that inner injections set, and their values
+        self._inner: tuple[bytes, bytes] | None = None  # bits that inner layers set, and their values
 
     def divert(self, writes: Iterable[Write]) -> None:
         """Apply values that were diverted to the injection."""
         apply(self.given, writes)
 
     def restack(self) -> bool:
-        """Read which inner injections stand; return whether the image beneath has changed."""
+        """Look up the inner layers again.
+
+        Returns:
+            True if the image that the injection replaces has changed.
+
+        """
         before = self._inner
         bits = np.zeros(len(self.given), np.uint8)
         for one in self._block.standing.read() if self.number else ():
@@ -140,7 +159,12 @@ class InjectionBase:
         return self._inner != before
 
     def image(self, raw: bytes) -> bytes:
-        """Return the image beneath the injection, given what the source delivered."""
+        """Return the image that the injection replaces.
+
+        Args:
+            raw: The image as the source delivered it.
+
+        """
         inner = self._inner
         if inner is None:
             return raw

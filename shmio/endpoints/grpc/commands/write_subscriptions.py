@@ -1,4 +1,4 @@
-"""Delivers accepted writes to the subscribers of registers' ``/in``."""
+"""Delivers accepted writes to the subscribers to registers' ``/in``."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from shmio.segment.commands import NO_COMMAND, apply
 
 
 class PendingImage:
-    """A frame's image with the commands applied that were accepted after it.
+    """The image of a frame, with the commands applied that were accepted after the frame.
 
-    ``mask`` has the bits set that the present command writes.
+    ``mask`` has the bits set that the current command writes.
     """
 
     def __init__(self, block: Block) -> None:
@@ -24,9 +24,9 @@ class PendingImage:
         self._frame = -1
 
     def begin(self, number: int) -> None:
-        """Begin a command that was accepted after this frame.
+        """Begin a command that was accepted after frame ``number``.
 
-        A frame that comes between the command's parts does not reset the image.
+        If a new frame arrives between the parts of the command, the image stays as it is.
         """
         if number != self._frame:
             frame = self._block.read(number) or self._block.latest()
@@ -45,15 +45,15 @@ class PendingImage:
 
 
 def ones(event: Event) -> Write:
-    """Return a write that sets all bits that a part of a command writes."""
+    """Return a write that sets every bit that this part of a command writes."""
     return Write(event.offset, event.mask, b"\xff" * len(event.data))
 
 
 class Listener(Protocol):
-    """A stream's subscription to writes; called in the event loop's thread."""
+    """A stream's subscription to writes. The event loop's thread calls the methods."""
 
     def deliver(self, message: Sized) -> None:
-        """Take one message."""
+        """Add one message to the stream."""
 
     def fail(self, reason: str) -> None:
         """End the stream, because writes were missed."""
@@ -74,26 +74,33 @@ Message = tuple[InChannel, Sized]
 
 
 class WriteSubscriptions:
-    """Makes messages of all writers' accepted writes, in the order of acceptance.
+    """Makes messages of the accepted writes of all writers, in the order of acceptance.
 
-    A subject is delivered as soon as a command has written all of it. If a command writes only
-    a part, such as one array element, the subject is delivered at the command's end, and the
-    rest is taken from the frame before. Commands whose first events were missed are skipped.
+    A subject is delivered as soon as a command has written all of it. If a command writes only a
+    part, such as one array element, the subject is delivered at the end of the command. The rest of
+    its value then comes from the frame before the command. A command whose first events were missed
+    is skipped.
     """
 
     def __init__(self, block: Block, stamp: Callable[[Event], tuple[int, int]]) -> None:
-        """``stamp`` returns an event's number and time, in ns of the instance's clock."""
+        """Begin without listeners.
+
+        Args:
+            block: The block that is written to.
+            stamp: Returns an event's number, and its time in ns of the instance's clock.
+
+        """
         self._block = block
         self._stamp = stamp
         self._channels: dict[Subject, InChannel] = {}
         self._table: tuple[InChannel, ...] = ()
         self._pending_image = PendingImage(block)
-        self._command = NO_COMMAND  # accepted last; unknown at first and after a gap
-        self._whole = False  # whether all its parts so far were applied
-        self._partly: dict[InChannel, Event] = {}  # channels that it has written in part
+        self._command = NO_COMMAND  # the last accepted command; unknown at first and after missed events
+        self._whole = False  # whether all parts of the command so far were applied
+        self._partly: dict[InChannel, Event] = {}  # channels that the command has written in part
 
     def listen(self, subject: Subject, listener: Listener) -> None:
-        """Add a listener for writes that are accepted from now on."""
+        """Add a listener to the writes that are accepted from now on."""
         channel = self._channels.get(subject)
         if channel is None:
             channel = self._channels[subject] = InChannel(subject)
@@ -101,7 +108,7 @@ class WriteSubscriptions:
         channel.listeners[listener] = None
 
     def leave(self, subject: Subject, listener: Listener) -> None:
-        """Remove a listener; the channel ends with its last one."""
+        """Remove a listener. The last listener's removal ends the channel."""
         channel = self._channels[subject]
         channel.listeners.pop(listener, None)
         if not channel.listeners:
@@ -110,26 +117,26 @@ class WriteSubscriptions:
 
     @property
     def busy(self) -> bool:
-        """Whether there is a listener."""
+        """True if somebody listens."""
         return bool(self._channels)
 
     def fail(self, reason: str) -> None:
-        """End all listeners' streams."""
+        """End the streams of all listeners."""
         for channel in self._table:
             for listener in channel.listeners:
                 listener.fail(reason)
 
     def skip(self) -> None:
-        """Forget the present command, because events were missed."""
+        """Forget the current command, because events were missed."""
         self._command, self._whole = NO_COMMAND, False
         self._pending_image.forget()
         self._partly.clear()
 
     def follow(self, event: Event) -> list[Message]:
-        """Process an event and return the messages to deliver."""
+        """Process an event, and return the messages to deliver."""
         command = event.command_key
         if event.kind != EventKind.ACCEPTED:
-            # Outcomes of earlier commands may come between the parts of this one.
+            # Outcomes of earlier commands may arrive between the parts of this one.
             return self._rest() if command == self._command or event.kind == EventKind.STARTED else []
         messages: list[Message] = []
         table = self._table
@@ -151,7 +158,7 @@ class WriteSubscriptions:
         return messages
 
     def _begins(self, event: Event) -> bool:
-        """Return whether the events before show that this is its command's first."""
+        """Return whether the events before this one show that it is the first of its command."""
         for number in range(event.number - 1, 0, -1):
             before = self._block.events.read(number)
             if before is None:
@@ -161,11 +168,14 @@ class WriteSubscriptions:
         return True
 
     def _touch(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
-        """Add a channel's message once all its bits are written; :meth:`_rest` adds others."""
+        """Add the message of a channel if the command has written all its bits.
+
+        :meth:`_rest` adds the message of a channel that is written only in part.
+        """
         bits = int.from_bytes(event.mask.to_bytes(1, "big") if event.mask else b"\xff" * len(event.data), "big")
         shift = 8 * (channel.stop - event.offset - len(event.data))
         if not (bits << shift if shift >= 0 else bits >> -shift) & channel.bits:
-            return  # other bits of its bytes
+            return  # the write changes other bits of the same bytes
         if channel.bits & ~int.from_bytes(self._pending_image.mask[channel.start : channel.stop], "big"):
             self._partly[channel] = event
             return
@@ -173,7 +183,7 @@ class WriteSubscriptions:
         self._show(channel, event, messages)
 
     def _rest(self) -> list[Message]:
-        """Return the messages of channels written in part, because the command is complete."""
+        """Return the messages of channels that the command, now complete, has written in part."""
         messages: list[Message] = []
         for channel, event in self._partly.items():
             self._show(channel, event, messages)

@@ -1,1 +1,1 @@
-"""The gRPC server: listeners, TLS, the guard every call passes, access, health."""
+"""The gRPC server: listeners, TLS, the guard that checks every call, access control, and health."""

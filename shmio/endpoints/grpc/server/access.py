@@ -47,7 +47,7 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
     "grpc.health.v1.Health": {READ: "Check Watch List"},
     "grpc.reflection.v1alpha.ServerReflection": {READ: "ServerReflectionInfo"},
 }
-"""The calls of each service, by the role that they need."""
+"""The calls of each service, grouped by the role that they need."""
 
 
 def _calls() -> Iterator[tuple[str, str]]:
@@ -58,7 +58,7 @@ def _calls() -> Iterator[tuple[str, str]]:
 
 
 NEEDS: Final[Mapping[str, str]] = dict(_calls())
-"""The role that a call needs, by its full name."""
+"""The role that a call needs, by the call's full name."""
 
 
 _SCHEME: Final = "bearer "
@@ -67,7 +67,7 @@ _LOCAL: Final = ("unix:", "ipv4:127.", "ipv6:%5B::1%5D:", "ipv6:[::1]:")
 
 
 class DeniedError(ShmioError):
-    """A call is refused before it does anything; the message says what to do."""
+    """The server refuses a call before the call does anything; the message says what to do."""
 
     def __init__(self, code: grpc.StatusCode, message: str) -> None:
         super().__init__(message)
@@ -84,7 +84,13 @@ class Credentials(NamedTuple):
     def of(
         cls, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
     ) -> Credentials:
-        """Read credentials from a call's metadata and its connection's authentication context."""
+        """Read the credentials of a call.
+
+        Args:
+            metadata: The call's metadata.
+            shown: The authentication context of the call's connection.
+
+        """
         token = None
         for key, value in metadata:
             if key == "authorization":
@@ -100,18 +106,26 @@ class Credentials(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """The configured tokens and certificate name patterns; a reload replaces them."""
+    """The configured tokens and certificate name patterns; a reload replaces the object."""
 
     secrets: Sequence[Secret] = ()
     clients: Sequence[Client] = ()
 
     @classmethod
     def of(cls, config: Grpc) -> Keys:
-        """Read tokens and patterns. ConfigError: a token's file is not usable."""
+        """Read tokens and patterns.
+
+        Raises:
+            ConfigError: The file of a token is not usable.
+
+        """
         return cls(read_tokens(config.token), tuple(config.client))
 
     def secret(self, shown: bytes) -> Secret | None:
-        """Return the token with this hash, in the same time for a wrong hash as for a right one."""
+        """Return the token with this hash, or None.
+
+        The time that this takes does not depend on the hash.
+        """
         found = None
         for secret in self.secrets:
             if hmac.compare_digest(secret.digest, shown):
@@ -132,13 +146,29 @@ class ListenerAccess:
     """Decides who may call what at one listening address; ``keys`` may be replaced at any time."""
 
     def __init__(self, keys: Keys, anonymous: Iterable[str] = ROLES, *, takes_tokens: bool = True) -> None:
-        """``anonymous``: roles without credentials. ``takes_tokens``: whether tokens are safe here."""
+        """Create the access rules of one address.
+
+        Args:
+            keys: The tokens and patterns.
+            anonymous: Roles of clients without credentials.
+            takes_tokens: Whether clients may send tokens to this address; on plain text they must
+                not.
+
+        """
         self.keys = keys
         self.anonymous = frozenset(anonymous)
         self._takes_tokens = takes_tokens
 
     def admit(self, method: str, shown: Credentials) -> str | None:
-        """Check a call, and return the name of the client's token or None. DeniedError: refused."""
+        """Check a call against the access rules.
+
+        Returns:
+            The name of the client's token, or None.
+
+        Raises:
+            DeniedError: The client may not make this call.
+
+        """
         needed = NEEDS.get(method)
         if needed is None:
             raise DeniedError(grpc.StatusCode.PERMISSION_DENIED, f"{method}: no role allows this call")
@@ -196,9 +226,9 @@ class ListenerAccess:
 def holder_of(
     peer: str, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
 ) -> object:
-    """Return the owner of a name that a client has chosen: its credentials, else its host.
+    """Return the owner of a name that a client has chosen: the client's credentials, or its host.
 
-    Two connections of one client are equal, whichever ports they have.
+    Two connections of one client have equal owners, whatever their ports.
     """
     credentials = Credentials.of(metadata, shown)
     if credentials.token or credentials.names:
@@ -210,7 +240,10 @@ def holder_of(
 
 
 def client_of(peer: str, token: str | None) -> str:
-    """Return the unit that limits apply to: a token, else a host, on this host a connection."""
+    """Return the unit that limits apply to.
+
+    This is the token, or without a token the host. On this host it is the connection.
+    """
     if token is not None:
         return f"token {token}"
     return peer if peer.startswith(_LOCAL) else peer.rpartition(":")[0]
@@ -232,7 +265,12 @@ class Listeners:
     """All listening addresses; they share tokens and certificate patterns."""
 
     def __init__(self, config: Grpc) -> None:
-        """Read the configuration. ConfigError: a token's file is not usable."""
+        """Read the configuration.
+
+        Raises:
+            ConfigError: The file of a token is not usable.
+
+        """
         keys = Keys.of(config)
         self._listeners = {
             key: Listener(
@@ -249,7 +287,12 @@ class Listeners:
         return list(self._listeners.values())
 
     def take(self, config: Grpc) -> None:
-        """Adopt new tokens, clients and roles. ConfigError: the old ones stay."""
+        """Adopt new tokens, clients and roles.
+
+        Raises:
+            ConfigError: The file of a token is not usable. The previous settings remain in effect.
+
+        """
         keys = Keys.of(config)
         for key, address in config.listening.items():
             if key in self._listeners:

@@ -1,4 +1,7 @@
-"""Guards the services: checks each call's access, limits and messages, and refuses calls of unknown names."""
+"""Guards the services: checks the access, limits and messages of each call.
+
+It also refuses calls of unknown names.
+"""
 
 from __future__ import annotations
 
@@ -22,18 +25,25 @@ from shmio.layout.topic import shorten
 from shmio.logs import fields
 
 TURN_S: Final = 10.0
-"""Time over which log lines are counted."""
+"""Period for which log lines are counted."""
 LINES: Final = 10
-"""Most log lines in ``TURN_S``; one more line reports how many others there were."""
+"""Maximum number of log lines in ``TURN_S``; one further line reports how many were left out."""
 
 log = logging.getLogger("shmio.grpc")
 
 
 class Refusals:
-    """Counts and logs refused messages or calls; for the event loop's thread."""
+    """Counts and logs refused messages or calls. Use it only in the event loop's thread."""
 
     def __init__(self, what: str = "publish refused", about: str = "topic", turn_s: float = TURN_S) -> None:
-        """``what`` begins each log line; ``about`` is the log field that names what was refused."""
+        """Begin to count.
+
+        Args:
+            what: The beginning of each log line.
+            about: The log field that names what was refused.
+            turn_s: Period for which log lines are counted.
+
+        """
         self.count = 0
         self._what = what
         self._about = about
@@ -41,7 +51,7 @@ class Refusals:
         self._in_turn = 0
 
     def add(self, reason: str, name: str, peer: str) -> None:
-        """Count a refusal, and log it if the limit allows."""
+        """Count a refusal, and log it unless too many lines were logged already."""
         self.count += 1
         self._in_turn += 1
         if self._in_turn == 1:
@@ -64,7 +74,7 @@ class CallLimits:
     """Limits on open connections and calls, on all addresses together.
 
     When fewer than ``reserve`` calls are free, only clients with fewer than ``share`` calls may
-    open another, so that a client that opens thousands leaves room for the others.
+    open another. So a client that opens thousands of calls leaves room for the others.
     """
 
     connections: int = 2048
@@ -72,11 +82,14 @@ class CallLimits:
     reserve: int = 1024
     share: int = 64
     message_s: float = 10.0
-    """Time that a call with a single request may take to send it, in s."""
+    """Time within which the client must send the request of a call with a single request, in s."""
 
 
 class _Call:
-    """An open call. ``denial``: why it has to end, if it has to."""
+    """An open call.
+
+    ``denial`` is the reason why the guard ends the call, or None.
+    """
 
     __slots__ = ("access", "client", "denial", "method", "shown", "task")
 
@@ -96,21 +109,26 @@ class _Call:
 
 
 class OpenCalls:
-    """All open calls, on all addresses; for the event loop's thread."""
+    """All open calls, on all addresses. Use it only in the event loop's thread."""
 
     def __init__(self, limits: CallLimits | None = None) -> None:
         self.limits = limits or CallLimits()
         self.refusals = Refusals("call refused", "call")
         self._open: set[_Call] = set()
         self._by_client: Counter[str] = Counter()
-        self._silent: dict[_Call, float] = {}  # calls without their message yet, and their time-outs in order
+        self._silent: dict[_Call, float] = {}  # deadlines, in order, of the calls whose message has not come yet
         self._timer: asyncio.TimerHandle | None = None
 
     def __len__(self) -> int:
         return len(self._open)
 
     def enter(self, method: str, access: ListenerAccess, context: Context) -> _Call:
-        """Admit a call, which has to :meth:`leave` later. DeniedError: it is refused."""
+        """Admit a call; :meth:`leave` it when it has ended.
+
+        Raises:
+            DeniedError: The call is refused.
+
+        """
         peer = context.peer()
         shown = Credentials.of(context.invocation_metadata() or (), context.auth_context())
         try:
@@ -132,10 +150,10 @@ class OpenCalls:
             del self._by_client[call.client]
 
     async def message(self, call: _Call, context: Context) -> Any:
-        """Return a call's single message, or EOF; end the call if none comes in time."""
+        """Return a call's single message, or EOF; end the call if no message comes in time."""
         loop = asyncio.get_running_loop()
         self._silent[call] = due_s = loop.time() + self.limits.message_s
-        if self._timer is None:  # one timer for all: nearly every message is there at once
+        if self._timer is None:  # one timer for all calls, because nearly every message is there at once
             self._timer = loop.call_at(due_s, self._end_silent)
         try:
             return await context.read()
@@ -154,7 +172,7 @@ class OpenCalls:
             call.end(DeniedError(grpc.StatusCode.DEADLINE_EXCEEDED, f"{call.method}: {limit}"))
 
     def review(self) -> int:
-        """End the calls that would not be admitted any more, and return their number."""
+        """End the calls that the present rules no longer allow, and return their number."""
         ended = 0
         for call in self._open:
             try:
@@ -180,11 +198,11 @@ class OpenCalls:
 
 
 class CallGuard(grpc.aio.ServerInterceptor):
-    """Checks every call of one listening address.
+    """Checks every call at one listening address.
 
-    For gRPC every call has a stream of requests. So a call is checked and counted before its
-    first message arrives, and an invalid message ends the call with a status, without a
-    traceback in the log.
+    It presents every call to gRPC as one with a stream of requests. So it can check and count a
+    call before the first message arrives. An invalid message then ends the call with a status, and
+    leaves no traceback in the log.
     """
 
     def __init__(self, access: ListenerAccess, calls: OpenCalls) -> None:
@@ -195,7 +213,7 @@ class CallGuard(grpc.aio.ServerInterceptor):
     async def intercept_service(
         self, continuation: Callable[[Any], Awaitable[Handler]], handler_call_details: Any
     ) -> Handler:
-        """Return the call's handler with the checks in front."""
+        """Return the call's handler, preceded by the checks."""
         method: str = handler_call_details.method
         if method not in self._handlers:
             self._handlers[method] = self._guarded(method, await continuation(handler_call_details))
@@ -261,15 +279,16 @@ async def _parsed(method: str, decode: Decode | None, data: bytes, context: Cont
 # ---- calls of unknown names ------------------------------------------------------------------------------
 #
 # grpcio's serving task decodes the name of every call that is not registered. A name that is not UTF-8 ends the
-# task, and its cleanup frees what the core still writes to. All unregistered calls also share one queue. So every
-# method is registered: the core matches names by their bytes, and each method has its own queue. A few workers
-# refuse all other calls. This needs private names of grpcio; a version without them is refused at start.
+# task, and its cleanup frees memory that the core still writes to. All unregistered calls also share one queue. So
+# the server registers every method: the core matches names by their bytes, and each method has its own queue. A few
+# workers refuse all other calls. This needs private names of grpcio. The server does not start with a version that
+# lacks them.
 
 cygrpc: Any = import_module("grpc._cython.cygrpc")
 AioServer: Any = import_module("grpc.aio._server").Server
 
 WORKERS: Final = 8
-"""How many calls of unknown names are refused at once."""
+"""Number of calls of unknown names that are refused concurrently."""
 
 _NEEDED: Final[Mapping[str, str]] = {
     "AioServer": "_make_request_call_future _request_call add_registered_method_handlers is_running shutdown",
@@ -281,7 +300,12 @@ _NO_CALL: Final = "there is no such call; reflection lists the services"
 
 
 def check_version() -> None:
-    """Check that grpcio has the private names needed here. EndpointError: it lacks some."""
+    """Check that grpcio has the private names that this module uses.
+
+    Raises:
+        EndpointError: This version of grpcio lacks some of them.
+
+    """
     missing = [
         f"{name}.{member}".rstrip(".")
         for name, members in _NEEDED.items()
@@ -296,17 +320,17 @@ def check_version() -> None:
 
 
 class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
-    """A gRPC core whose serving task only gets calls of registered methods."""
+    """A gRPC core that passes only calls of registered methods to its serving task."""
 
     def start_workers(self) -> None:
         """Start the workers that refuse calls of unknown names."""
-        self._taking = asyncio.Lock()  # one request for a call at a time is enough, and leaves the rest to the core
+        self._taking = asyncio.Lock()  # only one worker at a time waits for a call
         self.refused = 0
         self._workers = [asyncio.create_task(self._refuse()) for _ in range(WORKERS)]
 
     @property
     def alive(self) -> bool:
-        """Whether the core serves. If not, it never will again, and the process has to end."""
+        """True if the core serves. If not, it never serves again, and the process has to end."""
         return bool(self.is_running()) and not any(worker.done() for worker in self._workers)
 
     def _make_request_call_future(self, method: bytes | None) -> asyncio.Future[Any]:
@@ -321,30 +345,30 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
                     return
                 try:
                     state = await _kept(asyncio.create_task(self._request_call()))
-                except cygrpc._RequestCallError:  # it is shutting down
+                except cygrpc._RequestCallError:  # the core is shutting down
                     continue
             self.refused += 1
             context = cygrpc._ServicerContext(state, None, None, asyncio.get_running_loop())
             try:
                 await context.abort(grpc.StatusCode.UNIMPLEMENTED, _NO_CALL)
-            except (grpc.aio.AbortError, grpc.aio.InternalError):  # sent, or the client is gone
+            except (grpc.aio.AbortError, grpc.aio.InternalError):  # the status was sent, or the client is gone
                 pass
             finally:
-                del state, context  # which hold the call
+                del state, context  # they keep the call alive
 
 
 class CoreServer(AioServer):  # type: ignore[misc]
-    """An asyncio gRPC server with such a core."""
+    """An asyncio gRPC server that uses a :class:`Core`."""
 
     def __init__(self, options: Sequence[tuple[str, Any]], interceptor: grpc.aio.ServerInterceptor) -> None:
-        """Create a server with one interceptor and without grpc.aio.server()'s other arguments."""
+        """Create a server with one interceptor, and the defaults of ``grpc.aio.server`` otherwise."""
         check_version()
         self._loop = cygrpc.get_working_loop()
         self._server: Core = Core(self._loop, None, (), (interceptor,), tuple(options), None)
 
     @property
     def alive(self) -> bool:
-        """Whether the server serves."""
+        """True if the server serves."""
         return bool(self._server.alive)
 
     @property
@@ -360,5 +384,5 @@ class CoreServer(AioServer):  # type: ignore[misc]
 
 def _kept(request: asyncio.Task[Any]) -> asyncio.Future[Any]:
     """Shield a request for a call from cancellation, because the core writes to its memory."""
-    request.add_done_callback(lambda done: done.cancelled() or done.exception())  # no one else may retrieve the error
+    request.add_done_callback(lambda done: done.cancelled() or done.exception())  # else asyncio may log the error
     return asyncio.shield(request)

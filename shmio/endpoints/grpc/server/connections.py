@@ -1,6 +1,7 @@
-"""Finds out which clients are connected, even without an open call.
+"""Lists the clients that are connected, even those without an open call.
 
-gRPC reports the end of a call to a server, but not of a connection; the kernel knows.
+gRPC reports the end of a call to the server, but not the end of a connection. So this module reads
+the kernel's tables of connections.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ Peer = tuple[IPv4Address | IPv6Address, int]
 def peer_of(text: str) -> Peer | None:
     """Parse gRPC's name of a client, such as ``ipv4:127.0.0.1:5000`` or ``ipv6:%5B::1%5D:5000``.
 
-    None: the connection is not TCP.
+    Returns:
+        The client's address and port, or None if the connection is not TCP.
+
     """
     match = _PEER.fullmatch(unquote(text))
     if match is None:
@@ -35,7 +38,7 @@ def peer_of(text: str) -> Peer | None:
 
 
 def connected() -> frozenset[Peer]:
-    """Return the remote ends of this host's TCP connections, as far as the kernel lists them."""
+    """Return the remote ends of the TCP connections of this host that the kernel lists."""
     return frozenset(peer for table in _TABLES for peer in _read(table))
 
 
@@ -52,11 +55,11 @@ def _read(table: Path) -> Iterator[Peer]:
 
 
 def _address(words: bytes) -> IPv4Address | IPv6Address:
-    """Read an address from the kernel's tables: words of four bytes in the host's byte order."""
+    """Parse an address of the kernel's tables: words of four bytes in the host's byte order."""
     data = b"".join(words[at : at + 4][::-1] for at in range(0, len(words), 4))
     return _plain(ip_address(data))
 
 
 def _plain(address: IPv4Address | IPv6Address) -> IPv4Address | IPv6Address:
-    """Return the IPv4 address of an IPv4-mapped IPv6 address, and others unchanged."""
+    """Return the IPv4 address of an IPv4-mapped IPv6 address, and any other address unchanged."""
     return getattr(address, "ipv4_mapped", None) or address

@@ -1,8 +1,8 @@
 """Health (``grpc.health.v1``) of the endpoint, its services and its sources.
 
-The servicer of grpcio-health-checking is not used: it sends to watchers under a lock that
-status changes need. So a watcher that does not read blocks all changes of that service, and
-the process's end.
+The servicer of grpcio-health-checking is not suitable. It sends to watchers while it holds a lock
+that changes of a status need. A watcher that does not read would block all changes of that service,
+and the end of the process.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from shmio.layout.topic import shorten
 
 
 class Health(health_pb2_grpc.HealthServicer):
-    """Serves the status of services, conflated for slow watchers; for the event loop's thread."""
+    """Serves the status of services; a slow watcher gets only the newest status.
+
+    Use it only in the event loop's thread.
+    """
 
     def __init__(self) -> None:
         self._serving: dict[str, bool] = {}
@@ -27,26 +30,33 @@ class Health(health_pb2_grpc.HealthServicer):
         self._over = False
 
     def set(self, service: str, *, serving: bool) -> None:
-        """Set a service's status; without effect after :meth:`end`."""
+        """Set the status of a service; without effect after :meth:`end`."""
         if not self._over:
             self._serving[service] = serving
             for changed in self._watchers.get(service, ()):
                 changed.set()
 
     def end(self) -> None:
-        """Set all services to not serving, for good."""
+        """Set all services to not serving, permanently."""
         for service in list(self._serving):
             self.set(service, serving=False)
         self._over = True
 
     async def Check(self, request: wire.HealthCheckRequest, context: Context) -> wire.HealthCheckResponse:  # noqa: N802  the name of the call
-        """Return a service's status. Status NOT_FOUND: no such service."""
+        """Return the status of a service.
+
+        Statuses:
+            NOT_FOUND: There is no such service.
+        """
         if request.service not in self._serving:
             await context.abort(grpc.StatusCode.NOT_FOUND, f"{shorten(request.service)!r}: no such service")
         return self._status(request.service)
 
     async def Watch(self, request: wire.HealthCheckRequest, _: Context) -> AsyncIterator[wire.HealthCheckResponse]:  # noqa: N802
-        """Stream a service's status and its changes, conflated; the service may be unknown."""
+        """Stream the status of a service and its changes.
+
+        A slow client gets only the newest status. The service need not exist yet.
+        """
         changed = asyncio.Event()
         watchers = self._watchers.setdefault(request.service, set())
         watchers.add(changed)

@@ -1,4 +1,4 @@
-"""Limits on what clients take from the process: file descriptors, memory, and the event loop's time."""
+"""Limits what clients use up: file descriptors, memory, and the time of the event loop."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any, Final, TypeVar
 # ---- file descriptors ------------------------------------------------------------------------------------
 
 OWN: Final = 256
-"""Descriptors reserved for everything but connections, because nothing works without; more than enough."""
+"""File descriptors that are reserved for everything but connections; more than enough."""
 EACH: Final = 1
-"""Descriptors reserved for each connection."""
+"""File descriptors that are reserved for each connection."""
 FEW: Final = 64
-"""With fewer connections than this the endpoint reports a shortage."""
+"""The endpoint reports a shortage if it can serve fewer connections than this."""
 
 
 def shortage(connections: int, wanted: int) -> str:
-    """Return the note for ``status`` if connections are short; empty: there are enough."""
+    """Return a note for ``status`` if too few connections are possible, otherwise an empty text."""
     if connections >= min(FEW, wanted):
         return ""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -32,7 +32,7 @@ def shortage(connections: int, wanted: int) -> str:
 
 
 def room(wanted: int) -> int:
-    """Raise the limit of open files as far as needed; return the connections that it allows."""
+    """Raise the limit of open files as far as needed, and return how many connections it allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = OWN + EACH * wanted
     if soft != resource.RLIM_INFINITY and soft < needed:
@@ -47,23 +47,29 @@ def room(wanted: int) -> int:
 
 M_ARENA_MAX: Final = -8
 ARENAS: Final = 2
-"""Number of malloc arenas; by default each thread has its own, whose free memory no other uses."""
+"""Maximum number of malloc arenas.
+
+By default each thread has its own arena, and no other thread uses the free memory in it.
+"""
 FLOOD_CALLS: Final = 1000
-"""Number of refused calls after which free memory is returned."""
+"""Number of refused calls that count as a flood, after which free memory is returned to the kernel."""
 EVERY_S: Final = 5.0
 """Interval at which free memory is returned."""
 AFTER_S: Final = 60.0
-"""How long after a flood free memory is still returned."""
+"""Time after a flood during which free memory is still returned."""
 
 
 def limit_arenas() -> None:
-    """Limit the malloc arenas that all threads share. Call this before threads start."""
+    """Limit the number of malloc arenas, for all threads. Call this before you start threads."""
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(M_ARENA_MAX, ARENAS)
 
 
 class Trimmer:
-    """Returns free memory during floods and for a while after: gRPC frees a call's memory later."""
+    """Returns free memory to the kernel during floods of calls.
+
+    It continues for a while after a flood, because gRPC frees the memory of a call later.
+    """
 
     def __init__(
         self, clock_s: Callable[[], float] = time.monotonic, trim: Callable[[int], object] | None = None
@@ -74,7 +80,12 @@ class Trimmer:
         self._due_s = self._until_s = 0.0
 
     def look(self, refused: int) -> None:
-        """Return free memory if it is time. ``refused``: number of refused calls so far."""
+        """Return free memory to the kernel if it is time.
+
+        Args:
+            refused: Number of refused calls so far.
+
+        """
         now_s = self._clock_s()
         if refused - self._seen >= FLOOD_CALLS:
             self._seen, self._until_s = refused, now_s + AFTER_S
@@ -86,13 +97,13 @@ class Trimmer:
 # ---- the event loop's time -------------------------------------------------------------------------------
 
 HELD_S: Final = 0.005
-"""Longest time that one request's work may block the event loop at once."""
+"""Longest time for which the work of one request may block the event loop."""
 
 T = TypeVar("T")
 
 
 async def time_sliced(items: Iterable[T]) -> AsyncIterator[T]:
-    """Yield the items; let other tasks run whenever ``HELD_S`` has passed."""
+    """Yield the items, and let other tasks run whenever ``HELD_S`` has passed."""
     begun_s = time.perf_counter()
     for item in items:
         yield item

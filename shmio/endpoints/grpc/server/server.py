@@ -23,18 +23,18 @@ from shmio.errors import EndpointError
 
 MAX_REQUEST_BYTES = 1 << 20
 GRACE_S: Final = 0.2
-"""How long calls that are open may take to end by themselves when the endpoint stops."""
+"""Time in which open calls may end by themselves when the endpoint stops."""
 STOP_S: Final = 2.5
-"""How long all of a stop may take: well below the time after which the supervisor kills."""
+"""Maximum duration of a stop; well below the time after which the supervisor kills the process."""
 
 log = logging.getLogger("shmio.grpc")
 
 OPTIONS = [
-    ("grpc.so_reuseport", 0),  # else a second server could silently take the same port
+    ("grpc.so_reuseport", 0),  # otherwise a second server could silently use the same port
     ("grpc.max_receive_message_length", MAX_REQUEST_BYTES),
-    # A call that waited long in the queue is not cancelled: its client sets its own deadline.
+    # Do not cancel a call that has waited long in the queue: its client sets the deadline.
     ("grpc.server_max_unrequested_time_in_server", 3600),
-    # A client whose host vanished is noticed within half a minute.
+    # Notice within half a minute that a client's host has vanished.
     ("grpc.keepalive_time_ms", 20_000),
     ("grpc.keepalive_timeout_ms", 10_000),
     ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
@@ -42,12 +42,18 @@ OPTIONS = [
 
 
 class Server:
-    """Serves all services on each listening address, behind a :class:`CallGuard` each."""
+    """Serves all services on each listening address, each guarded by a :class:`CallGuard`."""
 
     def __init__(
         self, services: Mapping[str, dict[str, grpc.RpcMethodHandler[Any, Any]]], calls: OpenCalls | None = None
     ) -> None:
-        """``services``: the handlers of each service, by its full name; ``calls``: default: none is open."""
+        """Create the server; :meth:`start` starts it.
+
+        Args:
+            services: The handlers of each service, by the service's full name.
+            calls: The open calls; default: none.
+
+        """
         self.calls = OpenCalls() if calls is None else calls
         """The open calls on all addresses."""
         self._services = services
@@ -56,12 +62,12 @@ class Server:
         self._files: dict[str, SocketFile] = {}
         self._connections = 1
         self.shortage = ""
-        """Note for ``status`` if the endpoint serves with too few connections; else empty."""
+        """Note for ``status`` if the endpoint can serve too few connections; otherwise empty."""
         logging.getLogger("grpc._cython.cygrpc").addFilter(_is_news)
 
     @property
     def alive(self) -> bool:
-        """Whether all addresses are served.
+        """True if all addresses are served.
 
         If not, the process has to end: a second server in the process would corrupt its memory.
         """
@@ -73,16 +79,16 @@ class Server:
         return sum(server.refused for server in self._servers)
 
     async def start(self, listeners: Sequence[Listener], tls: Tls | None = None, gid: int | None = None) -> list[int]:
-        """Listen on all addresses and return their ports.
+        """Listen on all addresses, and return their ports.
 
         Args:
             listeners: The addresses; port 0 means any free port.
             tls: Certificate and key for encrypted addresses.
-            gid: A group that may also open UNIX sockets.
+            gid: A group whose members may also open UNIX sockets.
 
         Raises:
             ConfigError: A file of ``tls`` cannot be used.
-            EndpointError: An address, which the message names, cannot be used.
+            EndpointError: An address cannot be used; the message names it.
 
         """
         credentials = _credentials(tls) if tls else None
@@ -104,11 +110,11 @@ class Server:
         return ports
 
     async def set_source(self, source: str, good: bool) -> None:
-        """Set the health of ``source.<name>`` to a source's quality."""
+        """Set the health of ``source.<name>`` to the quality of a source."""
         self._health.set(f"source.{source}", serving=good)
 
     async def stop(self) -> None:
-        """Set health to not serving, end all calls and close, within ``STOP_S``."""
+        """Set the health to not serving, end all calls, and close. This takes at most ``STOP_S``."""
         self._health.end()
         ends = [asyncio.create_task(server.stop(GRACE_S)) for server in self._servers]
         if ends and (await asyncio.wait(ends, timeout=STOP_S))[1]:
@@ -140,9 +146,9 @@ class Server:
         return int(port)
 
     def _server(self, gate: CallGuard) -> CoreServer:
-        # A connection may have as many streams as there may be calls in all. gRPC ends some
-        # calls at random when 1000 wait: clients that open thousands at once would lose some. Each
-        # method has its own queue. A flood of unknown names can only fill the queue for those.
+        # One connection may have as many streams as there may be calls in total. By default, gRPC
+        # ends some calls at random when 1000 wait, and a client that opens thousands at once would
+        # lose some. Each method has its own queue, and so have the calls of unknown names.
         most = self.calls.limits.calls
         pending = "grpc.server.max_pending_requests"
         options: list[tuple[str, Any]] = [
@@ -171,5 +177,8 @@ def _credentials(tls: Tls) -> grpc.ServerCredentials:
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Filter gRPC's tracebacks about headers that are not UTF-8: any client can cause them."""
+    """Return False for gRPC's tracebacks about headers that are not UTF-8.
+
+    Any client can cause such tracebacks.
+    """
     return not str(record.msg).startswith("Invalid encoding on ")

@@ -1,4 +1,7 @@
-"""Injections of SimlogAPI clients: they read what an injection diverts, and give other values, by shadow topics."""
+"""Injections of SimlogAPI clients.
+
+By shadow topics, clients read the values that an injection diverts, and give other values instead.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +33,13 @@ from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.commands import CommandWrites, End, apply, worst
 
 MAX_INJECTIONS: Final = 64
-"""Bound of this endpoint's injections over one source."""
+"""Maximum number of this endpoint's injections on one source."""
 MAX_PATH: Final = 1024
-"""Longest path of a shadow, or prefix, in characters."""
+"""Maximum length of a shadow topic's path, or of a prefix, in characters."""
 LOOK_S: Final = 0.25
-"""Interval of checks for disconnected clients: their injections are to end within a second."""
+"""Interval of the checks for disconnected clients, whose injections are to end within a second."""
 UNSEEN_S: Final = 10.0
-"""How long an injection without a stream stands if its client's connection cannot be seen."""
+"""How long an injection without a stream lasts if the kernel does not list its client's connection."""
 
 _MARKS: Final = frozenset(mark.value for mark in TimeTopic)
 _SCHEME: Final = re.compile(r"^[^/:]*://")
@@ -44,11 +47,11 @@ _SCHEME: Final = re.compile(r"^[^/:]*://")
 log = logging.getLogger("shmio.grpc")
 
 Leave = Callable[[], None]
-"""Stops listening."""
+"""Ends a subscription."""
 
 
 class _Tap:
-    """The listeners to one of an injection's two directions; each encoding is made once."""
+    """The listeners to one direction of an injection; a value is encoded once for all of them."""
 
     def __init__(self) -> None:
         self._channels: dict[str, tuple[Encode, set[Listener]]] = {}
@@ -79,22 +82,30 @@ class _Tap:
 class Injection(InjectionFollower):
     """An injection over the registers of ``shape``, from laying to lifting.
 
-    ``shape`` is what ``target`` names in the layout of ``feed``. The injection's *originals* are
-    the values that it diverts: over ``/out`` those of the source or of inner injections, over
-    ``/in`` those that are written. Its *given values* are what its clients send instead. For the
-    event loop's thread.
+    ``shape`` has the registers that ``target`` names in the layout of ``feed``. The *originals* of
+    an injection are the values that it diverts. Over ``/out`` these come from the source or from
+    inner layers, over ``/in`` from writers. Its *given values* are those that its clients send
+    instead. Use it only in the event loop's thread.
     """
 
     def __init__(self, target: Topic, shape: Shape, feed: Feed, name: str) -> None:
-        """Begin laying the injection. ``name``: its name in the list of all injections."""
+        """Begin to lay the injection.
+
+        Args:
+            target: The topic of the injection.
+            shape: The registers that the target names.
+            feed: The feed of the source.
+            name: Name of the injection in the list of all injections.
+
+        """
         self.target = target
         self.shape = shape
         self.feed = feed
         self.inward = target.direction == "in"
         self.over = ""
-        """Why the injection is over; empty: it stands, or is being laid."""
+        """Why the injection has ended; empty while it lasts."""
         self.ends: dict[object, Callable[[], object]] = {}
-        """Functions that are called when the injection is over, by the object that added them."""
+        """Functions to call at the end of the injection, by the object that added them."""
         frame = feed.block.latest()
         self._base = InjectionBase(feed.block, frame.image if frame else b"")
         self._given_image = bytearray(self._base.given)
@@ -102,13 +113,18 @@ class Injection(InjectionFollower):
         self._subjects: dict[Subject, None] = {}
         self._diverted, self._given = _Tap(), _Tap()
         self._laid = asyncio.get_running_loop().create_task(self._lay(name))
-        self._laid.add_done_callback(lambda laid: laid.cancelled() or laid.exception())  # a waiter sees the error
+        self._laid.add_done_callback(lambda laid: laid.cancelled() or laid.exception())  # laid() raises the error
         self._lifting: asyncio.Task[None] | None = None
 
     # ---- laid, and lifted --------------------------------------------------------------------------------------
 
     async def laid(self) -> None:
-        """Wait until the injection stands. CommandError: the source refuses or does not answer."""
+        """Wait until the source has laid the injection.
+
+        Raises:
+            CommandError: The source refuses the injection, or does not answer.
+
+        """
         await asyncio.shield(self._laid)
 
     async def _lay(self, name: str) -> None:
@@ -126,11 +142,16 @@ class Injection(InjectionFollower):
             self._finish(str(error))
             raise CommandError(f"{self.target}: {error}") from None
         finally:
-            if self.over:  # ended meanwhile, or it is unknown whether it stands
+            if self.over:  # it ended meanwhile, or the source may have laid it although it did not answer
                 self._have_it_lifted()
 
     def end(self, reason: str) -> None:
-        """Lift the injection. ``reason``: becomes :attr:`over`."""
+        """Lift the injection.
+
+        Args:
+            reason: Why; becomes :attr:`over`.
+
+        """
         if not self.over:
             self._finish(reason)
             if self._laid.done():
@@ -149,16 +170,21 @@ class Injection(InjectionFollower):
     # ---- given values ------------------------------------------------------------------------
 
     def ready(self, values: Mapping[str, object]) -> bool:
-        """Return whether :meth:`give` of these values would not have to wait."""
+        """Return whether :meth:`give` would send these values without waiting."""
         return self._laid.done() and self.feed.commands.ready(values)
 
     async def give(self, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None) -> None:
-        """Send values as this injection's; the functions are those of :meth:`CommandClient.give`.
+        """Send values as those of this injection.
+
+        Args:
+            values: Values by register path.
+            done: Called once, with the outcome of each write.
+            accepted: Called if the source accepts the command.
 
         Raises:
-            PathError: The injection is over.
-            CommandError: The source does not answer. Nothing was sent, as with the next error.
-            ValueRangeError: A value does not fit.
+            PathError: The injection has ended.
+            CommandError: The source does not answer. Nothing was sent.
+            ValueRangeError: A value does not fit its register. Nothing was sent.
 
         """
         await self.laid()
@@ -192,15 +218,23 @@ class Injection(InjectionFollower):
             self._given.show(ShownImage(now.number, now.clock_ns, bytes(self._given_image)))
 
     def given_values(self, wire: str, encode: Encode, lane: EventLane) -> Leave:
-        """Listen to the values given from now on; return the function that leaves."""
+        """Listen to the values given from now on; return the function that ends this."""
         return self._given.listen(wire, encode, lane)
 
     # ---- originals ---------------------------------------------------------------------------
 
     def originals(self, wire: str, encode: Encode, outbox: Outbox, path: str, finish: Finish = bytes) -> Leave:
-        """Listen to what the injection diverts; return the function that leaves.
+        """Listen to the originals; return the function that ends this.
 
-        Over ``/out`` the present value comes first. ``path`` is named in failures.
+        Over ``/out`` the listener first gets the present value.
+
+        Args:
+            wire: Name of the encoding.
+            encode: Encodes an image as a message.
+            outbox: The stream that gets the messages.
+            path: Path of the topic, for the text of a failure.
+            finish: Completes a message when it is sent.
+
         """
         if self.inward:
             return self._diverted.listen(wire, encode, EventLane(outbox, path, finish))
@@ -217,7 +251,12 @@ class Injection(InjectionFollower):
         return partial(self.feed.leave, subject, lane)
 
     def present(self) -> ShownImage | None:
-        """Return the present original of ``/out``; None: it is not good, or ``/in`` is diverted."""
+        """Return the present original of ``/out``.
+
+        Returns:
+            The original, or None if it is not good, or if the injection is over ``/in``.
+
+        """
         frame = None if self.inward else self.feed.present()
         return None if frame is None else self._original(frame)
 
@@ -234,7 +273,7 @@ class Injection(InjectionFollower):
     # ---- events of the source ----------------------------------------------------------------
 
     def divert(self, diverted: CommandWrites) -> None:
-        """Take the values of a command that the injection diverted."""
+        """Handle a command whose values the injection diverted."""
         self._base.divert(diverted.writes)
         if self.inward:
             self._diverted.show(ShownImage(*self.feed.commands.stamp(diverted.event), bytes(self._base.given)))
@@ -243,16 +282,16 @@ class Injection(InjectionFollower):
             self._tell_again()
 
     def restack(self) -> None:
-        """React to another injection on the source that was laid or lifted."""
+        """Handle a change of another injection on the source."""
         if not self.inward and self._base.restack():
             self._tell_again()
 
     def lifted(self, reason: str) -> None:
-        """React to the injection's end, which this endpoint did not ask for."""
+        """Handle the end of the injection, if another program has lifted it."""
         self._finish(f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it")
 
     def fail(self, reason: str) -> None:
-        """React to missed events: fail the listeners to originals."""
+        """Fail the listeners to originals, because events were missed."""
         self._diverted.fail(reason)
 
 
@@ -260,9 +299,9 @@ class ShadowKind(Enum):
     """The kinds of shadow topics."""
 
     GIVEN = "gifts"
-    """Clients write the injection's values to it, and read what all clients have written."""
+    """The topic of the given values: clients write to it, and read what all clients have written."""
     ORIGINALS = "originals"
-    """Clients read from it what the injection diverts."""
+    """The topic of the originals: clients read from it what the injection diverts."""
 
 
 class Shadow(NamedTuple):
@@ -274,14 +313,18 @@ class Shadow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Client:
-    """A client that holds an injection without a stream. ``peer``: None if it cannot be seen."""
+    """A client that holds an injection without a stream.
+
+    ``peer`` is None if the kernel does not list the client's connection. Then ``until_s`` is the
+    end of the hold.
+    """
 
     peer: Peer | None
     until_s: float
 
 
 class Shadows:
-    """All shadow topics and their injections; an injection is lifted when nobody holds it."""
+    """All shadow topics and their injections. An injection that nobody holds any more is lifted."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -296,13 +339,13 @@ class Shadows:
     async def lay(
         self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], holder: object, peer: str
     ) -> Injection:
-        """Lay an injection with these shadow topics, or join the one that exists.
+        """Lay an injection with these shadow topics, or join the one that has them.
 
         Args:
-            target: What the injection is over.
-            shape: What the target names in the source's layout.
+            target: The topic to lay the injection over.
+            shape: The registers that the target names.
             kinds: The shadow topics, by path.
-            holder: Whoever holds the injection until :meth:`release`.
+            holder: The object that holds the injection until :meth:`release`.
             peer: The client, for the list of all injections.
 
         Raises:
@@ -334,7 +377,10 @@ class Shadows:
     async def lay_for_client(
         self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], peer: str
     ) -> Injection:
-        """Lay an injection as :meth:`lay`; the client's connection holds it until a stream does."""
+        """Lay an injection as :meth:`lay` does.
+
+        The client's connection holds the injection until a stream does.
+        """
         seen = peer_of(peer)
         if seen not in await asyncio.to_thread(connected):
             seen = None
@@ -345,13 +391,13 @@ class Shadows:
         return injection
 
     def hold(self, injection: Injection, stream: object) -> None:
-        """Have a stream hold an injection, in place of clients without a stream."""
+        """Let a stream hold an injection, instead of the clients without a stream."""
         holders = self._holders.get(injection, set())
         holders.difference_update([holder for holder in holders if isinstance(holder, _Client)])
         holders.add(stream)
 
     def release(self, injection: Injection, holder: object) -> None:
-        """End a hold on an injection, which is lifted when its last hold ends."""
+        """End a hold on an injection; the end of the last hold lifts the injection."""
         holders = self._holders.get(injection, set())
         if holder in holders:
             holders.remove(holder)
@@ -359,13 +405,19 @@ class Shadows:
                 injection.end("nobody holds it any more")
 
     def move(self, sources: Collection[str]) -> None:
-        """End the injections over sources whose blocks a reload has replaced."""
+        """End the injections on sources whose blocks a reload has replaced."""
         for injection in list(self._holders):
             if injection.target.source in sources:
                 injection.end(RETIRED)
 
     def _joined(self, target: Topic, kinds: Mapping[str, ShadowKind]) -> Injection | None:
-        """Return the injection that has these topics. ConflictError: another target has them."""
+        """Return the injection that has these topics already, or None.
+
+        Raises:
+            ValueRangeError: A topic is the target itself.
+            ConflictError: A topic is in use for another target.
+
+        """
         found: Injection | None = None
         for path, kind in kinds.items():
             name = self._topics.name(path)
@@ -384,7 +436,7 @@ class Shadows:
         self._named = {name: shadow for name, shadow in self._named.items() if shadow.injection is not injection}
 
     async def _look(self) -> None:
-        """Release the injections of clients without a stream whose connection has ended."""
+        """Release the injections of clients without a stream that have disconnected."""
         while clients := self._clients():
             await asyncio.sleep(LOOK_S)
             there = await asyncio.to_thread(connected)
@@ -404,7 +456,12 @@ class Shadows:
 
 
 def shadow_path(path: str) -> str:
-    """Check a path that a client wants for a shadow. ValueRangeError: it is not usable."""
+    """Check the path that a client wants for a shadow topic, and return it.
+
+    Raises:
+        ValueRangeError: The path is not usable.
+
+    """
     if not path.strip("/") or len(path) > MAX_PATH or not path.isprintable():
         raise ValueRangeError(f"the path of a shadow has 1 to {MAX_PATH} printable characters, not {shorten(path)!r}")
     return path
@@ -413,7 +470,11 @@ def shadow_path(path: str) -> str:
 def shadow_paths(prefix: str, target: Topic) -> tuple[str, str]:
     """Return the paths of a target's two shadow topics: for given values, and for originals.
 
-    Many targets may share a prefix. ValueRangeError: the prefix is not usable.
+    Many targets may share a prefix.
+
+    Raises:
+        ValueRangeError: The prefix is not usable.
+
     """
     if len(prefix) > MAX_PATH or not prefix.isprintable():
         raise ValueRangeError(f"shadowPathPrefix has at most {MAX_PATH} printable characters, not {shorten(prefix)!r}")

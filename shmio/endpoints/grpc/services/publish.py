@@ -1,4 +1,4 @@
-"""Writes the values that clients publish, for all SimlogAPI versions."""
+"""Writes the values that clients publish, for both versions of SimlogAPI."""
 
 from __future__ import annotations
 
@@ -22,21 +22,24 @@ from shmio.segment import DONE, EventKind
 from shmio.segment.commands import End, worst
 
 TURNS: Final = 3
-"""Turns that are awaited, as one of gRPC's threads may be delayed with what it received."""
+"""Number of passes through gRPC's queue to wait for.
+
+There are several because one of gRPC's threads may pass on a message late.
+"""
 
 
 class ReceiveBarrier:
     """Waits until the handlers have all messages that gRPC has received so far.
 
-    Received messages pass through a queue to the event loop. The barrier puts an operation
-    behind them that ends at once: watching an unused channel, which is not shut down.
+    Received messages pass through a queue to the event loop. The barrier appends an operation to
+    this queue that ends at once: it watches the state of an unused channel.
     """
 
     def __init__(self) -> None:
         self._channel: grpc.aio.Channel | None = None
 
     async def handled(self) -> None:
-        """Wait until the handlers have what was received before."""
+        """Wait until the handlers have all messages that were received before this call."""
         if self._channel is None:
             self._channel = grpc.aio.insecure_channel("unix:///dev/null")
         for _ in range(TURNS):
@@ -49,29 +52,35 @@ class ReceiveBarrier:
 
 
 SETTLE_S: Final = 5.0
-"""Longest time that a step waits for a client's earlier values while it sends more."""
+"""Longest time for which a step waits for a client's earlier values while the client sends more."""
 MAX_VALUES: Final = 256
-"""Bound of the registers in one structure: as many as a source takes in one cycle."""
+"""Maximum number of registers in one structure: as many as a source writes in one cycle."""
 LARGE_ELEMENTS: Final = 1024
-"""From this many elements on, an array is read in a thread, as it takes noticeable time."""
+"""Arrays with at least this many elements are read in a thread, because that takes noticeable time."""
 
 
 class _Destination(NamedTuple):
-    """Where a value goes. ``send`` sends it; ``ready``: whether that would not have to wait."""
+    """The receiver of a value.
+
+    ``send`` sends the value. ``ready`` is True if that would not have to wait.
+    """
 
     send: Callable[[Done, Callable[[], None]], Coroutine[None, None, None]]
     ready: bool
 
 
 class Request(NamedTuple):
-    """A value for a topic. ``read`` returns it by register path, or raises ValueRangeError."""
+    """A value for a topic.
+
+    ``read`` returns the value by register path, or raises ValueRangeError.
+    """
 
     path: str
     read: Callable[[Shape], Mapping[str, object]]
 
 
 Parse = Callable[[bytes], Request]
-"""Reads a message. DecodeError: it is not valid."""
+"""Parses a message, or raises DecodeError if it is not valid."""
 
 
 class _PublishCall:
@@ -91,7 +100,7 @@ class _PublishCall:
             await asyncio.shield(self._answered)
 
     def answer(self) -> None:
-        """Count a value that its source has accepted or refused."""
+        """Note that a source has accepted or refused a value."""
         self.unanswered -= 1
         if not self.unanswered and self._answered is not None:
             self._answered.set_result(None)
@@ -123,7 +132,12 @@ class _PublishedValue:
 
 
 async def _read(request: Request, found: Shape) -> Mapping[str, object]:
-    """Return a request's values, reading large arrays in a thread. ValueRangeError: wrong type."""
+    """Return the values of a request; large arrays are read in a thread.
+
+    Raises:
+        ValueRangeError: A value does not fit its register.
+
+    """
     if found.elements < LARGE_ELEMENTS:
         return request.read(found)
     return await asyncio.to_thread(request.read, found)
@@ -132,8 +146,9 @@ async def _read(request: Request, found: Shape) -> Mapping[str, object]:
 class Publisher:
     """Serves Publish and Write.
 
-    A wrong message of a stream is counted, logged and skipped; the stream goes on. Every
-    message is in the end counted as ``published``, if the device has it, or as ``refused``.
+    An invalid message of a stream is counted, logged and skipped, and the stream continues. In the
+    end each message is counted: as ``published`` if the device has the value, otherwise as
+    ``refused``.
     """
 
     def __init__(self, topics: Topics, shadows: Shadows) -> None:
@@ -147,11 +162,11 @@ class Publisher:
 
     @property
     def refused(self) -> int:
-        """Number of messages that were not carried out, or whose outcome is unknown."""
+        """Number of messages whose value was not written, or whose outcome is unknown."""
         return self._refusals.count
 
     async def publish(self, messages: AsyncIterator[bytes], parse: Parse, peer: str) -> Empty:
-        """Write a stream's values in order; return when the stream and all its values have ended.
+        """Write the values of a stream in order; return when all of them have ended.
 
         Values that were received are written even if the client disconnects.
         """
@@ -185,20 +200,20 @@ class Publisher:
             self._refusals.add(str(error), path, peer)
             value.end()
             return
-        except BaseException:  # the call ends
+        except BaseException:  # such as the cancellation of the call
             value.end()
             raise
         sending = self._send(destination, partial(self._ended, value, path, peer), value.answer)
         if destination.ready:
             await sending
-        else:  # reads nothing meanwhile: flow control slows the client down
+        else:  # the handler reads nothing meanwhile, so flow control slows the client down
             await asyncio.shield(self._keep(sending))
 
     async def settle(self, peer: str) -> None:
         """Wait until sources have accepted or refused all values received from a client.
 
-        This includes received values that were not read yet. A client that goes on sending is
-        waited for ``SETTLE_S`` at most.
+        This includes values that gRPC has received and the handler has not read yet. If the client
+        continues to send, the wait ends after ``SETTLE_S``.
         """
         if peer not in self._streams:
             return
@@ -214,10 +229,11 @@ class Publisher:
     async def write(self, request: Request, peer: str) -> tuple[EventKind, str]:
         """Write one value; return when its source has accepted it.
 
-        If the device does not take an accepted value after all, that is logged.
+        If the device later does not take an accepted value, the log says so.
 
         Returns:
-            ``(ACCEPTED, "")``, or the outcome and its reason if the source did not accept.
+            ``(ACCEPTED, "")``, or the outcome and its reason if the source did not accept the
+                value.
 
         Raises:
             PathError: There is no such topic. Nothing was sent, as with the other errors.
@@ -235,7 +251,7 @@ class Publisher:
             end = worst(ends)
             if end[0] in DONE:
                 self.published += 1
-                accepted()  # no event says so if an injection diverted all of it
+                accepted()  # there is no ACCEPTED event if an injection diverted the whole value
             elif answer.done():
                 self._refusals.add(in_words(end), request.path, peer)
             else:
@@ -251,7 +267,7 @@ class Publisher:
         return await answer
 
     async def _resolve(self, request: Request) -> _Destination:
-        """Resolve a request; raises what :meth:`write` raises."""
+        """Find the receiver of a request's value; raises what :meth:`write` raises."""
         if shadow := self._shadows.find(request.path):
             if shadow.kind is ShadowKind.ORIGINALS:
                 raise CommandError(

@@ -1,4 +1,4 @@
-"""Creates all services of the endpoint, over the same feeds."""
+"""Creates all services of the endpoint."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shmio.segment import ProcessSlot, Segment
 
 
 class Services:
-    """The services that a server offers on each of its addresses."""
+    """The services that a server offers at each of its addresses."""
 
     def __init__(
         self,
@@ -38,10 +38,11 @@ class Services:
         Args:
             segment: The instance's shared memory.
             slot: This process's entry in the process table.
-            virtual_time: That of the feeds.
-            wake_ups: Those of the feeds.
+            virtual_time: The virtual time that the feeds use.
+            wake_ups: The wake-ups that the feeds use.
             feeds: The feeds of all sources.
-            default_source: For paths without a source; None: the only source there is.
+            default_source: The source of paths that name none; None: the only source, if there is
+                just one.
 
         """
         topics = Topics(feeds, default_source)
@@ -52,7 +53,7 @@ class Services:
         self.stepper = Stepper(
             segment, slot, virtual_time, wake_ups, feeds, self._outboxes, self._publisher.settle, open_streams
         )
-        """Moves the instance's time for all services."""
+        """Controls the instance's time for all services."""
         self._shmio_v1 = ShmioV1(topics, feeds, wake_ups, segment, self.stepper, open_streams)
         self._services = (
             self._shmio_v1,
@@ -63,18 +64,21 @@ class Services:
 
     @property
     def calls(self) -> dict[str, dict[str, grpc.RpcMethodHandler[Any, Any]]]:
-        """The handlers of each service, by its full name."""
+        """The handlers of each service, by the service's full name."""
         return {service.name: service.handlers() for service in self._services}
 
     @property
     def counters(self) -> tuple[int, int, int, int]:
-        """Open streams, messages dropped on slow ones, messages published, and messages refused."""
+        """Numbers of open streams, and of messages dropped for slow clients, published and refused."""
         streams = len(self._outboxes) + self._shmio_v1.subscribe_calls.streams
         return streams, self._outboxes.dropped, self._publisher.published, self._publisher.refused
 
     @property
     def updates(self) -> int:
-        """Number of updates sent by ``shmio.v1`` since the start; feeds count theirs."""
+        """Number of updates that ``shmio.v1`` has sent since the start.
+
+        The feeds count the messages of the other services.
+        """
         return self._shmio_v1.subscribe_calls.updates
 
     @property
@@ -83,7 +87,7 @@ class Services:
         return self._outboxes.waiting_bytes
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch the streams of these sources to their present feeds, after a reload."""
+        """Switch the streams of these sources to their new feeds, after a reload."""
         self._shadows.move(sources)
         for service in self._services:
             if not isinstance(service, SimServer):

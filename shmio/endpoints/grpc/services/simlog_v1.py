@@ -1,7 +1,7 @@
-"""SimlogAPI version 1, package ``simulation.server``: the calls, and their values as ROSMessages.
+"""SimlogAPI version 1, package ``simulation.server``: the calls, and values as ROSMessages.
 
-A register is a text; a recognised structure has a message type of its own. Serialised fields
-may be concatenated, so constant fields are encoded once, and the time once per frame.
+A register is a text; a structure of a known type has its own message type. Serialised fields may be
+concatenated: constant fields are encoded once, and the time once for each frame.
 """
 
 from __future__ import annotations
@@ -41,26 +41,38 @@ _TIME_TOPIC_TYPES: Final = {TimeTopic.STEP: "int", TimeTopic.CLOCK: "time"}
 log = logging.getLogger("shmio.grpc")
 
 _Fill = Callable[[bytes, Any], None]
-"""Fills a message from an image."""
+"""Fills a message with values from an image."""
 
 _BITS: Final = {"seq": 32, "sec": 64, "nsec": 64, "msec": 64}
 
 
 def message_type(found: Shape) -> str:
-    """Return version 1's name of a type. ValueRangeError: a structure without a message type."""
+    """Return version 1's name for the type of a topic.
+
+    Raises:
+        ValueRangeError: The topic is a structure without a message type.
+
+    """
     return wire_type(found.registers[0]) if found.whole else _known(found)[0]
 
 
 def encoder(found: Shape, layout: Layout) -> Encode:
-    """Return a function that encodes an image as a ROSMessage, or as None if it holds no value.
+    """Return a function that encodes an image as a ROSMessage, or returns None for invalid bytes.
 
-    ValueRangeError as for :func:`message_type`.
+    Raises:
+        ValueRangeError: The topic is a structure without a message type.
+
     """
     return _text(found.registers[0], layout) if found.whole else _structure(found, layout)
 
 
 def read(data: wire.ROSMessage, found: Shape) -> Mapping[str, object]:
-    """Read a client's message as values by register path. ValueRangeError: it does not fit."""
+    """Convert a client's message to values by register path.
+
+    Raises:
+        ValueRangeError: The message does not fit the topic.
+
+    """
     content = data.WhichOneof("content")
     if found.whole:
         (register,) = found.registers
@@ -99,7 +111,13 @@ def _text(register: Register, layout: Layout) -> Encode:
 
 @lru_cache(maxsize=64)  # a frame or two for each feed
 def time_stamp(number: int, clock_ns: int) -> bytes:
-    """Encode the time stamp content: number of the frame or step, and time in ns."""
+    """Encode a time stamp as a field of a ROSMessage.
+
+    Args:
+        number: Number of the frame or step.
+        clock_ns: Time of the instance's clock, in ns.
+
+    """
     seconds = clock_ns // 1_000_000_000
     stamp = (b"\x08" + varint(seconds) if seconds else b"") + b"\x10" + varint(clock_ns)
     return b"\x4a" + delimited(b"\x08" + varint(number & 0xFFFFFFFF) + b"\x12" + delimited(stamp))
@@ -155,7 +173,10 @@ def _present(message: Any) -> Any:
 
 
 def _converter(name: str, register: Register) -> Callable[[Any], Any]:
-    """Return the conversion from a register's value to a field's; invalid texts become empty."""
+    """Return the function that converts a register's value to a field's value.
+
+    It converts an invalid text to an empty one.
+    """
     if wire_type(register) == "string":
         return lambda value: value or ""
     if name in _BITS:
@@ -165,7 +186,7 @@ def _converter(name: str, register: Register) -> Callable[[Any], Any]:
 
 
 def _values(message: Any, members: Found) -> Iterator[tuple[str, object]]:
-    """Yield a message's values by register path; absent inner messages give no values."""
+    """Yield the values of a message by register path; an absent inner message yields none."""
     for name, member in members.items():
         value = getattr(message, name)
         if isinstance(member, Register):
@@ -181,7 +202,7 @@ def _values(message: Any, members: Found) -> Iterator[tuple[str, object]]:
 
 
 def _filled(values: Sequence[object], register: Register) -> list[object]:
-    """Return a value for each of an array's elements; missing ones get the type's default."""
+    """Return a value for each element of an array; a missing one is the type's default."""
     if len(values) > register.count:
         raise ValueRangeError(f"{register.path}: expected at most {register.count} elements, found {len(values)}")
     default = scalar_literal(default_text(register.element), register.element)
@@ -189,7 +210,7 @@ def _filled(values: Sequence[object], register: Register) -> list[object]:
 
 
 class InjectCalls:
-    """The calls of version 1 about injections."""
+    """The calls of version 1 that concern injections."""
 
     def __init__(
         self,
@@ -197,15 +218,23 @@ class InjectCalls:
         shadows: Shadows,
         resolve: Callable[[str, Context], Awaitable[tuple[Topic, Shape]]],
     ) -> None:
-        """``resolve`` returns what a path names, or ends the call."""
+        """Create the calls.
+
+        Args:
+            outboxes: The outboxes of all streams.
+            shadows: The shadow topics of all SimlogAPI clients.
+            resolve: Returns the topic and registers of a path, or ends the call with an error.
+
+        """
         self._outboxes = outboxes
         self._shadows = shadows
         self._resolve = resolve
 
     async def find(self, path: str, context: Context) -> Injection | None:
-        """Return the injection whose shadow a path is, or None.
+        """Return the injection whose shadow topic a path names, or None.
 
-        Status INVALID_ARGUMENT: it is over a structure without a message type.
+        Statuses:
+            INVALID_ARGUMENT: The injection is over a structure without a message type.
         """
         shadow = self._shadows.find(path)
         if shadow is None:
@@ -220,15 +249,17 @@ class InjectCalls:
         """Lay or join an injection while the stream is open, and stream its originals.
 
         Over ``/in`` the originals are the writes, which no longer reach the source. Over ``/out``,
-        or without suffix, they are the source's values, the present one first. Values published to
-        the shadow replace the originals.
+        or without suffix, they are the source's values, beginning with the present one. Values
+        published to the shadow topic replace the originals.
 
         Statuses:
-            NOT_FOUND: No such target.
-            INVALID_ARGUMENT: A structure without a message type, or an unusable shadow path.
+            NOT_FOUND: There is no such target.
+            INVALID_ARGUMENT: The target is a structure without a message type, or the path of the
+                shadow topic is not usable.
             ALREADY_EXISTS: The path is in use for another target.
             FAILED_PRECONDITION: The source refuses the injection; the message says why.
-            RESOURCE_EXHAUSTED: Too many injections, or the client does not read the writes.
+            RESOURCE_EXHAUSTED: There are too many injections, or the client does not read the
+                writes.
             ABORTED: The injection was lifted.
         """
         topic, found = await self._resolve(request.target.path, context)
@@ -239,7 +270,7 @@ class InjectCalls:
             except ShmioError as error:
                 await refuse(context, error)
             release = partial(self._shadows.release, injection, outbox)
-            outbox.on_failure = release  # at once: a client that reads nothing delays the stream's end
+            outbox.on_failure = release  # at once, because a client that does not read delays the stream's end
             try:
                 encode = encoder(injection.shape, injection.feed.block.layout)
                 leave = injection.originals("v1", encode, outbox, shorten(request.target.path))
@@ -250,7 +281,7 @@ class InjectCalls:
             await context.abort(grpc.StatusCode.ABORTED, f"{shorten(request.target.path)}: {injection.over}")
 
     async def given_values(self, injection: Injection, path: str, context: Context) -> AsyncIterator[bytes]:
-        """Stream the values published to a shadow until its injection is over."""
+        """Stream the values published to a shadow topic until its injection ends."""
         with self._outboxes.opened() as outbox:
             encode = encoder(injection.shape, injection.feed.block.layout)
             leave = injection.given_values("v1", encode, EventLane(outbox, shorten(path)))
@@ -261,15 +292,16 @@ class InjectCalls:
     async def _messages(
         self, injection: Injection, outbox: Outbox, leave: Callable[[], None], context: Context
     ) -> AsyncIterator[bytes]:
-        """Stream an outbox until the injection is over.
+        """Stream an outbox until the injection ends.
 
-        Status RESOURCE_EXHAUSTED: the client does not read.
+        Statuses:
+            RESOURCE_EXHAUSTED: The client does not read the messages.
         """
         injection.ends[outbox] = outbox.end
         if injection.over:
             outbox.end()
         try:
-            await context.send_initial_metadata(())  # shows the client that the shadow stands
+            await context.send_initial_metadata(())  # tells the client that the shadow topic exists
             while (message := await outbox.pop()) is not None:
                 yield message
         finally:
@@ -280,7 +312,7 @@ class InjectCalls:
 
 
 class SimlogV1:
-    """Serves the registers of all sources as texts, and structures as their own messages."""
+    """Serves the registers of all sources as texts, and structures of known types as messages."""
 
     name = SERVICE
 
@@ -311,7 +343,7 @@ class SimlogV1:
         return calls
 
     async def set_step_size(self, request: wire.StepSizeRequest, context: Context) -> Empty:
-        """Set the step size, in ms, which makes time virtual.
+        """Set the step size, in ms; time becomes virtual.
 
         Statuses:
             INVALID_ARGUMENT: The step size is out of range.
@@ -324,9 +356,10 @@ class SimlogV1:
         return Empty()
 
     async def step(self, _: wire.StepRequest, context: Context) -> wire.StepResponse:
-        """Make a step after the values received from this client; answer when all streams have it.
+        """Make a step; answer when all streams have it.
 
-        The code is 0, or -1 if the step failed; the log says why.
+        Values received from this client before are written first. The code of the answer is 0, or
+        -1 if the step failed; then the log says why.
         """
         try:
             await self._stepper.step(peer=context.peer())
@@ -336,11 +369,11 @@ class SimlogV1:
         return wire.StepResponse(code=0)
 
     async def get_topic(self, request: wire.TopicDescriptor, context: Context) -> wire.TopicDescriptor:
-        """Return a topic's type.
+        """Return the type of a topic.
 
         Statuses:
-            NOT_FOUND: No such topic.
-            INVALID_ARGUMENT: A structure without a message type.
+            NOT_FOUND: There is no such topic.
+            INVALID_ARGUMENT: The topic is a structure without a message type.
         """
         if injection := await self._injecting.find(request.path, context):
             return wire.TopicDescriptor(path=request.path, msgType=message_type(injection.shape))
@@ -350,16 +383,17 @@ class SimlogV1:
         return wire.TopicDescriptor(path=request.path, msgType=message_type(found))
 
     async def subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:
-        """Stream a topic's current value, if it is good, and its changes; of ``/in``, the writes.
+        """Stream a topic's current value, if it is good, and its changes; for ``/in``, the writes.
 
-        Nothing is sent while quality is bad; on recovery the value is sent again. For a slow client
-        the newest value replaces those that wait. Its stream of ``/in`` ends instead, because no
-        write replaces another. After a reload the stream goes on if the register still exists.
+        Nothing is sent while the quality is bad. When the quality recovers, the value is sent
+        again. For a slow client the newest value replaces those that wait. A slow client's stream
+        of ``/in`` ends, because no write replaces another. After a reload the stream continues if
+        the register still exists.
 
         Statuses:
-            NOT_FOUND: No such topic, or a reload has removed it.
-            INVALID_ARGUMENT: A structure without a message type.
-            RESOURCE_EXHAUSTED: The client is too slow for writes or steps.
+            NOT_FOUND: There is no such topic, or a reload has removed it.
+            INVALID_ARGUMENT: The topic is a structure without a message type.
+            RESOURCE_EXHAUSTED: The client is too slow for the writes or the steps.
         """
         if injection := await self._injecting.find(request.path, context):
             async for gift in self._injecting.given_values(injection, request.path, context):
@@ -382,7 +416,7 @@ class SimlogV1:
                     encode = encoder(found, feed.block.layout)
                     joined = ExitStack()
                     joined.callback(lane.join(feed, Subject("v1", found.path, found.registers, encode)))
-                    outbox.on_failure = joined.close  # at once: a client that reads nothing delays the end
+                    outbox.on_failure = joined.close  # at once, because a client that does not read delays the end
                     try:
                         if not told:
                             await context.send_initial_metadata(())  # the client misses nothing from then on
@@ -398,7 +432,7 @@ class SimlogV1:
                 del self._streams[outbox]
 
     async def _stream_time_topic(self, time_topic: TimeTopic, context: Context) -> AsyncIterator[bytes]:
-        """Stream the values of a topic of time."""
+        """Stream the values of a time topic."""
         with self._outboxes.opened() as outbox, ExitStack() as listening:
             listening.callback(self._stepper.timeline.time_topics.listen(time_topic, _time_message, StateLane(outbox)))
             outbox.on_failure = listening.close
@@ -408,13 +442,17 @@ class SimlogV1:
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch the streams of these sources to their present feeds, after a reload."""
+        """Switch the streams of these sources to their new feeds, after a reload."""
         for outbox, source in self._streams.items():
             if source in sources:
                 outbox.end()
 
     async def _find_again(self, topic: Topic, context: Context) -> Shape:
-        """Return what a stream's topic names after a reload. Status NOT_FOUND: nothing."""
+        """Return the registers of a stream's topic after a reload.
+
+        Statuses:
+            NOT_FOUND: The topic no longer exists.
+        """
         try:
             return self._find(topic)
         except (PathError, ValueRangeError) as error:
@@ -422,11 +460,11 @@ class SimlogV1:
             raise  # abort never returns
 
     def _find(self, topic: Topic) -> Shape:
-        """Return what a topic names.
+        """Return the registers that a topic names.
 
         Raises:
-            PathError: Nothing.
-            ValueRangeError: A structure without a message type, or a whole source.
+            PathError: There is no such register.
+            ValueRangeError: The topic is a whole source, or a structure without a message type.
 
         """
         if not topic.path:
@@ -436,11 +474,15 @@ class SimlogV1:
         return found
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
-        """Write a stream's values in order; answer when it and all its values have ended."""
+        """Write the values of a stream in order; answer when all of them have ended."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
     async def _time_topic(self, path: str, context: Context) -> TimeTopic | None:
-        """Return the topic of time that a path names, or None. Status NOT_FOUND: no such source."""
+        """Return the time topic that a path names, or None.
+
+        Statuses:
+            NOT_FOUND: There is no such source.
+        """
         try:
             return self._topics.time_topic(path)
         except PathError as error:
@@ -460,6 +502,9 @@ def _parse(message: bytes) -> Request:
 
 
 def _time_message(time_topic: TimeTopic, moment: Moment) -> bytes:
-    """Encode a topic of time; the simulation time is in the time stamp, with an empty value."""
+    """Encode a value of a time topic.
+
+    The simulation time is in the time stamp; its value is empty.
+    """
     value = str(moment.number) if time_topic is TimeTopic.STEP else ""
     return wire.ROSMessage(type=_TIME_TOPIC_TYPES[time_topic], value=value).SerializeToString() + time_stamp(*moment)

@@ -1,6 +1,6 @@
-"""SimlogAPI version 2, package ``simlog.server``: the calls, and their values as ``google.protobuf.Value``.
+"""SimlogAPI version 2, package ``simlog.server``: calls, and values as ``google.protobuf.Value``.
 
-Serialised fields may be concatenated, so what all listeners share is encoded once.
+Serialised fields may be concatenated, so the fields that all listeners share are encoded once.
 """
 
 from __future__ import annotations
@@ -42,19 +42,22 @@ from shmio.wire import simlog_v2_pb2 as wire
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
 MAX_SUBSCRIBERS: Final = 256
 MAX_TOPICS: Final = 10_000
-"""Bound of one subscriber's topics."""
+"""Maximum number of topics of one subscriber."""
 MAX_ALL_TOPICS: Final = 100_000
-"""Bound of all subscribers' topics."""
+"""Maximum number of topics of all subscribers together."""
 MAX_NAME: Final = 256
-"""Longest name and uuid of a subscriber, in characters."""
+"""Maximum length of a subscriber's name and uuid, in characters."""
 PATIENCE_S: Final = 1.0
-"""How long Subscribe waits for its subscriber: the two calls may arrive in any order."""
+"""How long Subscribe waits for its subscriber, because the two calls may arrive in any order."""
 MAX_ELEMENTS: Final = 1 << 16
-"""Most numbers, bits or texts in one value."""
+"""Maximum number of numbers, bits and texts in one value."""
 MAX_MEMBERS: Final = 4096
-"""Most registers in one structure."""
+"""Maximum number of registers in one structure."""
 MAX_LEVELS: Final = 24
-"""Deepest nesting of structures: messages nest three times as deep, and readers stop at 100."""
+"""Maximum nesting of structures.
+
+Messages nest three times as deep, and protobuf's readers stop at 100 levels.
+"""
 
 _DOUBLE: Final = struct.Struct("<Bd")
 _TYPES: Final = {"bool": wire.BOOL, "double": wire.NUMBER, "int": wire.NUMBER, "string": wire.STRING}
@@ -63,7 +66,7 @@ log = logging.getLogger("shmio.grpc")
 
 
 class EncodedMessage:
-    """A SimlogMessage without its path: the header's time stamp, and the later fields."""
+    """A SimlogMessage without its path: the header's time stamp, and the fields after the header."""
 
     __slots__ = ("_last", "rest", "stamp")
 
@@ -76,7 +79,7 @@ class EncodedMessage:
         return len(self.stamp) + len(self.rest)
 
     def under(self, path: bytes) -> bytes:
-        """Return the message with a path, which is encoded by :func:`path_field`."""
+        """Return the message with a path; :func:`path_field` encodes the path."""
         last, whole = self._last
         if last != path:  # most listeners use the same path
             header = self.stamp + path
@@ -94,14 +97,21 @@ def value_type(found: Shape) -> wire.ValueType:
 
 
 def subject(found: Shape, layout: Layout) -> Subject:
-    """Return the subject to listen to. ValueRangeError as for :func:`encoder`."""
+    """Return the subject of a topic, for a feed.
+
+    Raises:
+        ValueRangeError: The topic is too large or nested too deeply for a message.
+
+    """
     return Subject("v2", found.path, found.registers, encoder(found, layout))
 
 
 def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessage | None]:
-    """Return a function that encodes an image as a message, or as None if it holds no value.
+    """Return a function that encodes an image as a message, or returns None for invalid bytes.
 
-    ValueRangeError: the topic is too large or nested too deeply for a message.
+    Raises:
+        ValueRangeError: The topic is too large or nested too deeply for a message.
+
     """
     members, elements = len(found.registers), found.elements
     if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
@@ -120,25 +130,25 @@ def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessa
 
 
 def path_field(path: str) -> bytes:
-    """Encode a header's path."""
+    """Encode the path of a header."""
     return b"\x12" + delimited(path.encode())
 
 
 @lru_cache(maxsize=64)  # a frame or two for each feed
 def time_stamp(clock_ns: int) -> bytes:
-    """Encode a header's time, from ns of the instance's clock."""
+    """Encode the time of a header, given in ns of the instance's clock."""
     seconds, nanos = divmod(clock_ns, 1_000_000_000)
     whole = b"\x08" + varint(seconds) if seconds else b""
     return b"\x0a" + delimited(whole + b"\x10" + varint(nanos) if nanos else whole)
 
 
 def nothing(stamp: bytes) -> EncodedMessage:
-    """Return the message of a missing value."""
+    """Return the message for a missing value."""
     return EncodedMessage(stamp, wire.SimlogMessage(type=wire.NULL, value=to_wire(None)).SerializeToString())
 
 
 def time_message(topic: TimeTopic, moment: Moment) -> EncodedMessage:
-    """Return the message of a topic of time: a step's number, or the time in s."""
+    """Return the message of a time topic: a step's number, or the time in s."""
     value = moment.number if topic is TimeTopic.STEP else moment.clock_ns / 1e9
     message = wire.SimlogMessage(type=wire.NUMBER, value=to_wire(value))
     return EncodedMessage(time_stamp(moment.clock_ns), message.SerializeToString())
@@ -150,17 +160,21 @@ def repeated(messages: Iterable[bytes]) -> bytes:
 
 
 def to_wire(value: Value) -> WireValue:
-    """Convert a decoded value: numbers become doubles, a missing value null."""
+    """Convert a decoded value: numbers become doubles, a missing value becomes null."""
     found = WireValue()
     _put(value, found)
     return found
 
 
 def from_wire(value: WireValue, found: Shape) -> dict[str, object]:
-    """Read a client's value as values by register path; a structure may lack members.
+    """Convert a client's value to values by register path; a structure may lack members.
 
-    A text for a register that is not a text is read as in version 1, so that 64-bit numbers keep
-    all their digits. ValueRangeError: the value does not fit.
+    For a register that is not a text, a text is parsed as in version 1. So a 64-bit number keeps
+    all its digits.
+
+    Raises:
+        ValueRangeError: The value does not fit the topic.
+
     """
     if found.whole:
         (register,) = found.registers
@@ -174,7 +188,7 @@ def from_wire(value: WireValue, found: Shape) -> dict[str, object]:
 
 
 def _read_members(value: WireValue, path: str, by_path: Mapping[str, Register], values: dict[str, object]) -> None:
-    """Collect a structure's values, no deeper than the registers' paths."""
+    """Collect the values of a structure, no deeper than the registers' paths."""
     if value.WhichOneof("kind") != "struct_value":
         raise ValueRangeError(f"{path}: expected a structure")
     for name, member in value.struct_value.fields.items():
@@ -205,7 +219,7 @@ def _plain(value: WireValue, name: str) -> object:
 
 
 def _whole(register: Register, layout: Layout) -> Callable[[bytes], bytes | None]:
-    """Return a function that encodes a register as a Value, or as None if it holds no value."""
+    """Return a function that encodes a register as a Value, or returns None for invalid bytes."""
     element, order = register.element, layout.byte_order
     code = "" if element.base == "BOOL" else scalar_codec(element, order).plain
     if code and len(register.dims) == 1:
@@ -222,7 +236,10 @@ def _whole(register: Register, layout: Layout) -> Callable[[bytes], bytes | None
 
 
 def _numbers(register: Register, kind: np.dtype[Any]) -> Callable[[bytes], bytes]:
-    """Return such a function for an array of numbers; a hundred times as fast as one by one."""
+    """Return a function that encodes an array of numbers as a Value.
+
+    It is a hundred times as fast as encoding each number by itself.
+    """
     one = ListValue(values=[WireValue(number_value=0)]).SerializeToString()  # ends in its double
     size = register.count * len(one)
     head = b"\x32" + varint(size)
@@ -238,7 +255,12 @@ def _numbers(register: Register, kind: np.dtype[Any]) -> Callable[[bytes], bytes
 
 
 def _structure(found: Shape, layout: Layout) -> Callable[[bytes], bytes]:
-    """Return such a function for a structure. ValueRangeError: it is nested too deeply."""
+    """Return a function that encodes a structure as a Value.
+
+    Raises:
+        ValueRangeError: The structure is nested too deeply.
+
+    """
     start = len(found.path) + 1
     fill = _members([(register.path[start:].split("/"), register) for register in found.registers], layout, MAX_LEVELS)
 
@@ -253,7 +275,14 @@ def _structure(found: Shape, layout: Layout) -> Callable[[bytes], bytes]:
 def _members(
     parts: list[tuple[list[str], Register]], layout: Layout, levels: int
 ) -> Callable[[bytes, WireValue], None]:
-    """Return a function that fills in a structure; ``parts``: each register's remaining names."""
+    """Return a function that fills in a structure.
+
+    Args:
+        parts: Each register, with the names of its path below this structure.
+        layout: The layout of the block.
+        levels: How many levels of structures are still allowed.
+
+    """
     if not levels:
         raise ValueRangeError(f"{shorten(parts[0][1].path)}: more than {MAX_LEVELS} nested structures")
     groups: dict[str, list[tuple[list[str], Register]]] = {}
@@ -294,7 +323,11 @@ def _put(item: Value, value: WireValue) -> None:
 
 @dataclass(slots=True)
 class _Subscription:
-    """A subscribed topic. ``topic``: None for a shadow. ``leave``: None while it does not exist."""
+    """A subscribed topic.
+
+    ``topic`` is None for a shadow topic. ``leave`` ends the subscription; it is None while the
+    topic does not exist.
+    """
 
     topic: Topic | TimeTopic | None
     lane: Lane | None
@@ -307,12 +340,22 @@ class Subscriber:
     def __init__(
         self, topics: Topics, shadows: Shadows, time_topics: TimeTopics, name: str, outbox: Outbox, holder: object
     ) -> None:
-        """``holder`` is the client that owns the subscriber."""
+        """Create a subscriber without topics.
+
+        Args:
+            topics: Resolves paths.
+            shadows: The shadow topics of all SimlogAPI clients.
+            time_topics: The time topics.
+            name: Name that the client has chosen, for the log.
+            outbox: The outbox of the call's stream.
+            holder: The client that owns the subscriber.
+
+        """
         self.name = name
         self.outbox = outbox
         self.holder = holder
         self.replaced = False
-        """Whether a new call with the same uuid has replaced this one."""
+        """True if a new call with the same uuid has replaced this one."""
         self._topics = topics
         self._shadows = shadows
         self._time_topics = time_topics
@@ -322,11 +365,11 @@ class Subscriber:
         return len(self._subscriptions)
 
     def add(self, path: str) -> None:
-        """Subscribe to a topic, unless it is subscribed already.
+        """Subscribe to a topic, unless that is done already.
 
         Raises:
-            PathError: No such topic.
-            ValueRangeError: Too large for a message.
+            PathError: There is no such topic.
+            ValueRangeError: The topic is too large for a message.
 
         """
         if path in self._subscriptions:
@@ -344,7 +387,10 @@ class Subscriber:
         self._subscriptions[path] = subscription
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch to the sources' present feeds; topics that are gone wait until they are back."""
+        """Switch to the new feeds of these sources.
+
+        A topic that no longer exists waits until it exists again.
+        """
         for path, subscription in self._subscriptions.items():
             if isinstance(subscription.topic, Topic) and subscription.topic.source in sources:
                 self._leave(subscription)
@@ -354,13 +400,13 @@ class Subscriber:
                     log.info("a subscribed topic is gone: %s", error, extra=fields(topic=shorten(path)))
 
     def close(self) -> None:
-        """Leave all topics."""
+        """Unsubscribe from all topics."""
         subscriptions, self._subscriptions = self._subscriptions, {}
         for subscription in subscriptions.values():
             self._leave(subscription)
 
     def _join_shadow(self, path: str, shadow: Shadow, finish: Finish) -> Callable[[], None]:
-        """Listen to a shadow topic; return the function that leaves.
+        """Listen to a shadow topic; return the function that ends this.
 
         A listener to originals holds the injection.
         """
@@ -414,10 +460,11 @@ class Subscribers:
     def enter(self, uuid: str, name: str, outbox: Outbox, holder: object) -> Subscriber:
         """Add a subscriber whose stream opens.
 
-        The same holder's stream with this uuid ends: a broken connection may have left it.
+        If the same holder has a stream with this uuid, that one ends: a broken connection may have
+        left it.
 
         Raises:
-            ValueRangeError: There is no uuid, or it is too long.
+            ValueRangeError: The uuid is missing or too long.
             ConflictError: Another holder has the uuid.
             EndpointError: There are too many subscribers.
 
@@ -450,10 +497,10 @@ class Subscribers:
             del self._open[uuid]
 
     async def subscribe(self, uuid: str, path: str, holder: object) -> None:
-        """Add a topic to a subscriber's stream, waiting ``PATIENCE_S`` for it to open.
+        """Add a topic to a subscriber's stream; wait up to ``PATIENCE_S`` for the stream to open.
 
         Raises:
-            PathError: No such topic, or the holder has no such subscriber.
+            PathError: There is no such topic, or the holder has no such subscriber.
             ValueRangeError: The topic is too large for a message.
             EndpointError: There are too many subscriptions.
 
@@ -475,7 +522,7 @@ class Subscribers:
         subscriber.add(path)
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch all subscribers to the sources' present feeds."""
+        """Switch all subscribers to the new feeds of these sources."""
         for subscriber in self._open.values():
             subscriber.move(sources)
 
@@ -495,7 +542,10 @@ class SimlogV2:
         self._subscribers = Subscribers(topics, shadows, time_topics)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Return the handlers of the service's calls. Values are serialised where they are made."""
+        """Return the handlers of the service's calls.
+
+        Streams and Read serialise their messages themselves.
+        """
         unary = grpc.unary_unary_rpc_method_handler
         empty = Empty.SerializeToString
         write = unary(self.write, wire.PubRequest.FromString, empty)
@@ -516,7 +566,10 @@ class SimlogV2:
         return calls
 
     async def get_topic_info(self, request: wire.TopicInfoRequest, _: Context) -> wire.TopicInfo:
-        """Describe a topic; for one that does not exist, only ``exists`` is set, to false."""
+        """Describe a topic.
+
+        For a topic that does not exist, the answer has only the path, and ``exists`` is False.
+        """
         if shadow := self._shadows.find(request.path):
             kind = value_type(shadow.injection.shape)
             direction = wire.OUT if shadow.kind is ShadowKind.ORIGINALS else wire.IN
@@ -534,15 +587,16 @@ class SimlogV2:
         """Stream the values of all topics that are subscribed for this uuid, in frame order.
 
         Statuses:
-            INVALID_ARGUMENT: No uuid, or it is too long.
-            ALREADY_EXISTS: The uuid is another client's.
-            RESOURCE_EXHAUSTED: Too many subscribers, or this one is too slow for writes or steps.
+            INVALID_ARGUMENT: The uuid is missing or too long.
+            ALREADY_EXISTS: The uuid belongs to another client.
+            RESOURCE_EXHAUSTED: There are too many subscribers, or this one is too slow for the
+                writes or the steps.
             ABORTED: CreateSubscriber was called again with this uuid.
         """
         with self._outboxes.opened() as outbox:
             try:
                 subscriber = self._subscribers.enter(request.uuid, request.name, outbox, _holder(context))
-                outbox.on_failure = subscriber.close  # releases what it holds at once
+                outbox.on_failure = subscriber.close  # releases its injections at once
             except ShmioError as error:
                 await refuse(context, error)
             try:
@@ -558,12 +612,13 @@ class SimlogV2:
     async def subscribe(self, request: wire.SubscriptionRequest, context: Context) -> Empty:
         """Add a topic to a subscriber's stream: its current value, if it is good, and its changes.
 
-        For ``/in`` the stream has the writes, for ``SIMLOG://step`` each step after its values.
+        For ``/in`` the stream has the writes. For ``SIMLOG://step`` it has the number of each step,
+        after the values of that step.
 
         Statuses:
-            NOT_FOUND: No such topic or subscriber.
+            NOT_FOUND: There is no such topic or subscriber.
             INVALID_ARGUMENT: The structure is too large for a message.
-            RESOURCE_EXHAUSTED: Too many subscriptions.
+            RESOURCE_EXHAUSTED: There are too many subscriptions.
         """
         try:
             await self._subscribers.subscribe(request.subscriberUUID, request.path, _holder(context))
@@ -574,14 +629,14 @@ class SimlogV2:
     async def inject(self, request: wire.InjectRequest, context: Context) -> wire.InjectResponse:
         """Lay an injection over a topic; return the paths for its values and for its originals.
 
-        The injection stands while a subscriber has ``shadowPathOut``; before the first one, while
-        this call's connection stands.
+        The injection lasts while a subscriber has ``shadowPathOut``. Before the first subscriber,
+        it lasts while this call's connection does.
 
         Statuses:
-            NOT_FOUND: No such topic.
-            INVALID_ARGUMENT: The structure is too large for a message, or the prefix is unusable.
+            NOT_FOUND: There is no such topic.
+            INVALID_ARGUMENT: The structure is too large for a message, or the prefix is not usable.
             FAILED_PRECONDITION: The source refuses the injection; the message says why.
-            RESOURCE_EXHAUSTED: Too many injections.
+            RESOURCE_EXHAUSTED: There are too many injections.
         """
         try:
             topic, found = self._find(request.targetPath)
@@ -594,14 +649,14 @@ class SimlogV2:
         return wire.InjectResponse(shadowPathIn=path_in, shadowPathOut=path_out)
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
-        """Write a stream's values in order; answer when it and all its values have ended."""
+        """Write the values of a stream in order; answer when all of them have ended."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
     async def write(self, request: wire.PubRequest, context: Context) -> Empty:
         """Write one value; answer when its source has accepted it.
 
         Statuses:
-            NOT_FOUND: No such topic.
+            NOT_FOUND: There is no such topic.
             INVALID_ARGUMENT: The value does not fit the topic's type.
             FAILED_PRECONDITION: The topic is not writable, or the source does not take the value.
             DEADLINE_EXCEEDED: The source did not answer; the value may have been written.
@@ -617,13 +672,13 @@ class SimlogV2:
         return Empty()
 
     async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
-        """Return the values of topics, in order; those of one source are from one frame.
+        """Return the values of topics, in order; those of one source come from one frame.
 
         A value is NULL while its quality is bad.
 
         Statuses:
-            NOT_FOUND: No such topic.
-            INVALID_ARGUMENT: Too much for a message.
+            NOT_FOUND: There is no such topic.
+            INVALID_ARGUMENT: The values are too large for one message.
         """
         try:
             return repeated(await self._read(request.path))
@@ -631,11 +686,16 @@ class SimlogV2:
             await refuse(context, error)
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch the subscriptions of these sources to their present feeds, after a reload."""
+        """Switch the subscriptions of these sources to their new feeds, after a reload."""
         self._subscribers.move(sources)
 
     def _find(self, path: str) -> tuple[Topic, Shape]:
-        """Return what a path names. PathError: nothing."""
+        """Return the topic and the registers that a path names.
+
+        Raises:
+            PathError: There is no such topic.
+
+        """
         topic = self._topics.topic(path)
         return topic, shape(self._topics.layout(topic), topic)
 
@@ -646,7 +706,13 @@ class SimlogV2:
         return wire.INOUT if await commands.writable(found.registers) else wire.OUT
 
     async def _read(self, paths: Iterable[str]) -> list[bytes]:
-        """Return serialised messages, made in time slices; raises PathError and ValueRangeError."""
+        """Return serialised messages, which are made in time slices.
+
+        Raises:
+            PathError: There is no such topic.
+            ValueRangeError: The values are too large for one message.
+
+        """
         wanted: list[tuple[str, str | Shadow, Shape]] = []
         members = elements = 0
         async for path in time_sliced(paths):
@@ -684,7 +750,7 @@ def _holder(context: Context) -> object:
 
 
 def _shadow_message(path: str, shadow: Shadow) -> bytes:
-    """Return the message of a shadow topic: the present original of ``/out``, else NULL."""
+    """Return the message of a shadow topic: the present original of ``/out``, otherwise NULL."""
     injection = shadow.injection
     shown = injection.present() if shadow.kind is ShadowKind.ORIGINALS else None
     message = None if shown is None else encoder(injection.shape, injection.feed.block.layout)(shown)

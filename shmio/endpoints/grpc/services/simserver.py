@@ -1,4 +1,4 @@
-"""SimServerAPI, package ``com.ttsnetwork.simulator3``: stepping, playing, the state of time."""
+"""SimServerAPI, package ``com.ttsnetwork.simulator3``: stepping, playing, and the state of time."""
 
 from __future__ import annotations
 
@@ -59,11 +59,16 @@ class SimServer:
         return _wire(self._stepper.timeline.status._replace(clock_ns=step.time_ns, dt_ns=step.dt_ns))
 
     async def start(self, request: wire.StartRequest, context: Context) -> wire.SimStatus:
-        """Play in real time from now on; statuses as for :meth:`step`."""
+        """Play from now on, in real time.
+
+        Statuses:
+            INVALID_ARGUMENT: The step is out of range.
+            FAILED_PRECONDITION: Another program controls time.
+        """
         return await self._answer(self._stepper.play(_ns(request.deltaTime)), context)
 
     async def stop(self, _: Empty, context: Context) -> wire.SimStatus:
-        """Stop playing, and report time as not alive until the next step."""
+        """Stop playing. Until the next step, the state of time is not alive."""
         return await self._answer(self._stepper.pause(end=True), context)
 
     async def pause(self, _: Empty, context: Context) -> wire.SimStatus:
@@ -73,7 +78,8 @@ class SimServer:
     async def subscribe(self, _: Empty, context: Context) -> AsyncIterator[bytes]:
         """Stream the state of time: a message for each step and each change.
 
-        Status RESOURCE_EXHAUSTED: the client is too slow for the steps.
+        Statuses:
+            RESOURCE_EXHAUSTED: The client is too slow for the steps.
         """
         with self._outboxes.opened() as outbox:
             lane = StateLane(outbox)

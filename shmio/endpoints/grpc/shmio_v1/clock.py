@@ -19,7 +19,7 @@ from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_ANSWERS: Final = 1024
-"""When this many answers wait for the client, the next step waits too."""
+"""Maximum number of answers that wait for the client; beyond that, the next step waits too."""
 
 STEPS: Final = wire.StepsResponse.DESCRIPTOR.fields_by_name["steps"].number
 
@@ -28,18 +28,26 @@ class StepsCall:
     """A Steps call: makes steps and collects their answers."""
 
     def __init__(self, stepper: Stepper, peer: str) -> None:
-        """``peer``: the client, as gRPC names it."""
+        """Prepare the call; :meth:`messages` makes the steps.
+
+        Args:
+            stepper: Makes the steps.
+            peer: The client, as gRPC names it.
+
+        """
         self._stepper = stepper
         self._peer = peer
         self._answers: list[bytes] = []
-        self._wake = asyncio.Event()  # there is an answer, or there will be none
+        self._wake = asyncio.Event()  # set when there is an answer, or when there will be no more
         self._room = asyncio.Event()
 
     async def messages(self, requests: AsyncIterator[wire.StepsRequest]) -> AsyncIterator[bytes]:
-        """Yield serialised StepsResponses; steps made while one is sent share the next.
+        """Yield serialised StepsResponses.
+
+        The steps that are made while one response is sent share the next.
 
         Raises:
-            TimeError: A step failed. It is raised after the answers to the earlier steps.
+            TimeError: A step failed. The answers to the earlier steps come first.
             ValueRangeError: A step is out of range.
 
         """
@@ -71,7 +79,7 @@ class StepsCall:
 
 
 MAX_WATCHERS = 256
-"""WatchClock calls that may be open at once."""
+"""Maximum number of open WatchClock calls."""
 
 
 class TimeCalls:
@@ -112,7 +120,12 @@ class TimeCalls:
         return found
 
     async def steps(self, requests: AsyncIterator[wire.StepsRequest], context: Context) -> AsyncIterator[bytes]:
-        """Make steps until one fails; statuses as for :meth:`step`."""
+        """Make steps until one fails.
+
+        Statuses:
+            INVALID_ARGUMENT: A step is out of range.
+            FAILED_PRECONDITION: A step failed, or another program controls time.
+        """
         try:
             async for message in StepsCall(self._stepper, context.peer()).messages(requests):
                 yield message
@@ -120,31 +133,49 @@ class TimeCalls:
             await refuse(context, error)
 
     async def set_step_size(self, request: wire.SetStepSizeRequest, context: Context) -> wire.Clock:
-        """Set the size of steps that have none of their own; statuses as for :meth:`step`."""
+        """Set the size of steps whose request names none.
+
+        Statuses:
+            INVALID_ARGUMENT: The step size is out of range.
+            FAILED_PRECONDITION: Another program controls time.
+        """
         return await self._do(self._stepper.set_step_size(request.dt_ns), context)
 
     async def play(self, request: wire.PlayRequest, context: Context) -> wire.Clock:
-        """Play from now on; statuses as for :meth:`step`."""
+        """Play from now on, at a multiple of real time.
+
+        Statuses:
+            INVALID_ARGUMENT: The rate or the step is out of range.
+            FAILED_PRECONDITION: Another program controls time.
+        """
         rate = request.rate or 1.0
         if not 1e-3 <= rate <= 1e3 or math.isnan(rate):
             await refuse(context, ValueRangeError(f"rate: {rate} is not from 0.001 to 1000"))
         return await self._do(self._stepper.play(request.dt_ns or None, rate), context)
 
     async def pause(self, _: wire.PauseRequest, context: Context) -> wire.Clock:
-        """Stop playing. Status FAILED_PRECONDITION: another program controls time."""
+        """Stop playing.
+
+        Statuses:
+            FAILED_PRECONDITION: Another program controls time.
+        """
         return await self._do(self._stepper.pause(), context)
 
     async def release(self, _: wire.ReleaseRequest, context: Context) -> wire.Clock:
         """Return to real time.
 
-        Status FAILED_PRECONDITION: another program controls time, or the instance has no real time.
+        Statuses:
+            FAILED_PRECONDITION: Another program controls time, or the instance has no real time.
         """
         return await self._do(self._stepper.release(), context)
 
     async def watch(self, _: wire.WatchClockRequest, context: Context) -> AsyncIterator[wire.Clock]:
-        """Stream the state of time: now, and after each step or change; conflated for slow clients.
+        """Stream the state of time: now, and after each step or change.
 
-        Status RESOURCE_EXHAUSTED: too many streams.
+        A slow client gets only the newest state.
+
+        Statuses:
+            RESOURCE_EXHAUSTED: There are too many WatchClock calls.
         """
         if len(self._watchers) >= MAX_WATCHERS:
             await refuse(context, EndpointError(f"{MAX_WATCHERS} calls of WatchClock are open, the maximum"))

@@ -1,4 +1,4 @@
-"""The call Declare: injections that their sources run, and the record of their events."""
+"""The call Declare: injections that their sources run, and a record of their events."""
 
 from __future__ import annotations
 
@@ -27,9 +27,12 @@ from shmio.segment import Block, Event, EventKind
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_MATCHES: Final = 10_000_000
-"""Bound of one call's comparisons of targets with registers; they take some seconds."""
+"""Maximum number of times that one call may compare a target with a register.
+
+So many comparisons take a few seconds.
+"""
 SEED_BITS: Final = 53
-"""Bits of a random seed; few enough for any JSON reader."""
+"""Number of bits of a random seed; few enough for any JSON reader."""
 
 _DECLARED, _HAPPENINGS = (
     wire.DeclareResponse.DESCRIPTOR.fields_by_name[name].number for name in ("declared", "happenings")
@@ -46,11 +49,19 @@ class DeclareCall:
     """A Declare call with its injections."""
 
     def __init__(self, feeds: Mapping[str, Feed], request: wire.DeclareRequest, turn: asyncio.Lock) -> None:
-        """Check the declarations. ``turn``: a lock, so that calls are checked one after another.
+        """Check the declarations.
 
-        ConfigError, ValueRangeError: a declaration is not valid.
+        Args:
+            feeds: The feeds of all sources, by name.
+            request: The request of the call.
+            turn: Lock that lets only one call at a time check its declarations.
+
+        Raises:
+            ConfigError: A declaration is not valid.
+            ValueRangeError: There are no declarations or too many, or a value in one is not valid.
+
         """
-        if len(request.declarations) > MAX_DECLARATIONS:  # first: reading them blocks the event loop
+        if len(request.declarations) > MAX_DECLARATIONS:  # checked first, as parsing blocks the event loop
             raise ValueRangeError(
                 f"{len(request.declarations)} injections are declared, at most {MAX_DECLARATIONS} are allowed"
             )
@@ -71,7 +82,7 @@ class DeclareCall:
         self._abandoned = False
         self._lifting: asyncio.Task[None] | None = None
         self.over = ""
-        """Why the call has to end before its injections; empty: it does not."""
+        """Why the call has to end before its injections; empty: it does not have to."""
 
     async def open(self) -> bytes:
         """Lay all injections or none; return the first message.
@@ -112,11 +123,14 @@ class DeclareCall:
         return field(_DECLARED, declared.SerializeToString()) + self._waiting.all()
 
     def abandon(self) -> None:
-        """Stop laying injections, because the client is gone; lift them unless all are laid."""
+        """Stop laying injections, because the client is gone.
+
+        Unless all are laid, those that are laid will be lifted.
+        """
         self._abandoned = True
 
     async def close(self) -> None:
-        """Lift the injections, unless they are to be kept; retry until the sources have done so."""
+        """Lift the injections, except those to keep; retry until the sources have done so."""
         if self._lifting is not None:
             await self._lifting
         elif not self._keep:
@@ -130,9 +144,9 @@ class DeclareCall:
         )
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield serialised DeclareResponses while an injection stands."""
+        """Yield serialised DeclareResponses until all injections have ended."""
         while True:
-            self._wake.clear()  # before looking
+            self._wake.clear()  # before the checks, so that no wake-up is lost
             if self._waiting:
                 yield self._waiting.all()
             elif self.over or all(member.gone for member in self._members):
@@ -149,9 +163,10 @@ class DeclareCall:
         self._wake.set()
 
     def end(self, reason: str) -> None:
-        """End the call because its record has a gap, lifting at once what is not to be kept.
+        """End the call, because its record has a gap.
 
-        A client that does not read would delay the stream's end.
+        The injections are lifted at once, except those to keep: a client that does not read would
+        delay the end of the stream.
         """
         self.over = self.over or reason
         if self._laid and not self._keep and self._lifting is None:
@@ -162,9 +177,12 @@ class DeclareCall:
 def _check(
     declarations: Sequence[Declaration], blocks: Mapping[str, Block], wanted: Callable[[], bool]
 ) -> list[Program]:
-    """Check declarations and return their programs.
+    """Check declarations and compile them to programs.
 
-    ConfigError: one does not fit the sources. ValueRangeError: too many comparisons.
+    Raises:
+        ConfigError: A declaration does not fit the sources.
+        ValueRangeError: There are too many targets to compare.
+
     """
     matches = 0
     for declaration in declarations:
@@ -190,7 +208,7 @@ class DeclaredInjection(InjectionFollower):
         self.commands = commands
         self.number = 0
         self.gone = False
-        """Whether the injection is over."""
+        """True if the injection has ended."""
         self._campaign = campaign
 
     def happened(self, event: Event) -> None:
@@ -213,7 +231,7 @@ class DeclaredInjection(InjectionFollower):
         )
 
     def lifted(self, reason: str) -> None:
-        """Record the injection's end, if no event did."""
+        """Record the end of the injection, unless an event has reported it."""
         if not self.gone:
             self.gone = True
             now_ns = self.commands.block.clock.read().present_ns

@@ -1,4 +1,4 @@
-"""The call Events: what happens in sources, explained once for all clients."""
+"""The call Events: streams the events of sources, each explained once for all clients."""
 
 from __future__ import annotations
 
@@ -24,16 +24,19 @@ from shmio.segment.events import EVENT_SLOTS
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_CALLS: Final = 256
-"""Bound of the open calls of Events."""
+"""Maximum number of open Events calls."""
 MAX_SOURCES: Final = 256
 BATCH_EVENTS: Final = 32
-"""Events that are explained before the event loop serves the streams."""
+"""Events that are explained in a row, before the event loop serves the streams."""
 BATCH_S: Final = 0.005
-"""Time after which no further event of a batch is explained: an event may be about thousands of registers."""
+"""Time after which a batch ends: a single event may be about thousands of registers."""
 LOG_BYTES: Final = 8 << 20
-"""Bound of the size of a block's events that wait for clients; their number is that of the ring."""
+"""Maximum size of a block's events that wait for clients.
+
+Their number is also limited, to that of the event ring.
+"""
 MESSAGE_BYTES: Final = 1 << 18
-"""Size up to which the events of all sources are sent in one message."""
+"""Size at which a message with the events of all sources is complete."""
 
 _SOURCES, _EVENTS = (wire.EventsResponse.DESCRIPTOR.fields_by_name[name].number for name in ("sources", "events"))
 _MISSED: Final = wire.Event.DESCRIPTOR.fields_by_name["missed"].number
@@ -42,18 +45,19 @@ _MISSED: Final = wire.Event.DESCRIPTOR.fields_by_name["missed"].number
 class EventLog:
     """The latest events of one block as messages, for all calls that follow the block.
 
-    A call that is slower than the log is long loses the oldest events. For the event loop's thread.
+    A call that falls further behind than the log reaches misses the oldest events. Use it only in
+    the event loop's thread.
     """
 
     def __init__(self, block: Block, wake_ups: WakeUps, after: int) -> None:
-        """Begin behind event ``after``."""
+        """Begin after event ``after``."""
         self.block = block
         self.began = after
         self.reader = EventReader(block, after=after)
         self.first = 0
-        """Place of the oldest entry: how many have been dropped."""
+        """Index of the oldest entry, which is the number of entries dropped so far."""
         self.missed = 0
-        """Events that were overwritten in the ring before they could be read."""
+        """Number of events that were overwritten in the ring before the log could read them."""
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
         self._entries: deque[tuple[int, int, bytes]] = deque()  # number of the event, missed until then, message
         self._size = 0
@@ -61,17 +65,17 @@ class EventLog:
 
     @property
     def end(self) -> int:
-        """Place behind the newest entry."""
+        """Index after the newest entry."""
         return self.first + len(self._entries)
 
     @property
     def ended(self) -> bool:
-        """Whether no more entries will come."""
+        """True if no more entries will come."""
         return not self._batches.alive
 
     @property
     def failed(self) -> bool:
-        """Whether the block can no longer be followed although it is in use."""
+        """True if the log cannot follow the block any more, although the block is in use."""
         return self.ended and not self.reader.ended
 
     def start(self) -> None:
@@ -84,7 +88,12 @@ class EventLog:
         self._batches.stop()
 
     def entry(self, place: int) -> tuple[int, int, bytes]:
-        """Return an entry: the event's number, how many were missed until then, and the message."""
+        """Return an entry.
+
+        Returns:
+            The number of the event, how many events were missed until then, and the message.
+
+        """
         return self._entries[place - self.first]
 
     def _read(self) -> bool:
@@ -94,7 +103,7 @@ class EventLog:
             self._read_batch()
             followed = not self.reader.ended
         finally:
-            if not followed:  # also after an error, which the caller reports
+            if not followed:  # after the last event, or after an error, which the caller reports
                 self.stop()
             if self.end != before or not followed:
                 for wake in tuple(self.listeners):
@@ -131,9 +140,13 @@ class EventLogs:
         self._logs: dict[int, EventLog] = {}  # by the block's section
 
     def join(self, block: Block, wake: Callback, *, after: int) -> EventLog:
-        """Return the log of a block; the first call to join starts it behind event ``after``.
+        """Return the log of a block; the first call to join starts it.
 
-        ``wake`` is called when there are new events, and when the log ends.
+        Args:
+            block: The block to follow.
+            wake: Called when there are new events, and when the log ends.
+            after: Number of the event after which a new log begins.
+
         """
         log = self._logs.get(block.section)
         if log is None:
@@ -144,7 +157,7 @@ class EventLogs:
         return log
 
     def leave(self, log: EventLog, wake: Callback) -> None:
-        """Leave a log; it ends with its last call."""
+        """Leave a log. The log ends when its last call leaves it."""
         log.listeners.pop(wake, None)
         if not log.listeners:
             log.stop()
@@ -152,10 +165,17 @@ class EventLogs:
 
 
 class _Place:
-    """How far a call has read a block's log."""
+    """The position of one call in a block's log."""
 
     def __init__(self, log: EventLog, after: int, missed: int = 0) -> None:
-        """Begin behind event ``after``. ``missed``: the events that were lost before that."""
+        """Begin after event ``after``.
+
+        Args:
+            log: The log.
+            after: Number of the last event that the call does not want.
+            missed: Number of events that the call missed before.
+
+        """
         self.log = log
         self.missed = missed + max(0, log.began - after)
         self._after = after
@@ -164,7 +184,7 @@ class _Place:
         self._log_missed = 0 if whole else log.missed
 
     def next(self) -> bytes | None:
-        """Return the next serialised ``Event`` if there is one."""
+        """Return the next serialised ``Event``, or None if there is none yet."""
         log = self.log
         if (dropped := log.first - self._next) > 0:
             self.missed += dropped
@@ -172,7 +192,7 @@ class _Place:
         while self._next < log.end:
             event_number, log_missed, message = log.entry(self._next)
             self._next += 1
-            if event_number <= self._after:  # the call came before the log had read it
+            if event_number <= self._after:  # the event is older than the call
                 self._log_missed = log_missed
                 continue
             missed = self.missed + log_missed - self._log_missed
@@ -185,7 +205,13 @@ class EventsCall:
     """An Events call: follows its sources, and collects their events."""
 
     def __init__(self, feeds: Mapping[str, Feed], logs: EventLogs, instance: str, sources: Sequence[str]) -> None:
-        """Begin to follow. PathError: no such source; ValueRangeError: too many."""
+        """Begin to follow the sources.
+
+        Raises:
+            PathError: There is no such source.
+            ValueRangeError: There are too many sources.
+
+        """
         if len(sources) > MAX_SOURCES:
             raise ValueRangeError(f"{len(sources)} sources, at most {MAX_SOURCES} are allowed: none stands for all")
         for source in sources:
@@ -197,7 +223,7 @@ class EventsCall:
         self._wake = asyncio.Event()
         self._places: dict[str, _Place] = {}
         self._moved: dict[str, EventLog | None] = {}
-        """The next log of each source that a reload has changed; None: the source was removed."""
+        """The next log of each source that a reload has changed; None if it has removed the source."""
         self._failure: EndpointError | None = None
         try:
             for source in dict.fromkeys(sources) or feeds:
@@ -217,23 +243,28 @@ class EventsCall:
         self._moved.clear()
 
     def move(self, sources: Collection[str]) -> None:
-        """Prepare to follow the present blocks of these sources, after a reload."""
+        """Prepare to follow the new blocks of these sources, after a reload."""
         for source in self._places.keys() & sources:
             feed, before = self._feeds.get(source), self._moved.get(source)
             if feed is not None and self._places[source].log.block is feed.block:
                 continue  # the call began with this block
             log = None if feed is None else self._logs.join(feed.block, self._wake.set, after=0)
-            if before is not None and before is not log:  # two reloads, and the client has not read up to the first
+            if before is not None and before is not log:  # a second reload before the client has read up to the first
                 self._places[source].missed += before.end + before.missed
                 self._logs.leave(before, self._wake.set)
             self._moved[source] = log
         self._wake.set()
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield serialised EventsResponses without end. EndpointError: a source can no longer be followed."""
+        """Yield serialised EventsResponses without end.
+
+        Raises:
+            EndpointError: The events of a source can no longer be read.
+
+        """
         yield b"".join(field(_SOURCES, source.encode()) for source in self._places)
         while True:
-            self._wake.clear()  # before looking
+            self._wake.clear()  # before the checks, so that no wake-up is lost
             if batch := self._batch():
                 yield batch
             if self._failure is not None:
@@ -242,7 +273,7 @@ class EventsCall:
                 await self._wake.wait()
 
     def _batch(self) -> bytes:
-        """Return the present events up to a bound, those of the sources in turn."""
+        """Return the events that are waiting, up to a limit; the sources take turns."""
         parts: list[bytes] = []
         size, waiting = 0, deque(self._places)
         while waiting and size < MESSAGE_BYTES:
@@ -253,13 +284,16 @@ class EventsCall:
                 size += len(event)
                 if source in self._places:
                     waiting.append(source)
-        if self._places:  # another one comes first now
+        if self._places:  # another source comes first next time
             source = next(iter(self._places))
             self._places[source] = self._places.pop(source)
         return b"".join(parts)
 
     def _next(self, source: str) -> bytes | None:
-        """Return the next serialised ``Event`` of a source; the last one, if a reload has removed it."""
+        """Return the next serialised ``Event`` of a source, or None.
+
+        If a reload has removed the source, the last event says so.
+        """
         place = self._places[source]
         while (event := place.next()) is None and place.log.ended:
             if source not in self._moved:
@@ -280,7 +314,7 @@ class EventsCall:
 
 
 class EventCalls:
-    """The calls of Events."""
+    """Serves the call Events."""
 
     def __init__(self, feeds: Mapping[str, Feed], wake_ups: WakeUps, segment: Segment) -> None:
         self._feeds = feeds
@@ -289,16 +323,16 @@ class EventCalls:
         self._open: set[EventsCall] = set()
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Return the handler of the call, by name. Events are serialised where they are read."""
+        """Return the handler of the call, by name. The call serialises its messages itself."""
         return {"Events": grpc.unary_stream_rpc_method_handler(self.events, wire.EventsRequest.FromString)}
 
     async def events(self, request: wire.EventsRequest, context: Context) -> AsyncIterator[bytes]:
         """Stream the events of these sources, or of all, from now on.
 
         Statuses:
-            NOT_FOUND: No such source.
-            INVALID_ARGUMENT: Too many sources.
-            RESOURCE_EXHAUSTED: Too many calls.
+            NOT_FOUND: There is no such source.
+            INVALID_ARGUMENT: There are too many sources.
+            RESOURCE_EXHAUSTED: There are too many calls.
         """
         call = None
         try:
@@ -316,6 +350,6 @@ class EventCalls:
                 call.close()
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch the streams of these sources to their present blocks, after a reload."""
+        """Switch the streams of these sources to their new blocks, after a reload."""
         for call in self._open:
             call.move(sources)

@@ -34,9 +34,9 @@ from shmio.segment.standing_injections import StandingInjection
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_INJECTIONS: Final = 256
-"""Bound of the open Inject and Declare calls."""
+"""Maximum number of open Inject and Declare calls."""
 MAX_OPEN: Final = 32
-"""Bound of one stream's values in flight; further values wait."""
+"""Maximum number of one stream's values in flight; further values wait."""
 MAX_LIFETIME_MS: Final = 86_400_000
 
 _ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].number for name in ("originals", "answers"))
@@ -45,7 +45,7 @@ _PIECES: Final = wire.Update.DESCRIPTOR.fields_by_name["pieces"].number
 
 
 class InjectTarget(NamedTuple):
-    """The target of an injection: a source and direction, topics, and byte ranges."""
+    """The target of an injection: a source and a direction, topics, and byte ranges."""
 
     place: SourceDirection
     topics: tuple[Topic, ...]
@@ -53,7 +53,13 @@ class InjectTarget(NamedTuple):
 
 
 def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
-    """Read what an injection is to be over. Raises PathError or ValueRangeError."""
+    """Read the target of an injection.
+
+    Raises:
+        PathError: The target is not a part of one source and direction.
+        ValueRangeError: There is no target, or too much of it.
+
+    """
     if not (lay.patterns or lay.ranges):
         raise ValueRangeError("no pattern and no range is given: name the registers to inject into")
     for name, given in (("patterns", len(lay.patterns)), ("ranges", len(lay.ranges))):
@@ -78,10 +84,19 @@ def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
 
 
 class ByteRanges:
-    """The bytes and bits that an injection is over, besides registers."""
+    """The bytes and bits that an injection covers by ranges, in addition to registers."""
 
     def __init__(self, ranges: Iterable[wire.Range], size: int) -> None:
-        """``size``: the block's, in bytes. ValueRangeError: a range is empty or outside it."""
+        """Check the ranges.
+
+        Args:
+            ranges: The ranges of the request.
+            size: Size of the block, in bytes.
+
+        Raises:
+            ValueRangeError: A range is empty or exceeds the block, or its mask exceeds a byte.
+
+        """
         self._spans: list[tuple[slice, int]] = []
         self._bits = np.zeros(size, np.uint8)
         for one in ranges:
@@ -98,7 +113,7 @@ class ByteRanges:
 
     @property
     def bits(self) -> bytes:
-        """A mask of the block with these bits set."""
+        """Mask of the block with the bits of the ranges set."""
         return self._bits.tobytes()
 
     @property
@@ -110,16 +125,16 @@ class ByteRanges:
         )
 
     def differing(self, image: bytes, before: bytes | None) -> bytes:
-        """Return fields of an ``Update``: each range from its first to its last changed byte.
+        """Return each range from its first to its last changed byte, as fields of an ``Update``.
 
-        Without ``before`` all bytes count as changed.
+        If ``before`` is None, all bytes count as changed.
         """
         new = np.frombuffer(image, np.uint8)
         changed = np.full(len(image), 0xFF, np.uint8) if before is None else new ^ np.frombuffer(before, np.uint8)
         return b"".join(self._pieces(new, changed))
 
     def touched(self, image: bytes, mask: bytes) -> bytes:
-        """Return such fields for the bits that are set in a mask of the block."""
+        """Return each range from its first to its last byte in a mask, as fields of an ``Update``."""
         return b"".join(self._pieces(np.frombuffer(image, np.uint8), np.frombuffer(mask, np.uint8)))
 
     def _pieces(self, image: Array, changed: Array) -> Iterator[bytes]:
@@ -132,9 +147,16 @@ class ByteRanges:
 
 
 def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
-    """Convert a client's raw bytes to writes. ``bits``: mask of what its injection is over.
+    """Convert a client's raw bytes to writes.
 
-    ValueRangeError: the injection is not over all of the bytes, or there are too many pieces.
+    Args:
+        pieces: The raw bytes.
+        bits: Mask of the block with the bits set that the injection covers.
+
+    Raises:
+        ValueRangeError: The injection does not cover all of the bytes, or there are too many
+            pieces.
+
     """
     if len(pieces) > MAX_VALUES:
         raise ValueRangeError(f"{len(pieces)} pieces, at most {MAX_VALUES} are allowed: join neighbours, or send fewer")
@@ -158,21 +180,27 @@ class InjectCall(InjectionFollower):
     """An Inject call with its injection."""
 
     def __init__(self, topics: Topics, selections: Selections, wake_ups: WakeUps, lay: wire.Lay) -> None:
-        """Check the request. Raises PathError or ValueRangeError."""
+        """Check the request.
+
+        Raises:
+            PathError: The target is not a part of one source and direction.
+            ValueRangeError: An option is not valid, or there is no target.
+
+        """
         _check(lay)
         self._topics = topics
         self._selections = selections
         self._wake_ups = wake_ups
         self._lay = lay
         self.over = ""
-        """Why the call has to end: another client lifted it, or this client does not read."""
+        """Why the call has to end: another client lifted the injection, or this one does not read."""
         self._lifted = self._ended = False
         self._lifting: asyncio.Task[None] | None = None
         self._target = target_of(topics, lay)
         self._wake = asyncio.Event()
         self._waiting = SendQueue()  # serialised fields of an InjectResponse
         self.failure: ShmioError | None = None
-        """The error in what the client sends, if there is one."""
+        """The error in the messages of the client, or None."""
         self._giving: set[asyncio.Task[None]] = set()
         self._room = asyncio.Semaphore(MAX_OPEN)
         self._shown: Frame | None = None
@@ -193,10 +221,10 @@ class InjectCall(InjectionFollower):
         """Lay the injection; return the first message.
 
         Raises:
-            PathError: No such register.
-            ValueRangeError: Too many registers, or an invalid range.
+            PathError: There is no such register.
+            ValueRangeError: There are too many registers, or a range is not valid.
             CommandError: The source refuses the injection, or does not answer.
-            EndpointError: Too many registers of all clients together.
+            EndpointError: All clients together use too many registers.
 
         """
         self._view = view = await self._selections.registers({self._target.place: self._target.topics})
@@ -228,7 +256,7 @@ class InjectCall(InjectionFollower):
 
     @property
     def _originals(self) -> bool:
-        """Whether the originals come from frames."""
+        """True if the call sends originals, and makes them of frames."""
         return not (self._inward or self._lay.quiet)
 
     async def close(self) -> None:
@@ -259,7 +287,7 @@ class InjectCall(InjectionFollower):
     async def messages(self) -> AsyncIterator[bytes]:
         """Yield serialised InjectResponses until the injection or its lifetime ends."""
         while True:
-            self._wake.clear()  # before looking
+            self._wake.clear()  # before the checks, so that no wake-up is lost
             if self._waiting:
                 yield self._waiting.all()
             elif original := self._original():
@@ -274,8 +302,12 @@ class InjectCall(InjectionFollower):
     async def take(self, requests: AsyncIterator[wire.InjectRequest]) -> None:
         """Send the client's values in order.
 
-        Errors are answered if a message has a sequence number; else they end the stream. Raises
-        ValueRangeError for a message that is not about values.
+        If a message has a sequence number, an error in it is answered. Otherwise the error ends the
+        stream.
+
+        Raises:
+            ValueRangeError: A message gives no values.
+
         """
         async for request in requests:
             if request.WhichOneof("what") != "shadow":
@@ -293,14 +325,14 @@ class InjectCall(InjectionFollower):
         self.taken(task)
 
     def taken(self, task: asyncio.Task[None]) -> None:
-        """End the stream if a task that takes values has failed."""
+        """End the stream if a task that handles the client's values has failed."""
         if not task.cancelled() and isinstance(error := task.exception(), ShmioError):
             self.failure = error
             self._end()
 
     async def _give(self, shadow: wire.Shadow) -> None:
         try:
-            async with self._in_order:  # a large message is read in time slices; later ones must not overtake it
+            async with self._in_order:  # no message may overtake a large one, which is read in time slices
                 values, raw = await self._values(shadow)
             ends: Sequence[End] = await command_client.give(self._commands, self._base.number, values, raw)
         except ShmioError as error:
@@ -330,7 +362,7 @@ class InjectCall(InjectionFollower):
     # ---- originals -----------------------------------------------------------------------------
 
     def _original(self) -> bytes | None:
-        """Return an update with the changes of the image beneath the injection, or None."""
+        """Return an update with the changes of the image that the injection replaces, or None."""
         if not self._originals:
             return None
         block, shown = self._view.block, self._shown
@@ -352,7 +384,7 @@ class InjectCall(InjectionFollower):
         return head(self._view.number, frame, whole=before is None) + body if body or quality else None
 
     def divert(self, diverted: CommandWrites) -> None:
-        """Take diverted values: over ``/in`` writes, over ``/out`` values of inner injections."""
+        """Handle diverted values: over ``/in`` writes, over ``/out`` values of inner layers."""
         self._base.divert(diverted.writes)
         if not self._inward:
             self.restack()
@@ -371,32 +403,38 @@ class InjectCall(InjectionFollower):
         self._wake.set()
 
     def _give_up(self, reason: str) -> None:
-        """Lift the injection at once, as a client that does not read delays the stream's end."""
+        """Lift the injection at once.
+
+        A client that does not read would delay the end of the stream, and so the lift.
+        """
         self.over = self.over or reason
         if self._base.number and not (self._lay.keep or self._lifted):
             self._lifting = self._lifting or self._lift()
         self._wake.set()
 
     def restack(self) -> None:
-        """React to another injection on the source that was laid or lifted."""
+        """Handle a change of another injection on the source."""
         if not self._inward:
             self._base.restack()
             self._wake.set()
 
     def lifted(self, reason: str) -> None:
-        """React to the injection's end, which this stream did not ask for."""
+        """Handle the end of the injection, if another program has lifted it."""
         self._lifted = True
         self.over = f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it"
         self._wake.set()
 
     def fail(self, reason: str) -> None:
-        """React to missed events: writes are missing; originals over ``/out`` come from frames."""
+        """Handle missed events: give up over ``/in``, where writes are missing.
+
+        Over ``/out`` the originals come from frames.
+        """
         if self._inward and not self._lay.quiet:
             self._give_up(reason)
 
 
 def _check(lay: wire.Lay) -> None:
-    """Raise ValueRangeError if options are not valid or do not go together."""
+    """Raise ValueRangeError if options are not valid or exclude each other."""
     if len(lay.name.encode()) > MAX_NAME_BYTES:
         raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes")
     if lay.lifetime_ms > MAX_LIFETIME_MS:
@@ -406,7 +444,7 @@ def _check(lay: wire.Lay) -> None:
 
 
 class InjectionCalls:
-    """The calls about injections."""
+    """Serves the calls about injections."""
 
     def __init__(self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, wake_ups: WakeUps) -> None:
         self._topics = topics
@@ -433,16 +471,17 @@ class InjectionCalls:
         }
 
     async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
-        """Lay an injection while the stream is open, or for good.
+        """Lay an injection that lasts as long as the stream, or that is kept.
 
-        Originals are streamed to the client, which streams other values back.
+        The call streams the originals to the client, which streams other values back.
 
         Statuses:
-            NOT_FOUND: No such register.
+            NOT_FOUND: There is no such register.
             INVALID_ARGUMENT: The injection is not valid, or does not cover a given value.
             FAILED_PRECONDITION: The source refuses the injection; the message says why.
-            RESOURCE_EXHAUSTED: Too many streams.
-            ABORTED: Another client lifted it, or this client does not read the originals.
+            RESOURCE_EXHAUSTED: There are too many streams.
+            ABORTED: Another client lifted the injection, or this client does not read the
+                originals.
         """
         opening: asyncio.Task[bytes] | None = None
         taking: asyncio.Task[None] | None = None
@@ -455,7 +494,7 @@ class InjectionCalls:
             async for message in injection.messages():
                 yield message
             taking.cancel()
-            await asyncio.shield(self._spawn(self._close(injection, opening)))  # it is lifted before the stream ends
+            await asyncio.shield(self._spawn(self._close(injection, opening)))  # lift it before the stream ends
             opening = None
         except ShmioError as error:
             await refuse(context, error)
@@ -470,7 +509,14 @@ class InjectionCalls:
             await context.abort(grpc.StatusCode.ABORTED, f"{injection.source}: {injection.over}")
 
     async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> InjectCall:
-        """Read the first message. Raises PathError, ValueRangeError or EndpointError."""
+        """Read the first message.
+
+        Raises:
+            PathError: The target is not a part of one source and direction.
+            ValueRangeError: The message does not lay an injection, or an option is not valid.
+            EndpointError: There are too many calls.
+
+        """
         self._check_room()
         async for request in requests:
             if request.WhichOneof("what") == "lay":
@@ -481,7 +527,7 @@ class InjectionCalls:
         raise ValueRangeError("the first message of Inject lays an injection, all others give values")
 
     def _check_room(self) -> None:
-        """Raise EndpointError if too many calls are open."""
+        """Raise EndpointError if there are too many calls."""
         if len(self._open) >= MAX_INJECTIONS:
             raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the maximum")
 
@@ -494,15 +540,15 @@ class InjectionCalls:
             self._open.discard(one)
 
     async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
-        """Lay declared injections, all or none, while the stream is open or for good.
+        """Lay declared injections, all or none, that last as long as the stream, or that are kept.
 
-        The stream is the record of their events.
+        The call streams a record of their events.
 
         Statuses:
             INVALID_ARGUMENT: A declaration is not valid; the message names the key.
             FAILED_PRECONDITION: A source refuses an injection; the message says why.
-            RESOURCE_EXHAUSTED: Too many streams.
-            ABORTED: The client does not read the record, or it would have a gap.
+            RESOURCE_EXHAUSTED: There are too many streams.
+            ABORTED: The client does not read the record, or events are missing in it.
         """
         opening: asyncio.Task[bytes] | None = None
         try:
@@ -525,7 +571,11 @@ class InjectionCalls:
     async def list_injections(
         self, request: wire.ListInjectionsRequest, context: Context
     ) -> wire.ListInjectionsResponse:
-        """List the injections that stand. Status NOT_FOUND: no such source."""
+        """List the injections on these sources, or on all.
+
+        Statuses:
+            NOT_FOUND: There is no such source.
+        """
         found = wire.ListInjectionsResponse()
         try:
             for block in self._topics.blocks(request.sources):
@@ -538,7 +588,7 @@ class InjectionCalls:
         """Lift one injection.
 
         Statuses:
-            NOT_FOUND: No such injection.
+            NOT_FOUND: There is no such injection.
             FAILED_PRECONDITION: The source does not answer.
         """
         try:
@@ -554,9 +604,10 @@ class InjectionCalls:
             await refuse(context, error)
 
     async def lift_all(self, request: wire.LiftAllRequest, context: Context) -> wire.LiftResponse:
-        """Lift all injections at once; the answer says why one still stands.
+        """Lift all injections concurrently. If one could not be lifted, the answer says why.
 
-        Status NOT_FOUND: no such source.
+        Statuses:
+            NOT_FOUND: There is no such source.
         """
         try:
             blocks = self._topics.blocks(request.sources)
@@ -578,7 +629,7 @@ class InjectionCalls:
 
 
 def _describe(block: Block, one: StandingInjection) -> wire.Injection:
-    """Describe an injection that stands on a block."""
+    """Convert an injection on a block to a message."""
     return wire.Injection(
         source=block.source,
         number=one.number,
@@ -594,7 +645,7 @@ def _describe(block: Block, one: StandingInjection) -> wire.Injection:
 
 
 def _running(running: Running[Declaration]) -> wire.Running:
-    """Describe the state of a declared injection."""
+    """Convert the state of a declared injection to a message."""
     declaration = running.declaration
     return wire.Running(
         declaration=declaration_to_wire(msgspec.to_builtins(declaration), declaration.name),

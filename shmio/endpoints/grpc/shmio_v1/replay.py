@@ -1,4 +1,4 @@
-"""The call of shmio.v1 that controls replays: Replay."""
+"""The call Replay of shmio.v1, which controls replays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_SOURCES: Final = 256
 
 
 class ReplayCalls:
-    """The call that controls replays."""
+    """Serves the call Replay."""
 
     def __init__(self, segment: Segment) -> None:
         self._replays = Replays(segment)
@@ -33,13 +33,15 @@ class ReplayCalls:
         return {"Replay": grpc.unary_unary_rpc_method_handler(self.replay, request, response)}
 
     async def replay(self, request: wire.ReplayRequest, context: Context) -> wire.ReplayResponse:
-        """Control the replays or return their status. Calls take turns; a search ends with its call.
+        """Control the replays, or return their status.
+
+        Calls are carried out one at a time. A search ends when its call ends.
 
         Statuses:
             INVALID_ARGUMENT: The speed or a time is not valid.
-            NOT_FOUND: No such source or register.
-            FAILED_PRECONDITION: Nothing is replayed, the search finds nothing, or a source does
-                not answer.
+            NOT_FOUND: There is no such source or register.
+            FAILED_PRECONDITION: Nothing is replayed, the search finds nothing, or a source does not
+                answer.
         """
         try:
             wanted = _wanted(request)
@@ -57,11 +59,16 @@ class ReplayCalls:
             try:
                 return await asyncio.to_thread(self._replays.change, wanted, over.is_set)
             finally:
-                over.set()  # ends the thread when the call is cancelled
+                over.set()  # if the call is cancelled, this ends the thread
 
 
 def _wanted(request: wire.ReplayRequest) -> ReplayRequest:
-    """Convert a request. ValueRangeError: too many sources, or too long a text."""
+    """Convert a request.
+
+    Raises:
+        ValueRangeError: There are too many sources, or a text is too long.
+
+    """
     texts = (request.seek, request.until, request.change, request.event, *request.sources)
     if len(request.sources) > MAX_SOURCES or any(len(text) > MAX_TEXT for text in texts):
         raise ValueRangeError(f"at most {MAX_SOURCES} sources, and {MAX_TEXT} characters of each text, can be given")

@@ -21,17 +21,20 @@ from shmio.segment import Block
 MAX_PATTERNS: Final = 256
 MAX_REGISTERS: Final = 16_384
 MAX_ELEMENTS: Final = 262_144
-"""Bound of one call's elements."""
+"""Maximum number of elements of one call."""
 MAX_MATCHES: Final = 1_000_000
-"""Bound of one call's comparisons of star patterns with registers; they take some seconds."""
+"""Maximum number of times that one call may compare a star pattern with a register.
+
+So many comparisons take a few seconds.
+"""
 MAX_ALL_ELEMENTS: Final = 1 << 22
-"""Bound of the elements of all clients together; equal patterns count once."""
+"""Maximum number of elements of all clients together; equal patterns count once."""
 KEPT: Final = 16
-"""Number of unused views that are cached for clients that read repeatedly."""
+"""Number of unused views that are cached, for clients that read repeatedly."""
 
 
 class SourceDirection(NamedTuple):
-    """A source's values, or with ``inward`` the writes to it."""
+    """The values of a source; with ``inward``, the writes to it."""
 
     source: str
     inward: bool = False
@@ -43,7 +46,7 @@ _Key = tuple[int, bool, tuple[str, ...]]
 
 
 class Selections:
-    """The views of all clients, with a cache."""
+    """Makes and caches the views of all clients."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -53,14 +56,14 @@ class Selections:
         self._turn = asyncio.Lock()
 
     def resolve(self, patterns: Sequence[str], *, inward: bool = False) -> TopicsBySource:
-        """Parse a call's patterns and group them by source and direction.
+        """Parse a call's patterns, and group them by source and direction.
 
         Args:
             patterns: Paths, structures, globs or source names.
             inward: Whether ``/in`` is allowed.
 
         Raises:
-            PathError: No such source, or ``/in`` is not allowed.
+            PathError: There is no such source, or ``/in`` is not allowed.
             ValueRangeError: There is no pattern, or there are too many.
 
         """
@@ -81,7 +84,12 @@ class Selections:
         return {place: tuple(topics) for place, topics in wanted.items()}
 
     def commands(self, source: str) -> CommandClient:
-        """Return a source's command client. PathError: a reload has removed the source."""
+        """Return the command client of a source.
+
+        Raises:
+            PathError: A reload has removed the source.
+
+        """
         return self._topics.feed(source).commands
 
     async def select(self, wanted: TopicsBySource, *, frames: bool = False) -> list[View]:
@@ -92,9 +100,9 @@ class Selections:
             frames: Return views of raw frames.
 
         Raises:
-            PathError: No such register.
-            ValueRangeError: Too much for one call.
-            EndpointError: Too much for all clients together.
+            PathError: There is no such register.
+            ValueRangeError: This call uses too many registers or elements.
+            EndpointError: All clients together use too many elements.
 
         """
         views = []
@@ -105,22 +113,29 @@ class Selections:
         return views
 
     async def registers(self, wanted: TopicsBySource) -> Selection:
-        """Return the view of a single source; it has no registers if no topic is given."""
+        """Return the view of a single source; without topics, the view has no registers."""
         ((place, topics),) = wanted.items()
         if not topics:
             block = self._topics.feed(place.source).block
             return Selection(next(self._numbers), block, (), inward=place.inward)
         view = await self._view(place, topics, _Budget())
-        if not isinstance(view, Selection):  # as raw frames are: of no topics
+        if not isinstance(view, Selection):  # the view of raw frames, which has no topics
             raise PathError(f"{place.source}: no register is named")
         return view
 
     async def _view(self, place: SourceDirection, topics: Sequence[Topic], budget: _Budget) -> View:
-        """Return a cached or new view. ``topics``: empty for raw frames."""
+        """Return a cached or a new view.
+
+        Args:
+            place: The source and direction.
+            topics: The topics; empty for raw frames.
+            budget: What the call may still use.
+
+        """
         block = self._topics.feed(place.source).block
         key = block.section, place.inward, tuple(topic.path for topic in topics)
         if (view := self._known.get(key)) is None:
-            async with self._turn:  # one at a time, in a thread: a large layout takes seconds
+            async with self._turn:  # one at a time, because a large layout takes seconds in a thread
                 view = self._known.get(key)
                 if view is None:
                     view = self._known[key] = await self._make(block, topics, budget, inward=place.inward)
@@ -150,7 +165,7 @@ class Selections:
 
 
 class _Budget:
-    """The rest of a call's limits."""
+    """The registers, elements and comparisons that a call may still use."""
 
     def __init__(self) -> None:
         self.registers, self.elements, self.matches = MAX_REGISTERS, MAX_ELEMENTS, MAX_MATCHES
@@ -170,7 +185,12 @@ class _Budget:
             )
 
     def match(self, registers: int) -> None:
-        """Count a star pattern. ValueRangeError: too many for the size of the blocks."""
+        """Count the comparisons of a star pattern.
+
+        Raises:
+            ValueRangeError: There are too many.
+
+        """
         self.matches -= registers
         if self.matches < 0:
             raise ValueRangeError(

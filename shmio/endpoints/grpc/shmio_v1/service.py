@@ -30,7 +30,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 PART_REGISTERS: Final = 4096
-"""Bound of the registers in one message."""
+"""Maximum number of registers in one message."""
 _REMEDY: Final = "shmio-supervisor up takes them over, shmio-supervisor down stops them"
 
 
@@ -48,7 +48,17 @@ class ShmioV1:
         stepper: Stepper,
         open_streams: OpenStreams,
     ) -> None:
-        """``open_streams`` counts these streams together with those of other services."""
+        """Create the service.
+
+        Args:
+            topics: Resolves paths.
+            feeds: The feeds of all sources, by name.
+            wake_ups: The wake-ups that the feeds use.
+            segment: The instance's shared memory.
+            stepper: Controls the instance's time.
+            open_streams: Counts the open streams of all services together.
+
+        """
         self._topics = topics
         self._segment = segment
         self._selections = Selections(topics)
@@ -66,7 +76,10 @@ class ShmioV1:
         )
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Return the handlers of the service's calls. Values are serialised where they are made."""
+        """Return the handlers of the service's calls.
+
+        Most calls serialise their messages themselves.
+        """
         unary, streaming = grpc.unary_unary_rpc_method_handler, grpc.unary_stream_rpc_method_handler
         calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
             "GetLayouts": streaming(
@@ -80,7 +93,11 @@ class ShmioV1:
         return calls
 
     async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
-        """Stream the layouts of these sources, or of all. Status NOT_FOUND: no such source."""
+        """Stream the layouts of these sources, or of all.
+
+        Statuses:
+            NOT_FOUND: There is no such source.
+        """
         try:
             blocks = self._topics.blocks(request.sources)
         except ShmioError as error:
@@ -90,16 +107,16 @@ class ShmioV1:
                 yield part
 
     async def get_status(self, _: wire.GetStatusRequest, __: Context) -> wire.Status:
-        """Return what ``shmio-supervisor status --json`` prints."""
+        """Return the information that ``shmio-supervisor status --json`` prints."""
         return _status(self._segment)
 
     async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
-        """Return the present values; those of one source are from one frame.
+        """Return the present values; those of one source come from one frame.
 
         Statuses:
-            NOT_FOUND: No such register.
-            INVALID_ARGUMENT: Too many registers.
-            RESOURCE_EXHAUSTED: Too many registers of all clients together.
+            NOT_FOUND: There is no such register.
+            INVALID_ARGUMENT: There are too many registers.
+            RESOURCE_EXHAUSTED: All clients together use too many registers.
         """
         try:
             views = await self._selections.select(self._selections.resolve(request.patterns))
@@ -110,7 +127,7 @@ class ShmioV1:
             await refuse(context, error)
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch the streams of these sources to their present blocks, after a reload."""
+        """Switch the streams of these sources to their new blocks, after a reload."""
         self._simulate_calls.move()
         self._event_calls.move(sources)
         self.subscribe_calls.move(sources)
@@ -131,7 +148,7 @@ def _reading(view: View, *, originals: bool) -> bytes:
 
 
 def _layout_parts(block: Block) -> Iterator[wire.LayoutPart]:
-    """Yield a block's layout in as many messages as necessary."""
+    """Yield the layout of a block, in as many messages as necessary."""
     layout, attributes = block.layout, block.attributes
     for first in range(0, max(1, len(layout.registers)), PART_REGISTERS):
         part = wire.LayoutPart(
@@ -159,7 +176,7 @@ def _layout_parts(block: Block) -> Iterator[wire.LayoutPart]:
 
 
 def _status(segment: Segment) -> wire.Status:
-    """Describe the instance's status."""
+    """Convert the instance's status to a message."""
     now = status_of(segment, _REMEDY, asking="grpc")
     found = wire.Status(
         instance=now.instance or "",

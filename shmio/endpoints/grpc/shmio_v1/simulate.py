@@ -1,4 +1,4 @@
-"""The call Simulate: a remote program (a model) computes a source, step by step."""
+"""The call Simulate: a model in a remote program computes a source, step by step."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 
 class OutputEncoder:
-    """Encodes a model's outputs into an image of the block; caches lookups of slots and paths."""
+    """Encodes the outputs of a model into an image of the block; caches lookups of slots and paths."""
 
     def __init__(self, selection: Selection) -> None:
         self._selection = selection
@@ -42,7 +42,12 @@ class OutputEncoder:
         self._paths: dict[str, Register] = {}
 
     async def packed(self, values: wire.Values, image: bytearray) -> None:
-        """Encode values by slot, in time slices. ValueRangeError: a slot or value does not fit."""
+        """Encode values by slot, in time slices.
+
+        Raises:
+            ValueRangeError: A slot or value does not fit the table.
+
+        """
         for column, name in FIELDS.items():
             if not values.HasField(name):
                 continue
@@ -52,7 +57,7 @@ class OutputEncoder:
             slots = np.fromiter(part.slots or range(most), np.int64)
             if len(slots) != len(part.values):
                 raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
-            if len(slots) > max(1, most):  # else one message could delay all clients
+            if len(slots) > max(1, most):  # otherwise one message could delay all clients
                 raise ValueRangeError(f"{name}: {len(slots)} values, the table has {most}: give each once")
             if len(wrong := np.flatnonzero(slots >= most)):
                 raise ValueRangeError(f"{name}: the table has no slot {slots[wrong[0]]}")
@@ -72,7 +77,7 @@ class OutputEncoder:
         """
         if len(assignments) > (most := self._selection.elements):
             raise ValueRangeError(f"assignments: {len(assignments)} values, the table has {most}: give each once")
-        if len(assignments) > MAX_VALUES:  # each is put in by itself
+        if len(assignments) > MAX_VALUES:  # because each is encoded by itself
             raise ValueRangeError(
                 f"assignments: {len(assignments)} values, at most {MAX_VALUES} are allowed by path: give them by slots"
             )
@@ -125,14 +130,14 @@ _VALUES, _INVALID = (wire.Do.DESCRIPTOR.fields_by_name[name].number for name in 
 
 
 class SimulateCalls:
-    """The call that connects models, at most one per source."""
+    """Serves the call Simulate, which connects at most one model to each source."""
 
     def __init__(self, feeds: Mapping[str, Feed], segment: Segment) -> None:
         self._feeds = feeds
         self._segment = segment
         self._open: dict[int, SimulateCall] = {}  # by the section of their block
         for block in segment.blocks.values():
-            if block.model_channel is not None:  # the process before this one may have died with its model
+            if block.model_channel is not None:  # a model may have been connected to the previous process
                 self._ring(block)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
@@ -144,9 +149,9 @@ class SimulateCalls:
         """Send the source's steps to the client, and the client's outputs to the source.
 
         Statuses:
-            NOT_FOUND: No such source.
-            FAILED_PRECONDITION: No model can join the source.
-            ALREADY_EXISTS: Another model has joined it.
+            NOT_FOUND: There is no such source.
+            FAILED_PRECONDITION: The source does not accept models.
+            ALREADY_EXISTS: Another model has joined the source.
             INVALID_ARGUMENT: The client does not join, or answers a step that is not pending.
             UNAVAILABLE: A reload has changed the source.
         """
@@ -158,7 +163,7 @@ class SimulateCalls:
             self._ring(simulation.block)
             taking = asyncio.get_running_loop().create_task(simulation.take(requests))
             taking.add_done_callback(simulation.taken)
-            # Even if the client does not read the stream's end:
+            # This also runs if the client does not read the end of the stream.
             taking.add_done_callback(partial(self._release, simulation))
             yield first
             async for message in simulation.messages():
@@ -174,7 +179,15 @@ class SimulateCalls:
             await refuse(context, simulation.failure)
 
     async def _joining(self, requests: AsyncIterator[wire.SimulateRequest], peer: str) -> SimulateCall:
-        """Read the first message; raises PathError, CommandError, ConflictError, ValueRangeError."""
+        """Read the first message.
+
+        Raises:
+            PathError: There is no such source.
+            CommandError: The source does not accept models.
+            ConflictError: Another model has joined the source.
+            ValueRangeError: The message does not join, or the name is too long.
+
+        """
         async for request in requests:
             if request.WhichOneof("what") == "join":
                 block, name = self._block(request.join.source), request.join.name or peer
@@ -209,7 +222,7 @@ class SimulateCalls:
             self._ring(simulation.block)
 
     def _ring(self, block: Block) -> None:
-        """Wake the source, so that it notices who is connected."""
+        """Wake the source, so that it notices whether a model is connected."""
         for slot in self._segment.processes:
             if slot.name == block.source:
                 self._segment.clock.slot_bell(slot.index).ring()
@@ -235,7 +248,7 @@ class SimulateCall:
         self._joined = False
         self._over = False
         self._wake = asyncio.Event()
-        self._bell: WakeUp | None = None  # called when the source asks for a step
+        self._bell: WakeUp | None = None  # rings when the source asks for a step
         self._handed = 0
         self._asked: ModelRequest | None = None  # the step that the model computes now
         self._given: DecodedImage | None = None
@@ -249,7 +262,7 @@ class SimulateCall:
         return self.block.model_channel
 
     async def join(self) -> bytes:
-        """Join the source's model channel; return the first message.
+        """Join the model channel of the source; return the first message.
 
         Raises:
             ConflictError: Another model has joined.
@@ -259,7 +272,7 @@ class SimulateCall:
         self._inputs, self._outputs = await asyncio.to_thread(_tables, self.block)  # takes seconds for a large layout
         self._encoder = OutputEncoder(self._outputs)
         link = self._link
-        self._handed = link.asked.head()  # before it is taken: what was asked then is not for this model
+        self._handed = link.asked.head()  # before joining: earlier requests are not for this model
         if not link.join(self.name):
             before = link.model()
             name, who = (before.name, f"pid {before.pid}") if before else ("another", "which is leaving")
@@ -280,7 +293,7 @@ class SimulateCall:
         return field(_JOINED, joined.SerializeToString() + parts)
 
     def leave(self) -> None:
-        """Leave the source's model channel."""
+        """Leave the model channel of the source."""
         self._over = True
         if self._joined:
             self._link.leave()
@@ -296,9 +309,9 @@ class SimulateCall:
     # ---- requests to the model -----------------------------------------------------------------
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield serialised SimulateResponses until the call is over."""
+        """Yield serialised SimulateResponses until the call ends."""
         while not self._over:
-            self._wake.clear()  # before looking
+            self._wake.clear()  # before the checks, so that no wake-up is lost
             if self._asked is None and (ask := self._newest()) is not None:
                 self._asked = ask
                 yield field(_WORK, self._work(ask))
@@ -306,7 +319,12 @@ class SimulateCall:
                 await self._wake.wait()
 
     def _newest(self) -> ModelRequest | None:
-        """Return the step that the source waits for, or None if the model has it already."""
+        """Return the step that the source waits for.
+
+        Returns:
+            The step, or None if there is none, or if the model has it already.
+
+        """
         link = self._link
         if link.asked.head() == self._handed or (ask := link.newest()) is None:
             return None
@@ -314,7 +332,7 @@ class SimulateCall:
         return ask if ask.until_ns > time.monotonic_ns() else None
 
     def _work(self, ask: ModelRequest) -> bytes:
-        """Return a serialised ``Do``: all inputs the first time, later those that have changed."""
+        """Return a serialised ``Do``: at first with all inputs, later with the changed ones."""
         before, now = self._given, self._inputs.columns.decode(ask.commanded)
         self._given = now
         work = wire.Do(
@@ -329,7 +347,12 @@ class SimulateCall:
     # ---- answers of the model ------------------------------------------------------------------
 
     async def take(self, requests: AsyncIterator[wire.SimulateRequest]) -> None:
-        """Process the model's answers until it half-closes. ValueRangeError: one is unexpected."""
+        """Process the model's answers until the model half-closes the stream.
+
+        Raises:
+            ValueRangeError: A message is not the answer to the pending step.
+
+        """
         async for request in requests:
             if request.WhichOneof("what") != "done":
                 raise ValueRangeError("a model joins once, by the first message; all others answer steps")
@@ -362,7 +385,7 @@ class SimulateCall:
         late_ns = (now_ns := time.monotonic_ns()) - ask.until_ns
         if late_ns < 0:
             self._link.answer(ask, now_ns, image, None if failure is None else printable(failure))
-        else:  # not given, because a source that is late too might still take it
+        else:  # do not pass it on: a source that is late as well might still use it
             self._refused = self._refused or f"step {ask.step}: the answer came {late_ns // 1_000_000} ms too late"
         self._asked = None
         self._wake.set()
@@ -372,7 +395,7 @@ def _tables(block: Block) -> tuple[Selection, Selection]:
     """Return the tables of inputs and outputs.
 
     Raises:
-        ValueRangeError: They are too large.
+        ValueRangeError: A table is too large.
         ConfigError: The declared outputs do not fit the layout.
 
     """

@@ -1,4 +1,4 @@
-"""The call Subscribe: one stream over any number of blocks."""
+"""The call Subscribe: one stream of updates from any number of blocks."""
 
 from __future__ import annotations
 
@@ -35,11 +35,14 @@ from shmio.segment import Event, Frame, FrameFollower
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_STREAMS: Final = 256
-"""Bound of the open Subscribe calls."""
+"""Maximum number of open Subscribe calls."""
 BATCH_BYTES: Final = 1 << 18
-"""Size up to which the updates of all blocks are sent in one message."""
+"""Size at which a message with the updates of all blocks is complete."""
 BATCH_UPDATES: Final = 256
-"""Bound of one message's frame updates, which take milliseconds: then other tasks run."""
+"""Maximum number of updates in one message.
+
+So many take some milliseconds to make. Then other tasks run.
+"""
 MAX_RATE_HZ: Final = 1e6
 
 TABLES, UPDATES, ENDED, STEP = (
@@ -48,7 +51,7 @@ TABLES, UPDATES, ENDED, STEP = (
 
 
 def check(request: wire.SubscribeRequest) -> None:
-    """Raise ValueRangeError if options are not valid or do not go together."""
+    """Raise ValueRangeError if options are not valid or exclude each other."""
     if request.mode not in wire.Mode.values() or request.format not in wire.Format.values():
         raise ValueRangeError(f"mode {request.mode}, format {request.format}: this version supports 0 and 1 for each")
     for name, value, most in (
@@ -71,14 +74,14 @@ class BlockUpdates(Protocol):
     view: View
     follower: FrameFollower
     due_s: float
-    """Event loop's time of the next possible update; infinity: it takes a new frame."""
+    """Time of the next possible update, by the event loop's clock; infinite: it needs a new frame."""
 
     def next(self, now_s: float) -> bytes | None:
         """Return the next serialised ``Update``, or None."""
 
 
 class EveryFrame:
-    """Makes an update of every frame from the present one on, and counts those overwritten."""
+    """Makes an update of every frame from the present one on; counts frames that were overwritten."""
 
     due_s = math.inf
 
@@ -86,8 +89,8 @@ class EveryFrame:
         self.view = view
         self.follower = FrameFollower(view.block)
 
-    def next(self, now_s: float) -> bytes | None:  # noqa: ARG002  as fast as the client takes them
-        """Return the next frame's update, or one that says that the last frame is stale."""
+    def next(self, now_s: float) -> bytes | None:  # noqa: ARG002  there is no rate limit
+        """Return the update of the next frame, or one that reports that the last frame is stale."""
         follower = self.follower
         frame = follower.poll()
         if frame is None:
@@ -100,7 +103,7 @@ class EveryFrame:
 
 
 class LatestFrame:
-    """Makes updates of the newest frame that differs, at most once per interval."""
+    """Makes updates of the newest frame if it has changes, at most one per interval."""
 
     def __init__(self, view: View, interval_s: float, deadband: float) -> None:
         self.view = view
@@ -109,10 +112,10 @@ class LatestFrame:
         self._interval_s = interval_s
         self._deadband = deadband
         self._last_s = -math.inf
-        self._sent: DecodedImage | None = None  # with a dead-band
+        self._sent: DecodedImage | None = None  # the receiver's values; only with a dead-band
 
     def next(self, now_s: float) -> bytes | None:
-        """Return the newest frame's changes, or an update that reports the last one as stale."""
+        """Return the changes of the newest frame, or an update that reports the last one as stale."""
         follower = self.follower
         shown = follower.frame
         if shown is not None and not follower.behind:
@@ -123,7 +126,7 @@ class LatestFrame:
         self.due_s = math.inf
         try:
             frame = follower.newest()
-        except SegmentError:  # overwritten during each read; there will be another
+        except SegmentError:  # overwritten during each attempt to read it; a newer frame will come
             return None
         if frame is None:
             return None
@@ -159,12 +162,19 @@ def _state(frame: Frame) -> tuple[object, ...]:
 
 
 class WriteFollower:
-    """Follows the writes to a table for one subscriber, in a queue from which none is dropped."""
+    """Follows the writes to a table for one subscriber, in a queue that drops none."""
 
     def __init__(self, writes: WriteUpdates, commands: CommandClient, ring: Callable[[], None]) -> None:
-        """``ring`` is called when there is an update."""
+        """Begin to follow the writes.
+
+        Args:
+            writes: Encodes the writes.
+            commands: The client of the source.
+            ring: Called when there is an update.
+
+        """
         self.failure = ""
-        """Why writes are missing; empty: none are."""
+        """Why writes are missing; empty if none are."""
         self._writes = writes
         self._commands = commands
         self._ring = ring
@@ -177,7 +187,7 @@ class WriteFollower:
 
     @property
     def waits(self) -> bool:
-        """Whether an update waits."""
+        """True if an update waits."""
         return bool(self._waiting)
 
     def next(self) -> bytes | None:
@@ -192,7 +202,7 @@ class WriteFollower:
             self._ring()
 
     def fail(self, reason: str) -> None:
-        """Fail because writes are missing; discard what waits, and stop following."""
+        """Fail because writes are missing: discard the queue, and stop following."""
         self.failure = self.failure or reason
         self._waiting = SendQueue()
         self.leave()
@@ -200,16 +210,22 @@ class WriteFollower:
 
 
 class SubscribeCall:
-    """A Subscribe call: follows its blocks and collects their updates."""
+    """A Subscribe call: follows its blocks, and collects their updates."""
 
     def __init__(
         self, selections: Selections, wake_ups: WakeUps, virtual_time: VirtualTime, request: wire.SubscribeRequest
     ) -> None:
-        """Check the request. Raises PathError or ValueRangeError."""
+        """Check the request.
+
+        Raises:
+            PathError: There is no such source.
+            ValueRangeError: An option is not valid, or there are too many patterns.
+
+        """
         check(request)
         self.updates = 0
         self.late = False
-        """Whether a step has waited too long for the client; see :meth:`give_up`."""
+        """True if a step has waited too long for the client; see :meth:`give_up`."""
         self._virtual_time = virtual_time
         self._opened = False
         self._step_marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
@@ -230,7 +246,11 @@ class SubscribeCall:
     async def open(self) -> bytes:
         """Start following all blocks; return the tables.
 
-        Raises PathError, ValueRangeError and EndpointError as :meth:`Selections.select`.
+        Raises:
+            PathError: There is no such register.
+            ValueRangeError: This call uses too many registers or elements.
+            EndpointError: All clients together use too many elements.
+
         """
         views = await self._selections.select(self._wanted, frames=self._request.format == wire.FORMAT_FRAMES)
         self._opened = True
@@ -244,26 +264,30 @@ class SubscribeCall:
             self._leave(place)
 
     def give_up(self) -> None:
-        """End a call that is too slow for steps: release all now, end when the client reads."""
+        """End a call that is too slow for the steps.
+
+        It leaves its blocks now. The stream ends when the client reads.
+        """
         self.late = True
         self.close()
         self._wake.set()
 
     def wake(self) -> None:
-        """Wake the stream to look for updates."""
+        """Wake the stream, so that it checks for updates."""
         self._wake.set()
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch these sources to their present blocks, after a reload."""
+        """Switch these sources to their new blocks, after a reload."""
         self._moved |= dict.fromkeys(place for place in self._wanted if place.source in sources)
         self._wake.set()
 
     def mark(self, step: Step) -> asyncio.Future[None]:
-        """Queue a step's marker, to be sent after the step's changes.
+        """Queue the marker of a step, which is sent after the changes of the step.
 
         Returns:
             A future that is done when the marker was sent or the call has ended. Before
-            :meth:`open` has returned, which takes seconds for a large layout, it is done at once.
+                :meth:`open` has
+            returned, which takes seconds for a large layout, it is done at once.
 
         """
         sent = asyncio.get_running_loop().create_future()
@@ -277,13 +301,15 @@ class SubscribeCall:
     async def messages(self) -> AsyncIterator[bytes]:
         """Yield serialised SubscribeResponses without end.
 
-        EndpointError: the client is too slow for steps or writes.
+        Raises:
+            EndpointError: The client is too slow for the steps or the writes.
+
         """
         while not self.late:
             for inward in self._inward.values():
                 if inward.failure:
                     raise EndpointError(inward.failure)
-            self._wake.clear()  # before looking
+            self._wake.clear()  # before the checks, so that no wake-up is lost
             batch, whole = self._batch()
             if self._step_marks and whole and not self._moved:
                 step, sent = self._step_marks.popleft()
@@ -302,9 +328,9 @@ class SubscribeCall:
         raise EndpointError("the client did not read a step in time: it is too slow for the rate of steps")
 
     def _batch(self) -> tuple[bytes, bool]:
-        """Return the present updates up to a bound, and whether these are all.
+        """Return the updates that are waiting, up to a limit, and whether these are all.
 
-        Writes come first, then the updates of the blocks in turn.
+        Writes come first. Then the blocks take turns.
         """
         parts: list[bytes] = []
         size, now_s = 0, self._clock()
@@ -315,7 +341,7 @@ class SubscribeCall:
                 parts.append(field(UPDATES, written))
         waiting = deque(one for one in self._blocks.values() if self._open(one))
         waiting.rotate(self._turn)
-        self._turn += 1  # else a block with long updates would starve the others
+        self._turn += 1  # otherwise a block with long updates would starve the others
         most = len(parts) + BATCH_UPDATES
         while waiting and size < BATCH_BYTES and len(parts) < most:
             update = waiting[0].next(now_s)
@@ -329,15 +355,15 @@ class SubscribeCall:
         return b"".join(parts), not (waiting or any(inward.waits for inward in self._inward.values()))
 
     def _open(self, updates: BlockUpdates) -> bool:
-        """Return whether a block's updates may be sent now.
+        """Return whether the updates of a block may be sent now.
 
-        In virtual time those of a block on the instance's clock wait for the end of a step.
+        In virtual time, the updates of a block on the instance's clock wait for the end of a step.
         """
         held = self._virtual_time.on and updates.view.block.attributes.stepped
         return not held or bool(self._step_marks) or updates.follower.frame is None
 
     def _ring(self, updates: BlockUpdates) -> None:
-        """Wake the stream, because a block has something new."""
+        """Wake the stream, because a block has a new frame or event."""
         if self._open(updates):
             self._wake.set()
 
@@ -353,7 +379,10 @@ class SubscribeCall:
             handle.cancel()
 
     async def _go_over(self, place: SourceDirection) -> bytes:
-        """Follow a source's present block, or report that it has none, after all of the old one."""
+        """Follow the new block of a source, or report that the source has none.
+
+        Call this when all updates of the old block were sent.
+        """
         self._leave(place)
         try:
             (view,) = await self._selections.select(
@@ -392,12 +421,20 @@ def _set(sent: asyncio.Future[None]) -> None:
 
 
 class SubscribeCalls:
-    """The call Subscribe; has all open ones follow steps and reloads."""
+    """Serves the call Subscribe; passes steps and reloads on to all open calls."""
 
     def __init__(
         self, selections: Selections, wake_ups: WakeUps, timeline: Timeline, open_streams: OpenStreams
     ) -> None:
-        """``open_streams`` counts these streams together with those of other services."""
+        """Create the call.
+
+        Args:
+            selections: Makes and caches the views of all clients.
+            wake_ups: Wakes the streams.
+            timeline: The instance's time.
+            open_streams: Counts the open streams of all services together.
+
+        """
         self._selections = selections
         self._wake_ups = wake_ups
         self._virtual_time = timeline.virtual_time
@@ -417,17 +454,17 @@ class SubscribeCalls:
         return self._ended_updates + sum(subscription.updates for subscription in self._open)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Return the handler of the call, by name. Values are serialised where they are made."""
+        """Return the handler of the call, by name. The call serialises its messages itself."""
         return {"Subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, wire.SubscribeRequest.FromString)}
 
     async def subscribe(self, request: wire.SubscribeRequest, context: Context) -> AsyncIterator[bytes]:
         """Stream the present values, then their changes or every frame.
 
         Statuses:
-            NOT_FOUND: No such register.
-            INVALID_ARGUMENT: Too many registers, or options that are not valid.
-            RESOURCE_EXHAUSTED: Too many streams, too many registers of all clients together, or
-                the client is too slow for steps or writes.
+            NOT_FOUND: There is no such register.
+            INVALID_ARGUMENT: There are too many registers, or options are not valid.
+            RESOURCE_EXHAUSTED: There are too many streams, all clients together use too many
+                registers, or the client is too slow for the steps or the writes.
         """
         try:
             if len(self._open) >= MAX_STREAMS:
@@ -449,7 +486,7 @@ class SubscribeCalls:
             subscription.close()
 
     async def deliver(self, step: Step) -> None:
-        """Send a step's changes and its marker on all streams, and wait until they are sent."""
+        """Send the changes and the marker of a step on all streams, and wait until they are sent."""
         marks = {subscription.mark(step): subscription for subscription in self._open}
         if marks:
             _, late = await asyncio.wait(marks, timeout=PATIENCE_S)
@@ -457,11 +494,11 @@ class SubscribeCalls:
                 marks[mark].give_up()
 
     def release(self) -> None:
-        """Wake all streams to send values as they come, because time is real again."""
+        """Wake all streams. Time is real again, so values need no longer wait for steps."""
         for subscription in self._open:
             subscription.wake()
 
     def move(self, sources: Collection[str]) -> None:
-        """Switch the streams of these sources to their present blocks, after a reload."""
+        """Switch the streams of these sources to their new blocks, after a reload."""
         for subscription in self._open:
             subscription.move(sources)

@@ -1,7 +1,8 @@
-"""Tables of registers: a block's frames and writes as updates, packed by type for all subscribers of a table.
+"""Tables of registers: make updates of a block's frames and writes, packed by type.
 
-A table of registers, or of raw frames, is a view of a block. Numpy packs an image into one array
-for each type, and compares two images.
+A table of registers is a view of a block; raw frames are the other kind of view. Numpy packs an
+image into one array for each type, and compares two images. All subscribers to a table share its
+updates.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, 
     )
 )  # fmt: skip
 
-_QUALITY_BAD: Final = number(QUALITY, 0)  # as the last field it wins over the frame's own quality
+_QUALITY_BAD: Final = number(QUALITY, 0)  # appended to an update: the last occurrence of a field counts
 _CACHED: Final = 8
 _NO_PLACES: Final = np.zeros(0, "<u4")
 
@@ -63,12 +64,15 @@ _BITS: Final = {column: np.dtype(f"<u{kind.itemsize}") for column, kind in KINDS
 
 
 def column_of(element: ElementType) -> Column:
-    """Return the column of a type."""
+    """Return the column for values of a type."""
     return _BY_BASE.get(element.base) or _COLUMNS.get(scalar_codec(element).plain, Column.TEXT)
 
 
 class DecodedImage(NamedTuple):
-    """All elements of an image. ``invalid``: indices of registers whose bytes hold no value."""
+    """All elements of an image.
+
+    ``invalid`` has the indices of the registers whose bytes are not a valid value.
+    """
 
     arrays: Mapping[Column, Array]
     texts: tuple[str, ...]
@@ -79,7 +83,8 @@ class DecodedImage(NamedTuple):
 class _NumberGroup:
     """Numeric elements of one type.
 
-    ``bytes``: offsets of each element's bytes, the least significant first; shape (elements, size).
+    ``bytes`` has the offsets of each element's bytes, the least significant byte first. Its shape
+    is (elements, size).
     """
 
     slots: slice
@@ -89,7 +94,7 @@ class _NumberGroup:
 
 @dataclass(frozen=True, slots=True)
 class _SingleElement:
-    """An element that is decoded by itself. ``register``: index of its register."""
+    """An element that is decoded by itself; ``register`` is the index of its register."""
 
     column: Column
     slot: int
@@ -102,7 +107,8 @@ class _SingleElement:
 class _SingleValues(NamedTuple):
     """Values of the elements that are decoded one by one.
 
-    ``invalid``: indices of the elements without a value; ``places``: those of their registers.
+    ``invalid`` has the indices of the elements without a valid value, ``places`` those of their
+    registers.
     """
 
     numbers: Mapping[Column, Mapping[int, Any]]
@@ -112,13 +118,16 @@ class _SingleValues(NamedTuple):
 
 
 class Columns:
-    """How registers map to columns. Decoding caches unchanged values, so it is for one thread."""
+    """Maps registers to columns.
+
+    Use it only in one thread, because decoding caches unchanged values.
+    """
 
     def __init__(self, registers: Sequence[Register], order: ByteOrder) -> None:
         self.places: list[tuple[Column, int]] = [(Column.TEXT, 0)] * len(registers)
         """Column and first slot of each register."""
         self.sizes = dict.fromkeys(Column, 0)
-        """Slots of each column."""
+        """Number of slots of each column."""
         self._numbers: list[tuple[Column, _NumberGroup]] = []
         self._others: list[_SingleElement] = []
         groups: dict[tuple[Column, str], list[int]] = {}
@@ -143,7 +152,7 @@ class Columns:
         starts = np.repeat([other.offset for other in self._others], sizes).astype(np.intp)
         before = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes) if sizes else np.zeros(0, np.intp)
         self._watched = starts + np.arange(len(starts)) - before
-        self._owners = np.repeat(np.arange(len(sizes)), sizes)  # the element of each watched byte
+        self._owners = np.repeat(np.arange(len(sizes)), sizes)  # index of each watched byte's element
         self._seen: tuple[Array, _SingleValues] | None = None
 
     def _others_of(
@@ -157,7 +166,7 @@ class Columns:
                 yield _SingleElement(column, first + flat, place, decode, at, register.element.size)
 
     def place(self, column: Column, slot: int) -> int | None:
-        """Return the index of the register that has a slot; None: there is no such slot."""
+        """Return the index of the register at a slot, or None if there is no such slot."""
         if not 0 <= slot < self.sizes[column]:
             return None
         firsts, places = self._starts[column]
@@ -165,7 +174,7 @@ class Columns:
 
     @cached_property
     def _starts(self) -> Mapping[Column, tuple[list[int], list[int]]]:
-        """For each column, its registers' first slots in ascending order, and their indices."""
+        """For each column, the first slots of its registers in ascending order, and their indices."""
         found: dict[Column, tuple[list[int], list[int]]] = {column: ([], []) for column in Column}
         for place, (column, slot) in sorted(enumerate(self.places), key=lambda pair: pair[1][1]):
             found[column][0].append(slot)
@@ -173,7 +182,7 @@ class Columns:
         return found
 
     def touched(self, mask: bytes) -> dict[Column, Array]:
-        """Return the slots of the elements that have a bit set in a mask of the block."""
+        """Return the slots of the elements that have at least one bit set in a mask of the block."""
         arrays = self.decode_numbers(mask)
         found = {column: array.view(_BITS[column]) != 0 for column, array in arrays.items()}
         if self.sizes[Column.TEXT]:
@@ -183,7 +192,7 @@ class Columns:
         return {column: np.flatnonzero(hit) for column, hit in found.items() if hit.any()}
 
     def decode_numbers(self, image: bytes) -> dict[Column, Array]:
-        """Decode the columns of numbers and bits; elements with a decoder of their own are 0."""
+        """Decode the columns of numbers and bits. Elements that need their own decoder are 0."""
         data = np.frombuffer(image, np.uint8)
         arrays = {column: np.zeros(self.sizes[column], kind) for column, kind in KINDS.items() if self.sizes[column]}
         if Column.BOOL in arrays:
@@ -197,8 +206,9 @@ class Columns:
         """Encode values at valid slots into an image.
 
         Returns:
-            Indices into ``slots`` of the values that were not encoded: they do not fit, or need
-            an encoder of their own.
+            Indices into ``slots`` of the values that were not encoded: they do not fit, or they
+                need their
+            own encoder.
 
         """
         data, left = np.frombuffer(image, np.uint8), np.full(len(slots), column is not Column.BOOL)
@@ -228,7 +238,7 @@ class Columns:
         return DecodedImage(arrays, rest.texts, rest.places)
 
     def _rest(self, image: bytes, data: Array) -> _SingleValues:
-        """Decode the elements that need a decoder of their own, if their bytes have changed."""
+        """Decode the elements that need their own decoder, if their bytes have changed."""
         watched = data[self._watched]
         if self._seen is None:
             changed, before = (
@@ -256,9 +266,10 @@ class Columns:
 
 
 def pack(new: DecodedImage, old: DecodedImage | None = None, deadband: float = 0.0) -> bytes:
-    """Serialise as ``Values`` the elements whose bits differ from ``old``, or all without it.
+    """Serialise as ``Values`` the elements whose bits differ from ``old``, or all without ``old``.
 
-    Numbers that differ by no more than ``deadband`` are left out. Empty: nothing differs.
+    Numbers that differ by no more than ``deadband`` are left out. The result is empty if nothing
+    differs.
     """
     parts = []
     for column, values in new.arrays.items():
@@ -282,7 +293,7 @@ def pack(new: DecodedImage, old: DecodedImage | None = None, deadband: float = 0
 
 
 def pack_slots(values: DecodedImage, chosen: Mapping[Column, Array]) -> bytes:
-    """Serialise these slots as ``Values``."""
+    """Serialise the elements at these slots as ``Values``."""
     parts = []
     for column, slots in chosen.items():
         where = field(1, slots.astype("<u4").tobytes())
@@ -294,7 +305,10 @@ def pack_slots(values: DecodedImage, chosen: Mapping[Column, Array]) -> bytes:
 
 
 def merge(new: DecodedImage, old: DecodedImage, deadband: float) -> DecodedImage:
-    """Return what a receiver has after :func:`pack`: numbers left out keep their old value."""
+    """Return the values that a receiver has after :func:`pack`.
+
+    Numbers that were left out keep their old value.
+    """
     arrays = {}
     for column, values in new.arrays.items():
         slots = _differing(column, old.arrays[column], values, deadband)
@@ -304,7 +318,7 @@ def merge(new: DecodedImage, old: DecodedImage, deadband: float) -> DecodedImage
 
 
 def _differing(column: Column, old: Array, new: Array, deadband: float) -> Array:
-    """Return the slots that differ by bits: NaN equals NaN, and 0.0 differs from -0.0."""
+    """Return the slots whose bits differ: so NaN equals NaN, and 0.0 differs from -0.0."""
     differs = old.view(_BITS[column]) != new.view(_BITS[column])
     if deadband and column is not Column.BOOL:
         with np.errstate(invalid="ignore", over="ignore"):
@@ -326,24 +340,38 @@ def _numbers(registers: Sequence[Register], code: str, order: ByteOrder, slots: 
 
 
 def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:
-    """Return each bit's byte offset and its shift."""
+    """Return the byte offset and the shift of each bit."""
     places = [(register.offset + byte, bit) for register in registers for byte, bit in bit_positions(register)]
     where, shifts = zip(*places, strict=True)
     return np.array(where, np.intp), np.array(shifts, np.uint8)
 
 
 class UpdateMessage(NamedTuple):
-    """A serialised ``Update`` in two parts. ``body``: the changes; empty if there are none."""
+    """A serialised ``Update`` in two parts.
+
+    ``body`` has the changes; it is empty if there are none.
+    """
 
     head: bytes
     body: bytes
 
 
 class WriteUpdates:
-    """Encodes writes to a table's registers, once for all subscribers. For the loop's thread."""
+    """Encodes the writes to a table's registers, once for all subscribers.
+
+    Use it only in the event loop's thread.
+    """
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], columns: Columns) -> None:
-        """``number`` is that of the table."""
+        """Begin without a command.
+
+        Args:
+            number: Number of the table.
+            block: The block that is written to.
+            registers: The registers of the table.
+            columns: The columns of the table.
+
+        """
         self._number = number
         self._block = block
         self._columns = columns
@@ -354,10 +382,11 @@ class WriteUpdates:
         self._update = b""
 
     def of(self, event: Event) -> bytes:
-        """Return the serialised ``Update`` of an accepted write; empty: it is not in the table.
+        """Return the serialised ``Update`` of an accepted write, or nothing if the table lacks it.
 
-        If an element is written in part, the rest is taken from the frame before the command. An
-        element that the command's next event completes is left to that event.
+        If an element is written in part, the rest of its value comes from the frame before the
+        command. If the command's next event completes the element, only the update of that event
+        has it.
         """
         if event.number != self._event:
             self._event, self._update = event.number, self._make(event)
@@ -384,13 +413,21 @@ class WriteUpdates:
 
 
 class Selection:
-    """A table of registers of one block; it makes updates of frames, once for all subscribers.
+    """A table of registers of one block; makes updates of frames, once for all subscribers.
 
-    After creation it is for the event loop's thread.
+    After it was created, use it only in the event loop's thread.
     """
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], *, inward: bool = False) -> None:
-        """``inward``: the table is for writes to the registers."""
+        """Create the table.
+
+        Args:
+            number: Number of the table.
+            block: The block of the registers.
+            registers: The registers of the table.
+            inward: The table is for writes to the registers.
+
+        """
         self.number = number
         self.inward = inward
         self.block = block
@@ -403,7 +440,7 @@ class Selection:
 
     @cached_property
     def writes(self) -> WriteUpdates:
-        """Makes the updates about writes to the registers."""
+        """The encoder of the writes to the registers."""
         return WriteUpdates(self.number, self.block, self.registers, self.columns)
 
     @cached_property
@@ -423,7 +460,7 @@ class Selection:
         return table.SerializeToString()
 
     def decode(self, frame: Frame) -> DecodedImage:
-        """Decode a frame as consumers see it, with injections; cached."""
+        """Decode a frame as consumers see it, with injections. The result is cached."""
         found = self._decoded.get(frame.number)
         if found is None:
             found = self._decoded[frame.number] = self.columns.decode(frame.image)
@@ -431,7 +468,7 @@ class Selection:
         return found
 
     def update(self, frame: Frame, before: Frame | None = None) -> UpdateMessage:
-        """Return an ``Update`` with the changes since ``before``, or with everything; cached.
+        """Return an ``Update`` with the changes since ``before``, or with everything. It is cached.
 
         Its quality is the one that the frame was published with.
         """
@@ -448,9 +485,17 @@ class Selection:
     def update_beyond(
         self, frame: Frame, before: Frame, sent: DecodedImage, deadband: float
     ) -> tuple[UpdateMessage, DecodedImage]:
-        """Return an ``Update`` with a dead-band, and what the receiver has after it.
+        """Return an ``Update`` with the changes that exceed a dead-band.
 
-        ``sent``: what the receiver has now.
+        Args:
+            frame: The new frame.
+            before: The frame of the last update.
+            sent: The values that the receiver has now.
+            deadband: The largest difference that is left out.
+
+        Returns:
+            The update, and the values that the receiver has after it.
+
         """
         new = self.decode(frame)
         return self._update(frame, before, new, sent, deadband), merge(new, sent, deadband)
@@ -474,7 +519,10 @@ class Selection:
         return pack(self.columns.decode(frame.raw))
 
     def injected(self, frame: Frame) -> Array:
-        """Return the indices of registers under an injection over ``/out``; cached by event."""
+        """Return the indices of the registers that an injection over ``/out`` covers.
+
+        The result is cached for each event.
+        """
         if frame.effective is None:
             return _NO_PLACES
         found = self._injected_places.get(frame.event)  # injections change only with an event
@@ -496,7 +544,7 @@ class Selection:
 
     @cached_property
     def _extents(self) -> tuple[Array, ...]:
-        """For each register, its first byte, the byte after its last, and a single bit's mask."""
+        """For each register, its first byte, the byte after its last, and the mask of a single bit."""
         starts = [register.offset for register in self.registers]
         stops = [register.offset + register.size for register in self.registers]
         masks = [0 if register.bit is None or register.dims else 1 << register.bit for register in self.registers]
@@ -525,7 +573,7 @@ class RawFrames:
         ).SerializeToString()
 
     def update(self, frame: Frame, before: Frame | None = None) -> UpdateMessage:  # noqa: ARG002  a frame is always whole
-        """Return an ``Update`` with the image, and with the original one under an injection."""
+        """Return an ``Update`` with the image, and with the original image if injections change it."""
         found = self._updates.get(frame.number)
         if found is None:
             body = field(IMAGE, frame.image) if frame.source_ns else b""
@@ -540,7 +588,7 @@ View = Selection | RawFrames
 
 
 def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
-    """Return a frame's serialised ``Update`` without values."""
+    """Return the serialised ``Update`` of a frame, without values."""
     return wire.Update(
         table=table,
         frame=frame.number,
@@ -556,7 +604,7 @@ def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
 
 
 def head_of(table: int, event: Event) -> bytes:
-    """Return a serialised ``Update`` for an event, without values."""
+    """Return the serialised ``Update`` of an event, without values."""
     return wire.Update(
         table=table,
         frame=event.frame,
@@ -569,12 +617,12 @@ def head_of(table: int, event: Event) -> bytes:
 
 
 def stale_fields(reason: str) -> bytes:
-    """Return the addition to a frame's update that reports the frame as stale."""
+    """Return the fields to append to a frame's update to report the frame as stale."""
     return _QUALITY_BAD + field(REASON, reason.encode())
 
 
 def describe(register: Register, found: wire.Register, column: Column | None = None, slot: int = 0) -> None:
-    """Fill in a message with a register's description."""
+    """Fill in a message with the description of a register."""
     found.path, found.type = register.path, register.type
     found.offset, found.size, found.count = register.offset, register.size, register.count
     found.column = int(column or column_of(register.element))  # type: ignore[assignment]

@@ -1,4 +1,4 @@
-"""The call Write, and what calls share that send values: they come by path, or packed by a table's slots."""
+"""The call Write, and helpers for all calls that receive values, by path or by a table's slots."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shmio.segment import EventKind
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_VALUES: Final = 4096
-"""Bound of one command's values."""
+"""Maximum number of values in one command."""
 MAX_TIMEOUT_MS: Final = 86_400_000
 
 FIELDS: Final = {column: wire.Values.DESCRIPTOR.fields_by_number[column].name for column in Column}
@@ -37,7 +37,7 @@ _OUTCOMES: Final = {
 
 
 class WriteCalls:
-    """The call Write."""
+    """Serves the call Write."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -53,8 +53,9 @@ class WriteCalls:
         After an error status nothing was sent.
 
         Statuses:
-            NOT_FOUND: No such register.
-            INVALID_ARGUMENT: A value does not fit, several sources, or too many values.
+            NOT_FOUND: There is no such register.
+            INVALID_ARGUMENT: A value does not fit, there are too many values, or they are for
+                several sources.
             FAILED_PRECONDITION: A register is not writable, or the source does not answer.
         """
         try:
@@ -75,15 +76,19 @@ def outcome(kind: EventKind, reason: str) -> wire.Outcome:
 
 
 async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
-    """Read values by path, in time slices; return their source, and the values.
+    """Read values by path, in time slices.
+
+    Returns:
+        The source of the values, and the values by register path.
 
     Raises:
-        PathError: No such register.
-        ValueRangeError: A value does not fit, several sources, too many values, or none.
+        PathError: There is no such register.
+        ValueRangeError: A value does not fit, there are none or too many, or they are for several
+            sources.
         CommandError: A path ends in ``/out``.
 
     """
-    if len(assignments) > MAX_VALUES:  # before looking at any
+    if len(assignments) > MAX_VALUES:  # checked before any value is read
         raise ValueRangeError(
             f"{len(assignments)} values, at most {MAX_VALUES} are allowed: write whole arrays, or fewer at once"
         )
@@ -106,14 +111,24 @@ async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, obj
 
 
 def plain(value: wire.Value, register: Register) -> object:
-    """Convert a value to Python. ValueRangeError: it is missing, or a text does not fit."""
+    """Convert a value to Python.
+
+    Raises:
+        ValueRangeError: The value is missing, or a text does not fit the register.
+
+    """
     if value.WhichOneof("kind") == "text" and (register.dims or wire_type(register) != "string"):
         return from_text(value.text, register)
     return value_from_wire(value, register.path)
 
 
 def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
-    """Read values by slot as values by path. ValueRangeError: they do not fit the table."""
+    """Convert values by slot to values by path.
+
+    Raises:
+        ValueRangeError: The values do not fit the table.
+
+    """
     found: dict[str, object] = {}
     for column, name in FIELDS.items():
         if not values.HasField(name):
@@ -130,7 +145,12 @@ def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
 
 
 def _path(selection: Selection, column: Column, slot: int) -> str:
-    """Return the path of the register or element at a slot. ValueRangeError: no such slot."""
+    """Return the path of the register or element at a slot.
+
+    Raises:
+        ValueRangeError: There is no such slot.
+
+    """
     place = selection.columns.place(column, slot)
     if place is None:
         raise ValueRangeError(f"{column.name.lower()}s: the table has no slot {slot}")

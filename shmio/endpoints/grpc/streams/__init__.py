@@ -1,1 +1,1 @@
-"""From a block's frames to clients' streams: feeds, conflation, back-pressure."""
+"""From a block's frames to clients' streams: feeds, conflation, and back-pressure."""

@@ -1,4 +1,4 @@
-"""Back-pressure: bounds on what waits for clients, and when a block need not be read."""
+"""Back-pressure: limits what waits for clients, and skips frames if all clients are busy."""
 
 from __future__ import annotations
 
@@ -10,31 +10,34 @@ from typing import Final, Protocol
 from shmio.segment import Block, FrameFollower
 
 WINDOW_S: Final = 0.25
-"""Length of the window in which a client's losses are compared with its values."""
+"""Period for which a client's lost values are compared with the values offered to it."""
 BEHIND_S: Final = 5.0
-"""A client that is far behind is tried again at the next multiple of this time.
+"""A client that is far behind gets another chance at the next multiple of this time.
 
-Its losses while it is behind do not show how fast it could be. All clients are tried at the
-same time, because a frame that is read for one of them is available to all.
+The values that it loses while it is behind do not show how fast it could be. All clients get their
+chance at the same time, because a frame that is read for one of them is available to all.
 """
 PART: Final = 3
-"""A client that loses more than one value in this many is far behind."""
+"""A client that loses more than one in this many values is far behind."""
 LATE_S: Final = 0.002
-"""A value for a client that is far behind is dropped after this time if there is a newer one."""
+"""A value for a client that is far behind is dropped after this time, if there is a newer one."""
 
 
 class LossMonitor:
-    """Decides from one client's lost values whether it is far behind. Times in s, on any clock."""
+    """Decides by the values that a client loses whether the client is far behind.
+
+    Times are in s, of any clock.
+    """
 
     def __init__(self) -> None:
         self.behind = False
-        """Whether the client is far behind: queued values would only reach it later."""
+        """True if the client is far behind: if values were queued, they would only reach it later."""
         self._offered = 0
         self._lost = 0
         self._until_s = 0.0
 
     def offer(self, now_s: float) -> None:
-        """Count one value for the client; at the end of a window decide anew."""
+        """Count one value for the client; at the end of a period, decide again."""
         if now_s >= self._until_s:
             self.behind = not self.behind and PART * self._lost > self._offered
             self._offered = self._lost = 0
@@ -42,19 +45,19 @@ class LossMonitor:
         self._offered += 1
 
     def lose(self, count: int) -> None:
-        """Count values that were dropped in favour of newer ones."""
+        """Count values that were dropped because there were newer ones."""
         self._lost += count
 
     def skip(self, count: int) -> None:
-        """Count values that were never queued; they count as offered and as lost."""
+        """Count values that were never queued, as offered and as lost."""
         self._offered += count
         self._lost += count
 
 
 BOUND_BYTES: Final = 8 << 20
-"""Limit of the values, and of the events, that wait in one stream."""
+"""Maximum size of the values, and of the events, that wait in one stream."""
 TOTAL_BYTES: Final = 256 << 20
-"""Limit of all messages that wait in all streams; beyond it each stream has an equal share."""
+"""Maximum size of all messages that wait in all streams; beyond it, each stream has an equal share."""
 
 
 class TotalBacklog:
@@ -65,12 +68,12 @@ class TotalBacklog:
         self.streams = 0
 
     def over(self, size: int) -> bool:
-        """Return whether all is too much and a stream of ``size`` bytes is over its share."""
+        """Return whether the total is too large and a stream of ``size`` bytes exceeds its share."""
         return self.size > TOTAL_BYTES and size > TOTAL_BYTES // max(1, self.streams)
 
 
 class Backlog:
-    """Count and size of the messages of one kind that wait in one stream."""
+    """Number and size of the messages of one kind that wait in one stream."""
 
     def __init__(self, total: TotalBacklog) -> None:
         self.count = 0
@@ -78,7 +81,7 @@ class Backlog:
         self._total = total
 
     def full(self, message: Sized, bound: int, bound_bytes: int | None = None) -> bool:
-        """Return whether one more message would exceed a bound. A single message never does."""
+        """Return whether one more message would exceed a limit. A single message never does."""
         most = BOUND_BYTES if bound_bytes is None else bound_bytes
         size = self.size + len(message)
         return self.count > 0 and (self.count >= bound or size > most or self._total.over(size))
@@ -91,7 +94,7 @@ class Backlog:
         self._total.size += size
 
     def remove(self, message: Sized) -> None:
-        """Count out a message that was sent or dropped."""
+        """Count a message that was sent or dropped."""
         size = len(message)
         self.count -= 1
         self.size -= size
@@ -99,31 +102,31 @@ class Backlog:
 
 
 CATCH_UP_FRAMES: Final = 48
-"""A feed that is further behind than this skips to the newest frame: the rest is conflated.
+"""A feed that is further behind than this, or has no listeners, skips to the newest frame.
 
-A feed without listeners also skips. The bound is a number of frames. The MQTT bridge has a
-time instead, because it falls behind only if it is delayed itself. Here frames that clients
-are too slow for wait in the ring, up to the number that an outbox has room for.
+The limit is a number of frames: an outbox has room for so many. Frames for which the clients are
+too slow wait in the ring. The MQTT bridge has a time limit instead, because it falls behind only if
+it is delayed itself.
 """
 FEW_FRAMES: Final = 8
-"""A client that is behind gets this many frames, if they are new, so that it need not wait."""
+"""Number of new frames that a client far behind gets at once, so that it need not wait for more."""
 LOOK_S: Final = 0.02
-"""Frames are read at least this often, even if all clients are busy: quality may be bad."""
+"""Longest time between two reads while all clients are busy; the quality may have turned bad."""
 
 
 class Stream(Protocol):
     """A client's stream, as back-pressure sees it."""
 
     refills: dict[Callable[[], object], None]
-    """Functions that are called once, as soon as the stream has nothing to send."""
+    """Functions to call once, as soon as the stream has nothing to send."""
 
     @property
     def busy(self) -> bool:
-        """Whether messages wait, or the client is still taking the last one."""
+        """True if messages wait, or if the client has not taken the last one yet."""
 
     @property
     def behind(self) -> bool:
-        """Whether the client loses so many values that it is far behind."""
+        """True if the client loses so many values that it is far behind."""
 
     def skip(self, frames: int, topics: int) -> None:
         """Count frames that were not delivered to ``topics`` topics of a slow client."""
@@ -132,12 +135,18 @@ class Stream(Protocol):
 class BackPressure:
     """Back-pressure for the streams that follow one block.
 
-    The feed reads no frames while all of its streams are busy. As soon as a stream can take
-    more, the feed continues with the newest frames.
+    While all of its streams are busy, the feed reads no frames. As soon as a stream can take more,
+    the feed continues with the newest frames.
     """
 
     def __init__(self, block: Block, refill: Callable[[], object]) -> None:
-        """``refill`` is called when a stream can take more."""
+        """Begin without streams.
+
+        Args:
+            block: The block that the streams follow.
+            refill: Called when a stream can take more.
+
+        """
         self._block = block
         self._refill = refill
         self._streams: Counter[Stream] = Counter()
@@ -160,7 +169,8 @@ class BackPressure:
     def passes(self) -> bool:
         """Return whether the feed should read nothing now, because all streams are busy.
 
-        Busy streams call ``refill`` later. ``LOOK_S`` after the last read the answer is False.
+        A busy stream calls ``refill`` later. When the last read was more than ``LOOK_S`` ago, the
+        answer is False.
         """
         if not self._streams:
             return False
@@ -174,7 +184,7 @@ class BackPressure:
         return time.monotonic() <= self._until_s
 
     def skip(self, follower: FrameFollower) -> None:
-        """Skip the frames that are too many, or too old for the streams."""
+        """Skip the frames that are too many or too old for the streams."""
         passing, self._passing = self._passing, False
         self._until_s = time.monotonic() + LOOK_S
         behind = passing and all(stream.behind for stream in self._streams)

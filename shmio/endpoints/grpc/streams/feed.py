@@ -1,4 +1,4 @@
-"""Follows one block: one change scan per frame, and one encoding per change for all listeners."""
+"""Follows one block: scans each frame once for changes, and encodes each change once."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from shmio.segment.changed_registers import ChangeScan, entries
 
 
 class Moment(NamedTuple):
-    """A step's number, and the simulation time after it, in ns since the instance's start."""
+    """A step's number, and the simulation time after the step, in ns since the instance's start."""
 
     number: int
     clock_ns: int
 
 
 class DeliveredImage(NamedTuple):
-    """A block's image after a step; ``raw``: as the source delivered it, without injections."""
+    """The image of a block after a step; ``raw`` is the image without injections."""
 
     number: int
     clock_ns: int
@@ -31,21 +31,22 @@ class DeliveredImage(NamedTuple):
 
 
 class VirtualTime:
-    """Whether time is virtual (``on``), and the step that was delivered last (``moment``).
+    """The state of virtual time, for the feeds.
 
-    In virtual time, values of blocks on the instance's clock are delivered step by step.
-    For the event loop's thread.
+    ``on`` is True while time is virtual. ``moment`` is the step that was delivered last. In virtual
+    time, the values of blocks on the instance's clock are delivered step by step. Use it only in
+    the event loop's thread.
     """
 
     def __init__(self) -> None:
         self.on = False
         self.look: Callable[[], object] = lambda: None
-        """Adopts steps that other programs have made; set by the timeline."""
+        """Adopts the steps that other programs have made; the timeline sets this function."""
         self.moment = Moment(0, 0)
 
 
 class Listener(Protocol):
-    """A stream's subscription to one subject; called in the event loop's thread."""
+    """A stream's subscription to one subject. The event loop's thread calls the methods."""
 
     @property
     def stream(self) -> Stream:
@@ -55,41 +56,53 @@ class Listener(Protocol):
     """Number of the frame whose value the stream already has."""
 
     def deliver(self, message: Sized, at_s: float | None = None) -> None:
-        """Take one message. ``at_s``: its time by the topic's clock, in s; default: now."""
+        """Add one message to the stream.
+
+        Args:
+            message: The message.
+            at_s: Time of the message, in s of the monotonic clock; None: now.
+
+        """
 
     def keep(self, message: Sized) -> None:
-        """Queue a message of a step; such a message must not be dropped."""
+        """Queue a message of a step, which must not be dropped."""
 
     def lose(self) -> None:
-        """Drop the messages that were not sent yet, because quality has turned bad."""
+        """Drop the messages that were not sent yet, because the quality has turned bad."""
 
 
 class _Channel:
-    """A subject that has listeners: how a frame becomes a message, and who gets it."""
+    """A subject that has listeners: encodes its value, and knows who gets it."""
 
     def __init__(self, subject: Subject, slot: int) -> None:
-        """``slot``: the channel's index in the feed's table."""
+        """Create a channel without listeners.
+
+        Args:
+            subject: The subject.
+            slot: Index of the channel in the feed's table.
+
+        """
         self.encode = subject.encode
         self.listeners: dict[Listener, None] = {}  # in the order in which they came
         self.slot = slot
         first = subject.registers[0]
         self.order = first.offset, first.bit or 0, subject.path, subject.wire
-        """Sort key: the channels that a step has changed are delivered in the block's order."""
+        """Sort key: the changes of a step are delivered in the order of the block's registers."""
         self.changed = subject.changed
         self.entries = b"" if self.changed else entries(subject.registers, slot)
 
 
 class _ChannelTable(NamedTuple):
-    """All channels of a block, and the change scan over them."""
+    """All channels of a block, and the scan that finds the changed ones."""
 
     slots: tuple[_Channel | None, ...]
     scan: ChangeScan
     apart: tuple[_Channel, ...]
-    """Channels that decide by a function of their own whether they have changed."""
+    """Channels whose subject has its own function to compare two images."""
 
     @classmethod
     def of(cls, channels: Collection[_Channel], slots: int) -> _ChannelTable:
-        """Build the table of these channels. ``slots``: its length; some slots may be free."""
+        """Build the table of these channels; ``slots`` is its length, and some slots may be free."""
         places: list[_Channel | None] = [None] * slots
         for channel in channels:
             places[channel.slot] = channel
@@ -98,14 +111,15 @@ class _ChannelTable(NamedTuple):
 
 
 TURN_FRAMES: Final = 8
-"""Frames that are delivered before the event loop serves the streams."""
+"""Frames that are delivered in a row, before the event loop serves the streams."""
 
 
 class Feed:
-    """Delivers the changes of one block's registers to listeners while quality is good.
+    """Delivers the changes of one block's registers to listeners, while the quality is good.
 
-    After bad quality every register is delivered again. In virtual time the feed of a block on
-    the instance's clock is *held*: only :meth:`step` delivers. For the event loop's thread.
+    After bad quality, the feed delivers every register again. In virtual time, the feed of a block
+    on the instance's clock is *held*: only :meth:`step` delivers. Use it only in the event loop's
+    thread.
     """
 
     def __init__(
@@ -116,21 +130,30 @@ class Feed:
         on_quality: Callable[[str, bool], None],
         virtual_time: VirtualTime | None = None,
     ) -> None:
-        """``writer``: this process's command queue. ``virtual_time``: default: time is real."""
+        """Create a feed; :meth:`start` starts it.
+
+        Args:
+            block: The block to follow.
+            writer: Number of this process's command queue.
+            wake_ups: Wakes the feed when the block has a new frame or event.
+            on_quality: Called with the source's name, and whether its quality is good.
+            virtual_time: The state of virtual time; None: time is real.
+
+        """
         self.block = block
         self.commands = CommandClient(block, writer, wake_ups, self._stamp)
-        """The way into the block: commands to its source."""
+        """Sends commands to the block's source."""
         self.messages = 0
         self._virtual_time = virtual_time or VirtualTime()
         self._held = self._virtual_time.on and block.attributes.stepped
-        self._stepped = False  # whether a step was delivered since the feed is held
-        self._shown: Frame | DeliveredImage | None = None  # delivered last; None: quality is bad
-        self._good = False  # as last reported
+        self._stepped = False  # whether a step was delivered since the feed has been held
+        self._shown: Frame | DeliveredImage | None = None  # the last delivery; None while the quality is bad
+        self._good = False  # the quality that was reported last
         self._loop = asyncio.get_running_loop()
         self._on_quality = on_quality
         self._channels: dict[Subject, _Channel] = {}
         self._back_pressure = BackPressure(block, self._refill)
-        self._free: list[int] = []  # slots
+        self._free: list[int] = []  # unused slots
         self._table = _ChannelTable.of((), 0)
         self._outdated = False
         self._owed: dict[Listener, _Channel] = {}  # listeners that wait for a good value
@@ -140,12 +163,12 @@ class Feed:
 
     @property
     def alive(self) -> bool:
-        """Whether the block and its events are being followed, or the block has retired."""
+        """True while the feed follows the block and its events, or if the block has retired."""
         return (self._reader.alive or self.block.retired) and self.commands.alive
 
     @property
     def over(self) -> bool:
-        """Whether the feed has ended, has no listeners left, and no commands in flight."""
+        """True if the feed has ended, and has no listeners and no commands in flight."""
         return not (self._reader.alive or self._channels) and self.commands.over
 
     def start(self) -> None:
@@ -153,7 +176,7 @@ class Feed:
         if self._held:
             self._adopt(self.block.latest())
         self._follower.restart()
-        self.commands.start()  # first: a write is delivered before the frame after it
+        self.commands.start()  # first, so that a write is delivered before the frame that shows it
         self._reader.start()
 
     def stop(self) -> None:
@@ -162,7 +185,7 @@ class Feed:
         self.commands.stop()
 
     def listen(self, subject: Subject, listener: Listener) -> None:
-        """Add a listener; it gets the current value at once, or as soon as that is good."""
+        """Add a listener. It gets the current value at once, or as soon as the quality is good."""
         channel = self._channels.get(subject)
         if channel is None:
             slot = self._free.pop() if self._free else len(self._channels)
@@ -175,7 +198,7 @@ class Feed:
         self._settle()
 
     def leave(self, subject: Subject, listener: Listener) -> None:
-        """Remove a listener; the channel ends with its last one."""
+        """Remove a listener. The last listener's removal ends the channel."""
         self._owed.pop(listener, None)
         channel = self._channels[subject]
         del channel.listeners[listener]
@@ -183,22 +206,25 @@ class Feed:
         if not channel.listeners:
             del self._channels[subject]
             self._free.append(channel.slot)
-            if not self._outdated:  # once for all listeners that leave together
+            if not self._outdated:  # rebuild once for all listeners that leave together
                 self._outdated = True
                 self._loop.call_soon(self._rebuild)
 
     def tell_again(self, subject: Subject) -> None:
-        """Deliver a subject's value again, because it has changed without a new frame."""
+        """Deliver the value of a subject again, because it has changed without a new frame."""
         if channel := self._channels.get(subject):
             self._owed |= dict.fromkeys(channel.listeners, channel)
             self._settle()
 
     def hold(self) -> None:
-        """Deliver only by :meth:`step` from now on, if the block is on the instance's clock."""
+        """If the block is on the instance's clock, deliver only by :meth:`step` from now on."""
         self._held = self.block.attributes.stepped
 
     def release(self) -> None:
-        """Deliver every frame again, from the newest one on: it may be newer than the last step."""
+        """Deliver every frame again.
+
+        The newest one comes first, as it may be newer than the last step.
+        """
         if not self._held:
             return
         self._held = self._stepped = False
@@ -207,9 +233,9 @@ class Feed:
         self._settle()
 
     def step(self) -> None:
-        """Deliver what a step has changed: the newest frame against the values delivered last.
+        """Deliver the changes of a step: where the newest frame differs from the last delivery.
 
-        The order is that of the block's registers.
+        They are in the order of the block's registers.
 
         Raises:
             SegmentError: No frame can be read.
@@ -235,7 +261,7 @@ class Feed:
                 listener.keep(message)
 
     def _adopt(self, frame: Frame | None) -> None:
-        """Deliver the first good image as it is, if no step was delivered yet."""
+        """Deliver the first good image, if no step was delivered yet."""
         if self._held and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
             self._shown = DeliveredImage(*self._virtual_time.moment, frame.image, frame.raw)
             self._settle()
@@ -259,13 +285,13 @@ class Feed:
         self._owed.clear()
 
     def _turn_bad(self, frame: int) -> None:
-        """Drop the values of listeners from before ``frame``: quality is bad from it on."""
+        """Drop the listeners' values from before ``frame``: from that frame on, the quality is bad."""
         self._shown = None
         for channel in self._channels.values():
             for listener in channel.listeners:
                 if listener.since < frame:
                     listener.lose()
-                    listener.since = 0  # it may have dropped this value
+                    listener.since = 0  # the value may have been dropped
         self._tell(good=False)
 
     def _rebuild(self) -> None:
@@ -278,16 +304,16 @@ class Feed:
         return not self._held and self._back_pressure.passes()
 
     def _refill(self) -> None:
-        """Read on, because a busy stream can take more again."""
+        """Continue to read, because a busy stream can take more again."""
         if self._reader.alive:
             self._reader.read()
             if not self._back_pressure.passes():
                 self._reader.resume()
 
     def _read(self) -> bool:
-        """Read a few new frames; without new frames check the age of the last one."""
+        """Read a few new frames; if there are none, check the age of the last one."""
         follower = self._follower
-        if not self._held:  # a held feed delivers nothing from here
+        if not self._held:  # a held feed delivers only steps
             self._back_pressure.skip(follower)
         take = self._regard if self._held else self._take
         for count in range(TURN_FRAMES):
@@ -303,7 +329,10 @@ class Feed:
         return True
 
     def _take(self, frame: Frame) -> None:
-        """Deliver a good frame; turn bad if it is not good, or the one before was stale."""
+        """Deliver a good frame.
+
+        Turn bad if the frame is not good, or if the one before was stale.
+        """
         change = self._follower.take(frame)
         bad = self._follower.quality is Quality.BAD
         if self._shown is not None and (bad or change is QualityChange.GAP):
@@ -315,7 +344,7 @@ class Feed:
             self._shown = frame
 
     def _regard(self, frame: Frame) -> None:
-        """Report quality at once, even though values wait for a step."""
+        """Report a change of quality at once, although the values wait for a step."""
         self._tell(good=frame.quality is not Quality.BAD)
         self._adopt(frame)
 
@@ -325,7 +354,10 @@ class Feed:
             self._on_quality(self.block.source, good)
 
     def _show(self, shown: Frame | DeliveredImage | None, frame: Frame) -> None:
-        """Deliver what has changed since ``shown``, or all, to listeners without this frame."""
+        """Deliver the changes since ``shown`` to the listeners that do not have this frame yet.
+
+        If ``shown`` is None, deliver everything.
+        """
         for channel in self._changes(shown, frame):
             message = channel.encode(frame)
             if message is None:
@@ -339,7 +371,7 @@ class Feed:
             self._settle()
 
     def _changes(self, shown: Frame | DeliveredImage | None, frame: Frame) -> list[_Channel]:
-        """Return the channels whose bytes have changed since ``shown``; all, if that is None."""
+        """Return the channels whose bytes have changed since ``shown``; if that is None, all."""
         slots, scan, apart = self._table
         if shown is None:
             return [channel for channel in slots if channel]
@@ -347,7 +379,7 @@ class Feed:
         return changes + [channel for channel in apart if channel.changed and channel.changed(shown, frame)]
 
     def present(self) -> Frame | DeliveredImage | None:
-        """Return what a new listener would get; None: there is no good value."""
+        """Return the image that a new listener would get, or None if the quality is not good."""
         if self._held:
             self._virtual_time.look()
             return self._shown
@@ -355,12 +387,15 @@ class Feed:
         return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame
 
     def _stamp(self, event: Event) -> tuple[int, int]:
-        """Return an event's number and time: those of the last frame, or step in virtual time."""
+        """Return the number and time of an event.
+
+        These are those of its frame, or in virtual time those of the last step.
+        """
         return self._virtual_time.moment if self._held else Moment(event.frame, event.clock_ns)
 
 
 class Feeds(Mapping[str, Feed]):
-    """The feeds of a segment's blocks, by source name; for the event loop's thread."""
+    """The feeds of a segment's blocks, by source name. Use it only in the event loop's thread."""
 
     def __init__(
         self,
@@ -370,18 +405,18 @@ class Feeds(Mapping[str, Feed]):
         on_quality: Callable[[str, bool], None],
         virtual_time: VirtualTime | None = None,
     ) -> None:
-        """Start without feeds; see :meth:`start`.
+        """Begin without feeds; :meth:`start` starts them.
 
         Args:
             segment: The instance's shared memory.
-            writer: The command queue of this process.
-            wake_ups: Wakes the feeds when their blocks have something new.
+            writer: Number of this process's command queue.
+            wake_ups: Wakes the feeds when their blocks have new frames or events.
             on_quality: Called with a source's name, and whether its quality is good.
-            virtual_time: See :class:`Feed`.
+            virtual_time: The state of virtual time; None: time is real.
 
         """
         self._segment = segment
-        self._generation = -1  # of the segment when it was last read
+        self._generation = -1  # the segment's generation at the last read
         self._writer = writer
         self._wake_ups = wake_ups
         self._on_quality = on_quality
@@ -406,7 +441,7 @@ class Feeds(Mapping[str, Feed]):
 
     @property
     def alive(self) -> bool:
-        """Whether every block is being followed."""
+        """True if all feeds follow their blocks."""
         return all(feed.alive for feed in self._feeds.values())
 
     def start(self) -> None:
@@ -423,7 +458,7 @@ class Feeds(Mapping[str, Feed]):
         """Adopt what a reload has changed.
 
         Returns:
-            The sources that were added or removed, or have a new feed.
+            The sources that were added or removed, or that have a new feed.
 
         Raises:
             FormatError: The segment is damaged.
@@ -444,13 +479,13 @@ class Feeds(Mapping[str, Feed]):
 
     def _read(self) -> None:
         """Read the segment's blocks. Runs in a thread, because a large layout takes a second."""
-        self._generation = self._segment.generation  # first: a change during the read is noticed next time
+        self._generation = self._segment.generation  # first, so that the next call notices a change during the read
         self._segment.refresh()
         for block in self._segment.blocks.values():
             block.layout.members(""), block.layout.by_path
 
     def _prune(self) -> None:
-        """Forget the feeds that are over, and release what they hold of the segment."""
+        """Forget the feeds that are over, and release their parts of the segment."""
         over = [feed for feed in self._ended if feed.over]
         self._ended_messages += sum(feed.messages for feed in over)
         self._ended = [feed for feed in self._ended if feed not in over]

@@ -1,4 +1,4 @@
-"""Queues of clients' streams: states may be conflated, events may not."""
+"""The queues of clients' streams: states may be conflated, events may not."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.segment.events import EVENT_SLOTS
 
 TOPIC_BOUND: Final = 64
-"""Bound of one topic's waiting values: more than a feed delivers while it catches up."""
+"""Maximum number of one topic's waiting values: more than a feed delivers while it catches up."""
 STATE_BOUND: Final = 4096
-"""When this many values of a stream wait, a new value replaces all of its topic."""
+"""Number of a stream's waiting values from which on a new value replaces all of its topic."""
 EVENT_BOUND: Final = 2 * EVENT_SLOTS
-"""Bound of a stream's waiting events: twice what catching up can deliver at once."""
+"""Maximum number of a stream's waiting events: twice as many as catching up can deliver at once."""
 STEP_BOUND: Final = 16_384
-"""Bound of the values of one step that wait in a stream; none of them may be dropped."""
+"""Maximum number of values of one step that wait in a stream. None of them may be dropped."""
 STEP_BOUND_BYTES: Final = 64 << 20
-"""Bound of the size of these values, in bytes."""
+"""Maximum size of these values, in bytes."""
 
 Finish = Callable[[Any], bytes]
 
 
 class Outbox:
-    """A stream's waiting messages, in order of arrival, in one lane per topic.
+    """The waiting messages of a stream, in order of arrival, with one lane for each topic.
 
-    For the event loop's thread; it has one reader.
+    It has one reader. Use it only in the event loop's thread.
     """
 
     def __init__(self, total: TotalBacklog | None = None) -> None:
@@ -40,10 +40,10 @@ class Outbox:
         self.states, self.events = Backlog(total), Backlog(total)
         self.dropped = 0
         self.failure = ""
-        """Why the outbox failed; empty: it did not."""
+        """Why the outbox failed; empty if it has not failed."""
         self.on_failure: Callable[[], object] | None = None
-        """Called on failure: the stream itself may wait for ever if its client reads nothing."""
-        self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # with its time in s
+        """Called on failure; if the client does not read, the stream itself may wait for ever."""
+        self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # messages with their time in s
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
         self._ended = False
@@ -53,16 +53,16 @@ class Outbox:
         self._asked = False  # whether the reader waits
         self.losses = LossMonitor()
         self.refills: dict[Callable[[], object], None] = {}
-        """Functions that are called once, as soon as nothing waits."""
+        """Functions to call once, as soon as no message waits."""
 
     @property
     def busy(self) -> bool:
-        """Whether messages wait, or the client is still taking the last one."""
+        """True if messages wait, or if the client has not taken the last one yet."""
         return bool(self._waiting) or not self._asked
 
     @property
     def behind(self) -> bool:
-        """Whether the client loses so many values that it is far behind."""
+        """True if the client loses so many values that it is far behind."""
         return self.losses.behind
 
     def skip(self, frames: int, topics: int) -> None:
@@ -71,7 +71,14 @@ class Outbox:
         self.losses.skip(frames * topics)
 
     def add(self, lane: _Lane, message: Sized, at_s: float = 0.0) -> int:
-        """Queue a message and return its number. ``at_s``: its time, for :meth:`since`."""
+        """Queue a message, and return its number.
+
+        Args:
+            lane: The lane of the message.
+            message: The message.
+            at_s: Time of the message, for :meth:`since`, in s.
+
+        """
         number = self._next
         self._next = number + 1
         self._waiting[number] = lane, message, at_s
@@ -96,7 +103,7 @@ class Outbox:
             lane.drop()
 
     def close(self) -> None:
-        """Discard what waits, because the stream is over; it does not count as dropped."""
+        """Discard the waiting messages at the end of the stream. They do not count as dropped."""
         for lane, message, _ in self._waiting.values():
             lane.load.remove(message)
         self._waiting.clear()
@@ -104,18 +111,18 @@ class Outbox:
         self._tell()
 
     def end(self) -> None:
-        """End the reader after the messages that wait."""
+        """End the reader after the messages that wait now."""
         self._ended = True
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """End at once: drop what waits and whatever is added later."""
+        """End at once: drop the messages that wait, and those that are added later."""
         failed, self.failure = self.failure, self.failure or reason
         self.clear()
         self.end()
         self._tell()
         if self.on_failure and not failed:
-            asyncio.get_running_loop().call_soon(self.on_failure)  # later: the caller may iterate over what it leaves
+            asyncio.get_running_loop().call_soon(self.on_failure)  # later, as the caller may iterate over listeners
 
     def owe(self) -> None:
         """Make :meth:`taken` wait for all messages that were added so far."""
@@ -123,11 +130,11 @@ class Outbox:
 
     @property
     def owing(self) -> bool:
-        """Whether the client has yet to take messages that :meth:`taken` waits for."""
+        """True if the client has not yet taken all messages that :meth:`taken` waits for."""
         return self._taken < self._owed and not self.failure
 
     async def taken(self) -> None:
-        """Wait until the client has taken all messages up to :meth:`owe`, or the stream is over."""
+        """Wait until the client has taken all messages up to :meth:`owe`, or until the stream ends."""
         while self.owing:
             self._told = asyncio.get_running_loop().create_future()
             try:
@@ -136,15 +143,15 @@ class Outbox:
                 self._told = None
 
     def _tell(self) -> None:
-        """Wake :meth:`taken` if nothing is owing any more."""
+        """Wake :meth:`taken` if there is nothing left to wait for."""
         if self._told is not None and not self._told.done() and not self.owing:
             self._told.set_result(None)
 
     async def pop(self) -> bytes | None:
-        """Wait for the oldest message and return it; None after :meth:`end`.
+        """Wait for the oldest message, and return it; return None after :meth:`end`.
 
-        Reading may go on after None. A call also means that the client has the message before,
-        as far as flow control allows.
+        You may call it again after None. Each call means that the client has taken the message
+        before, as far as flow control shows.
         """
         waiting = self._waiting
         self._taken = next(iter(waiting)) if waiting else self._next
@@ -184,7 +191,7 @@ class _Lane:
         self._numbers: deque[int] = deque()
 
     def take(self, message: Sized) -> bytes:
-        """Finish the lane's oldest message, which has left the outbox, and return it."""
+        """Complete the lane's oldest message, which has left the outbox, and return it."""
         self._numbers.popleft()
         self.load.remove(message)
         return self._finish(message)
@@ -195,7 +202,7 @@ class _Lane:
             self._outbox.drop(self._numbers.popleft())
 
     def keep(self, message: Sized) -> None:
-        """Add a message of a step; without room for it the whole outbox fails.
+        """Add a message of a step. If there is no room for it, the whole outbox fails.
 
         The step waits until the client has taken the message.
         """
@@ -214,20 +221,26 @@ class _Lane:
 
 
 class StateLane(_Lane):
-    """A lane for states: every change while the client keeps up, otherwise the newest value.
+    """A lane for states: has every change while the client keeps up, otherwise the newest value.
 
-    Values that are left out are counted. The lane is a feed's listener.
+    The outbox counts the values that are left out. The lane is a listener of a feed.
     """
 
     def __init__(self, outbox: Outbox, finish: Finish = bytes) -> None:
-        """``finish`` completes a message when it is sent."""
+        """Create the lane.
+
+        Args:
+            outbox: The outbox of the stream.
+            finish: Completes a message when it is sent.
+
+        """
         super().__init__(outbox, outbox.states, finish)
         self.stream = outbox
         self.since = 0
 
     def deliver(self, message: Sized, at_s: float | None = None) -> None:
-        """Add a message; it replaces the topic's messages that are too many or too old."""
-        waits = len(self._numbers)  # nothing, if the client keeps up
+        """Add a message, which replaces the topic's messages that are too many or too old."""
+        waits = len(self._numbers)  # 0 if the client keeps up
         outbox, numbers, now_s = self._outbox, self._numbers, time.monotonic()
         at_s = now_s if at_s is None else at_s
         outbox.losses.offer(now_s)
@@ -240,28 +253,35 @@ class StateLane(_Lane):
         self._add(message, at_s)
 
     def lose(self) -> None:
-        """Drop what waits, because quality has turned bad."""
+        """Drop the waiting messages, because the quality has turned bad."""
         self.drop()
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
-        """Listen to the values of a feed's source; return the function that leaves."""
+        """Listen to the values of a feed's source; return the function that ends this."""
         feed.listen(subject, self)
         return partial(feed.leave, subject, self)
 
 
 class EventLane(_Lane):
-    """A lane for events: none replaces another, so the outbox fails if one does not fit.
+    """A lane for events. None replaces another: if one has no room, the outbox fails.
 
     The lane is a listener of write subscriptions.
     """
 
     def __init__(self, outbox: Outbox, path: str, finish: Finish = bytes) -> None:
-        """``path`` is named in a failure; ``finish`` completes a message when it is sent."""
+        """Create the lane.
+
+        Args:
+            outbox: The outbox of the stream.
+            path: Path of the topic, for the text of a failure.
+            finish: Completes a message when it is sent.
+
+        """
         super().__init__(outbox, outbox.events, finish)
         self._path = path
 
     def deliver(self, message: Sized) -> None:
-        """Add a message; fail if there is no room."""
+        """Add a message; without room for it, fail."""
         if self.load.full(message, EVENT_BOUND):
             self.fail(f"{self.load.count} messages are waiting: the client reads too slowly")
         self._add(message)
@@ -271,7 +291,7 @@ class EventLane(_Lane):
         self._outbox.fail(f"{self._path}: {reason}")
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
-        """Listen to writes to a feed's source; return the function that leaves."""
+        """Listen to the writes to a feed's source; return the function that ends this."""
         write_subscriptions = feed.commands.write_subscriptions
         write_subscriptions.listen(subject, self)
         return partial(write_subscriptions.leave, subject, self)
@@ -281,11 +301,11 @@ Lane = StateLane | EventLane
 
 
 class OpenStreams:
-    """Number of the open streams of all services; for the event loop's thread."""
+    """Number of open streams of all services together. Use it only in the event loop's thread."""
 
     def __init__(self) -> None:
         self.changed: Callable[[], object] = lambda: None
-        """Called when the first stream opens, before it gets values, and when the last closes."""
+        """Called when the first stream opens, before it gets values, and when the last one closes."""
         self._count = 0
 
     def __bool__(self) -> bool:
@@ -293,7 +313,7 @@ class OpenStreams:
 
     @contextmanager
     def joined(self) -> Iterator[None]:
-        """Count a stream for as long as it is open."""
+        """Count a stream while it is open."""
         self._count += 1
         if self._count == 1:
             self.changed()
@@ -309,7 +329,12 @@ class Outboxes:
     """The outboxes of all open streams."""
 
     def __init__(self, open_streams: OpenStreams | None = None) -> None:
-        """``open_streams`` counts these streams together with those of other services."""
+        """Begin without outboxes.
+
+        Args:
+            open_streams: Counts the open streams of all services together.
+
+        """
         self._open_streams = OpenStreams() if open_streams is None else open_streams
         self._open: set[Outbox] = set()
         self._dropped = 0
@@ -325,12 +350,12 @@ class Outboxes:
 
     @property
     def dropped(self) -> int:
-        """Number of messages dropped since the start because a client was too slow."""
+        """Number of messages that were dropped since the start because a client was too slow."""
         return self._dropped + sum(outbox.dropped for outbox in self._open)
 
     @contextmanager
     def opened(self) -> Iterator[Outbox]:
-        """Give a stream an outbox for as long as the stream is open."""
+        """Provide an outbox for a stream while the stream is open."""
         outbox = Outbox(self._total)
         self._open.add(outbox)
         self._total.streams += 1
@@ -344,7 +369,7 @@ class Outboxes:
             outbox.close()
 
     async def taken(self, patience_s: float) -> None:
-        """Wait until all clients have taken what they are owed.
+        """Wait until all clients have taken the messages marked by :meth:`Outbox.owe`.
 
         Streams whose clients have not done so within ``patience_s`` fail.
         """
@@ -365,7 +390,7 @@ MAX_WAITING: Final = 4096
 
 
 class SendQueue:
-    """A queue with bounds on the number and the size of its messages."""
+    """A queue that limits the number and the size of its messages."""
 
     def __init__(self) -> None:
         self._messages: deque[bytes] = deque()
@@ -375,7 +400,7 @@ class SendQueue:
         return bool(self._messages)
 
     def add(self, message: bytes) -> str:
-        """Add a message; return why it does not fit, or an empty text."""
+        """Add a message. If there is no room, return the reason; otherwise return an empty text."""
         if self._load.full(message, MAX_WAITING):
             return f"{self._load.count} messages are waiting: the client reads too slowly"
         self._load.add(message)
@@ -389,5 +414,5 @@ class SendQueue:
         return message
 
     def all(self) -> bytes:
-        """Remove all messages and return them concatenated."""
+        """Remove all messages, and return them concatenated."""
         return b"".join([self.pop() for _ in range(len(self._messages))])

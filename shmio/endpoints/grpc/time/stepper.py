@@ -1,4 +1,4 @@
-"""Moves the instance's time for clients of all services: steps, and plays in real time."""
+"""Moves the instance's time for clients of all services: makes steps, and plays in real time."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
 
 BRIEF_NS: Final = 500_000
-"""Time that the event loop blocks for sources that answer at once.
+"""Time for which the event loop blocks, in case the sources answer at once.
 
-A wake-up by a thread takes about as long.
+To be woken by a thread takes about as long.
 """
 
 
@@ -33,10 +33,13 @@ class StepDriver:
         self._coordinator = coordinator
         self._clock = clock
         self._wake_ups = wake_ups
-        self._delivered: WakeUp | None = None  # as a rule, no other process delivers steps
+        self._delivered: WakeUp | None = None  # made when needed: usually no other process delivers steps
 
     async def step(self, dt_ns: int | None) -> Step:
-        """Make one step; cancelling aborts it. Raises what :meth:`Coordinator.step` raises."""
+        """Make one step. Cancelling aborts it.
+
+        It raises what :meth:`Coordinator.step` raises.
+        """
         until_ns = time.monotonic_ns() + BRIEF_NS
         with closing(self._coordinator.stepping(dt_ns)) as stepping:
             while True:
@@ -49,13 +52,13 @@ class StepDriver:
                     await self._wait(wait)
 
     def stop(self) -> None:
-        """End the wake-ups for deliveries of other processes."""
+        """Stop waiting for the deliveries of other processes."""
         if self._delivered is not None:
             self._delivered.stop()
             self._delivered.join()
 
     async def _wait(self, wait: StepWait) -> None:
-        """Wait for the wake-up that the step needs; it also comes periodically."""
+        """Wait until the step may continue, or until it is time to check again."""
         woken = asyncio.get_running_loop().create_future()
 
         def ring() -> None:
@@ -80,30 +83,39 @@ class StepDriver:
 
 
 def _brief(wait: StepWait, rest_ns: int) -> bool:
-    """Block the event loop for at most ``rest_ns``; return whether the block had something new."""
+    """Block the event loop until the block has a new frame or event, for at most ``rest_ns``.
+
+    Returns:
+        True if the block had a new frame or event.
+
+    """
     if wait.block is None or rest_ns <= 0:
         return False
     return wait.block.ring.wait(wait.seen, min(rest_ns, wait.rest_ns)) != wait.seen
 
 
 LATE_S: Final = 0.5
-"""Most delay that playing catches up with."""
+"""Maximum delay that playing catches up with."""
 
 log = logging.getLogger("shmio.grpc")
 
 
 class Player:
-    """Plays: makes steps at a multiple of real time. For the event loop's thread."""
+    """Makes steps at a multiple of real time. Use it only in the event loop's thread."""
 
     def __init__(self, make: Callable[[int | None], Awaitable[object]], step_size_ns: Callable[[], int]) -> None:
-        """``make`` makes one step of the given ns, or of the step size if that is None.
+        """Prepare to play; :meth:`begin` starts.
 
-        A ShmioError of ``make`` is logged, and playing goes on.
+        Args:
+            make: Makes one step of the given size in ns, or of the step size if that is None. A
+                ShmioError is logged, and playing continues.
+            step_size_ns: Returns the present step size, in ns.
+
         """
         self.dt_ns: int | None = None
         """Size of each step, in ns; None: the step size."""
         self.rate = 1.0
-        """Speed as a multiple of real time."""
+        """Speed, as a multiple of real time."""
         self._make = make
         self._step_size_ns = step_size_ns
         self._loop = asyncio.get_running_loop()
@@ -112,12 +124,12 @@ class Player:
 
     @property
     def on(self) -> bool:
-        """Whether time is playing."""
+        """True while time is played."""
         return self._task is not None
 
     @property
     def alive(self) -> bool:
-        """Whether the playing task is running, if time is played."""
+        """True unless the playing task has ended while time is played."""
         return self._task is None or not self._task.done()
 
     def begin(self) -> None:
@@ -126,14 +138,14 @@ class Player:
             self._task = self._loop.create_task(self._play())
 
     async def end(self) -> None:
-        """Stop playing and wait for the end of the last step."""
+        """Stop playing, and wait for the end of the last step."""
         task, self._task = self._task, None
         self._woken.set()
         if task is not None:
             await task
 
     async def break_off(self) -> None:
-        """Abort the step in progress and stop; :attr:`on` stays True."""
+        """Abort the present step, and stop; :attr:`on` stays True."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -152,18 +164,18 @@ class Player:
                     log.warning("playing: %s", reason)
             dt_s = (self.dt_ns or self._step_size_ns()) / 1e9
             due_s = max(due_s + dt_s / self.rate, self._loop.time() - LATE_S)
-            with suppress(TimeoutError):  # lets other tasks run even if playing is late
+            with suppress(TimeoutError):  # the wait lets other tasks run, even if playing is late
                 await asyncio.wait_for(self._woken.wait(), max(0.0, due_s - self._loop.time()))
 
 
 REST_S: Final = 1.0
-"""Control of time is released after this long without a step, so that others can take it."""
+"""Without a step for this long, control of time is released, so that other programs can take it."""
 
 _Result = TypeVar("_Result")
 
 
 class Stepper:
-    """Moves time for clients, one request at a time. For the event loop's thread."""
+    """Moves time for clients, one request at a time. Use it only in the event loop's thread."""
 
     def __init__(
         self,
@@ -176,9 +188,18 @@ class Stepper:
         settle: Callable[[str], Awaitable[None]],
         open_streams: OpenStreams,
     ) -> None:
-        """Create the timeline; ``settle`` completes a client's writes before its step.
+        """Create the stepper; :meth:`start` starts it.
 
-        ``wake_ups`` are those of the feeds. The other arguments are those of :class:`Timeline`.
+        Args:
+            segment: The instance's shared memory.
+            slot: This process's entry in the process table.
+            virtual_time: The state of virtual time that the feeds use.
+            wake_ups: The wake-ups that the feeds use.
+            feeds: The feeds of all sources, by name.
+            outboxes: The outboxes of all streams.
+            settle: Waits for a client's earlier writes before its step.
+            open_streams: Counts the open streams of all services together.
+
         """
         self._segment = segment
         self._settle = settle
@@ -197,9 +218,13 @@ class Stepper:
         """The state of time, whichever program moves it."""
 
     async def start(self, predecessor: int = 0) -> None:
-        """Start following time, and resume playing if the previous process was playing.
+        """Start following time.
 
-        ``predecessor``: pid of the previous process of this endpoint; 0: none.
+        Resume playing if the previous process of this endpoint was playing.
+
+        Args:
+            predecessor: Process id of that process; 0: there was none.
+
         """
         self.timeline.start()
         state = self._segment.clock.last_written()
@@ -211,11 +236,11 @@ class Stepper:
 
     @property
     def alive(self) -> bool:
-        """Whether time is being followed, and the playing task runs if time is played."""
+        """True if time is followed, and unless the playing task has ended while time is played."""
         return self.timeline.alive and self._player.alive
 
     async def set_step_size(self, dt_ns: int) -> None:
-        """Set the size of steps that have none of their own; takes control of time.
+        """Set the size of steps whose request names none. This takes control of time.
 
         Raises:
             ValueRangeError: The step size is out of range.
@@ -226,10 +251,11 @@ class Stepper:
         await self._do(self._change(partial(self._coordinator.set_step_size, dt_ns)))
 
     async def step(self, dt_ns: int | None = None, peer: str = "") -> Step:
-        """Make a step and return when all streams have taken its marker.
+        """Make a step; return when all streams have taken the marker of the step.
 
-        Values received earlier on the peer's Publish streams reach their sources before the step.
-        A step that has begun is completed even if its client disconnects; a waiting one is not.
+        Values that were received earlier on the peer's Publish streams reach their sources before
+        the step. A step that has begun is completed even if its client disconnects. A step that
+        still waits is cancelled.
 
         Args:
             dt_ns: Size in ns; None: the step size.
@@ -259,7 +285,7 @@ class Stepper:
         return await self._do(self._begin_play(dt_ns, rate))
 
     async def pause(self, *, end: bool = False) -> TimeStatus:
-        """Stop playing and return the state of time.
+        """Stop playing, and return the state of time.
 
         Args:
             end: Report time as not alive until the next step.
@@ -326,7 +352,7 @@ class Stepper:
 
     @asynccontextmanager
     async def _moved(self) -> AsyncIterator[None]:
-        """Hold control of time, exclusively among this endpoint's clients."""
+        """Control time, with exclusive access among this endpoint's clients."""
         async with self._turn:
             self._moving, self.timeline.steered = asyncio.current_task(), True
             try:
@@ -392,7 +418,7 @@ class Stepper:
 
 
 async def _tell(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Result]) -> None:
-    """Await ``work`` and put its result or error into ``done``, unless that is cancelled."""
+    """Await ``work``, and pass its result or error to ``done``, unless ``done`` is cancelled."""
     try:
         result = await work
     except Exception as error:  # noqa: BLE001  passed on to the waiting task
@@ -407,6 +433,6 @@ async def _tell(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Result
 
 
 def _check(dt_ns: int | None) -> None:
-    """Raise ValueRangeError if a step is out of range, before control of time is taken."""
+    """Raise ValueRangeError if a step is out of range. Call this before taking control of time."""
     if dt_ns is not None:
         check_step(dt_ns)

@@ -1,4 +1,4 @@
-"""Follows the instance's time and has each step delivered, whichever program makes it."""
+"""Follows the instance's time, and delivers each step, whichever program makes it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from shmio.model.clock import Clock
 from shmio.segment import ProcessSlot, Segment
 
 PATIENCE_S: Final = 3.0
-"""Time that clients have to take a step's values, and again to take its marker.
+"""Time for clients to take the values of a step, and as much again to take its marker.
 
-Clients of shmio.v1 have their turn after the others. The total is less than a step's own
-time-out. A stream that is the only one has this time for values and marker together.
+Clients of shmio.v1 follow after the others. The total is less than the time-out of a step. If only
+one stream is open, it has this time once, for values and marker together.
 """
 
 log = logging.getLogger("shmio.grpc")
@@ -31,7 +31,7 @@ class TimeStatus(NamedTuple):
     """The state of the instance's time.
 
     ``dt_ns`` is the size of the step that the status reports, otherwise the present step size.
-    ``alive`` is False after a client has said that time goes on no more.
+    ``alive`` is False after a client has ended time, until the next step.
     """
 
     clock_ns: int
@@ -41,13 +41,13 @@ class TimeStatus(NamedTuple):
 
 
 class Listener(Protocol):
-    """A stream's subscription to a topic of time; called in the event loop's thread."""
+    """A stream's subscription to a time topic. The event loop's thread calls the methods."""
 
     def deliver(self, message: Sized) -> None:
-        """Take one message."""
+        """Add one message to the stream."""
 
     def keep(self, message: Sized) -> None:
-        """Take one message of a step, which must not be dropped."""
+        """Add one message of a step, which must not be dropped."""
 
 
 Encode = Callable[[TimeTopic, Moment], Sized]
@@ -61,7 +61,14 @@ class TimeTopics:
     """
 
     def __init__(self, virtual_time: VirtualTime, now: Callable[[], Moment], tick_s: Callable[[], float]) -> None:
-        """``now`` returns the present simulation time, ``tick_s`` the step size."""
+        """Begin without listeners.
+
+        Args:
+            virtual_time: The state of virtual time.
+            now: Returns the present simulation time.
+            tick_s: Returns the step size, in s.
+
+        """
         self._virtual_time = virtual_time
         self._now = now
         self._tick_s = tick_s
@@ -69,7 +76,7 @@ class TimeTopics:
         self._timer: asyncio.TimerHandle | None = None
 
     def listen(self, topic: TimeTopic, encode: Encode, listener: Listener) -> Callable[[], None]:
-        """Add a listener and return the function that removes it.
+        """Add a listener, and return the function that removes it.
 
         The simulation time is sent at once, a step's number only after that step.
         """
@@ -91,7 +98,7 @@ class TimeTopics:
             del self._listeners[topic, encode]
 
     def tell(self) -> None:
-        """Send number and time of the step that was delivered."""
+        """Send the number and time of the step that was delivered."""
         for (topic, encode), listeners in self._listeners.items():
             message = encode(topic, self._virtual_time.moment)
             for listener in listeners:
@@ -102,7 +109,7 @@ class TimeTopics:
             self._timer = asyncio.get_running_loop().call_later(self._tick_s(), self._tick)
 
     def _tick(self) -> None:
-        """Send the simulation time while time is real, as long as there is a listener."""
+        """Send the simulation time, while time is real and there is a listener."""
         self._timer = None
         if self._virtual_time.on:
             return
@@ -133,19 +140,19 @@ class StepReceiver(Protocol):
         """Number of the service's open streams."""
 
     async def deliver(self, step: Step) -> None:
-        """Send what a step has changed, then its marker, and wait until all streams have both."""
+        """Send the changes of a step, then its marker; wait until all streams have both."""
 
     def release(self) -> None:
-        """Send values as they come, because time is real again."""
+        """Send values without waiting for steps, because time is real again."""
 
 
 class _Delivery:
     """Delivers steps in order to all streams, whichever program has made them.
 
-    A step's delivery begins with the writes before it. The changed values follow, of all blocks
-    on the instance's clock in the segment's order. When all streams have taken these, they get
-    the step's marker, and when they have taken that, the delivery is over. A single stream is
-    in order anyway, so nothing is awaited before its marker. For the event loop's thread.
+    First come the writes before the step. Then come the changed values of all blocks on the
+    instance's clock, in the segment's order. When all streams have taken these, they get the step's
+    marker. The delivery ends when they have taken the marker. A single stream is in order anyway,
+    so its marker need not wait for the values. Use it only in the event loop's thread.
     """
 
     def __init__(self, virtual_time: VirtualTime, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
@@ -156,14 +163,14 @@ class _Delivery:
         self.receivers: list[StepReceiver] = []
 
     def begin(self, moment: Moment) -> None:
-        """Switch to virtual time; ``moment`` counts as delivered."""
+        """Switch to virtual time; the step ``moment`` counts as delivered."""
         self._virtual_time.on = True
         self._virtual_time.moment = moment
         for feed in self._feeds.values():
             feed.hold()
 
     def end(self) -> None:
-        """Switch back to real time; only while not :attr:`busy`."""
+        """Switch back to real time. Call this only while not :attr:`busy`."""
         self._virtual_time.on = False
         for feed in list(self._feeds.values()):
             try:
@@ -174,9 +181,14 @@ class _Delivery:
             receiver.release()
 
     async def deliver(self, step: Step, mark: Callable[[], None]) -> bool:
-        """Deliver a step, with its marker by ``mark``; return False if it was delivered already.
+        """Deliver a step; return False if it was delivered already.
 
         The stream of a client that does not read fails after ``PATIENCE_S``.
+
+        Args:
+            step: The step.
+            mark: Queues the step's marker.
+
         """
         async with self._turn:
             if step.number <= self._virtual_time.moment.number:
@@ -192,11 +204,14 @@ class _Delivery:
 
     @property
     def busy(self) -> bool:
-        """Whether a step is being delivered now."""
+        """True while a step is being delivered."""
         return self._turn.locked()
 
     def pass_over(self, step: Step, mark: Callable[[], None]) -> None:
-        """Deliver a step without waiting, as no stream is open; only while not :attr:`busy`."""
+        """Deliver a step without waiting, because no stream is open.
+
+        Call this only while not :attr:`busy`.
+        """
         if step.number > self._virtual_time.moment.number:
             self._show(step)
             mark()
@@ -214,7 +229,10 @@ class _Delivery:
 
 
 class Timeline:
-    """The instance's time as all services of the endpoint see it; for the event loop's thread."""
+    """The instance's time as all services of the endpoint see it.
+
+    Use it only in the event loop's thread.
+    """
 
     def __init__(
         self,
@@ -226,27 +244,28 @@ class Timeline:
         open_streams: OpenStreams,
         play_dt_ns: Callable[[], int | None],
     ) -> None:
-        """Read the present time; see :meth:`start`.
+        """Read the present time; :meth:`start` starts following it.
 
         Args:
             segment: The instance's shared memory.
             slot: This process's entry in the process table.
-            virtual_time: Updated here and read by the feeds.
-            feeds: The feeds of all sources.
+            virtual_time: The state that this object updates, and the feeds read.
+            feeds: The feeds of all sources, by name.
             outboxes: The outboxes of all streams.
-            open_streams: While there are none, no step waits for this process.
-            play_dt_ns: Returns the size of the steps that this process plays, in ns; None: the
-                step size.
+            open_streams: Counts the open streams; while there are none, no step waits for this
+                process.
+            play_dt_ns: Returns the size of the steps that this process plays, in ns; None: the step
+                size.
 
         """
         self.time_topics = TimeTopics(virtual_time, self._now, lambda: self._clock.read().step_size_ns / 1e9)
         """Sends step numbers and simulation time to subscribers."""
         self.virtual_time = virtual_time
-        """Whether time is virtual, and the step delivered last."""
+        """The state of virtual time, with the step that was delivered last."""
         self.steered = False
-        """Whether this process moves time at present and delivers its own steps."""
+        """True while this process moves time, and delivers its own steps."""
         self.ended = False
-        """Whether a client has said that time goes on no more; reset by the next step."""
+        """True if a client has ended time; the next step resets this."""
         self._clock = segment.clock
         self._slot = slot
         self._open_streams = open_streams
@@ -272,7 +291,7 @@ class Timeline:
         self._page.listeners[self.look] = None
 
     async def stop(self) -> None:
-        """Stop following time, and cancel the deliveries in progress."""
+        """Stop following time, and cancel the deliveries that have not ended."""
         self.time_topics.stop()
         page, self._page = self._page, None  # own() may still be called
         if page is not None:
@@ -285,20 +304,23 @@ class Timeline:
 
     @property
     def alive(self) -> bool:
-        """Whether time is being followed."""
+        """True while time is followed."""
         return self._page is not None
 
     def own(self, owns: bool) -> None:
-        """Note whether this process owns time; its own writes to the clock page need no wake-up."""
+        """Note whether this process controls time.
+
+        Its own writes to the clock page need no wake-up.
+        """
         if self._page is not None:
             (self._page.mute if owns else self._page.unmute)()
 
     def add_receiver(self, receiver: StepReceiver) -> None:
-        """Deliver each step to ``receiver`` too."""
+        """Deliver each step to ``receiver``, too."""
         self._delivery.receivers.append(receiver)
 
     def watch(self, watcher: Callable[[TimeStatus], None]) -> None:
-        """Call ``watcher`` with each step's status and with each change."""
+        """Call ``watcher`` with the status after each step and after each change."""
         self._watchers.append(watcher)
 
     @property
@@ -307,21 +329,22 @@ class Timeline:
         return self._status(self.look())
 
     async def deliver(self, step: Step) -> None:
-        """Deliver a step's values and marker to all streams, unless they have them already."""
+        """Deliver a step's values and marker to all streams, unless that was done already."""
         if await self._delivery.deliver(step, partial(self._mark, step)):
             self._delivered = step.number
             if self._awaited:
                 self._clock.deliver(self._slot.index, step.number)
 
     def look(self) -> Clock:
-        """Read the clock page and act on what has changed.
+        """Read the clock page, and act on changes.
 
-        This is also called periodically, because a player that dies causes no wake-up.
+        This is also called periodically, because the death of a program that plays causes no
+        wake-up.
         """
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
             self._delivery.begin(_before(state))
-        elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # else at the next call
+        elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # if busy, at the next call
             self._end(state)
         if state.virtual and state.done > self.virtual_time.moment.number and not self.steered:
             step = Step(state.done, state.present_ns, state.dt_ns)
@@ -337,15 +360,15 @@ class Timeline:
         return state
 
     def _end(self, state: Clock) -> None:
-        """Act on the release of time: it is real again."""
+        """Handle the return to real time."""
         self._delivery.end()
         self.time_topics.resume()
         self._tell(self._status(state), state)
 
     def _attend(self) -> None:
-        """Make steps wait for this process while it has open streams."""
+        """Let steps wait for this process while it has open streams."""
         if self._open_streams:
-            self.look()  # delivers what is over; steps wait from the next one on
+            self.look()  # delivers the steps so far; the next step will wait for this process
             self._awaited = True
             self._clock.deliver(self._slot.index, self._delivered)
         else:
@@ -372,9 +395,9 @@ class Timeline:
 
 
 def _before(state: Clock) -> Moment:
-    """Return the moment that counts as delivered when time is first seen to be virtual.
+    """Return the moment that counts as delivered when this process first sees that time is virtual.
 
-    On a busy machine the first step may have ended already, and still has to be delivered.
+    On a busy machine the first step may have ended before, and still has to be delivered.
     """
     first = bool(state.dt_ns) and state.step == state.done
     return Moment(state.done - first, state.present_ns - first * state.dt_ns)
