@@ -24,7 +24,7 @@ log = logging.getLogger("shmio.mqtt")
 
 
 def run(worker: Worker) -> None:
-    """Run the process that the worker's name selects until the worker is stopped."""
+    """Run the bridge or the broker, as the worker's name says, until the worker is stopped."""
     rate_limit = LogRateLimit()
     log.addFilter(rate_limit)
     try:
@@ -52,7 +52,10 @@ def _run_bridge(worker: Worker) -> None:
 
 
 def run_broker(worker: Worker) -> None:
-    """Run our own broker until the worker is stopped: mosquitto if it is installed, else aMQTT."""
+    """Run our own broker until the worker is stopped.
+
+    It is mosquitto if that is installed, otherwise aMQTT.
+    """
     settings = msgspec.convert(worker.config, Mqtt)
     program = choose_broker(settings)
     place = folder(worker.segment)
@@ -66,7 +69,7 @@ def run_broker(worker: Worker) -> None:
                 "everything, even values",
                 settings.listen,
             )
-            from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  of the extra, and large
+            from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  needs the extra, and is large
 
             asyncio.run(amqtt.serve(worker, settings, place))
     finally:

@@ -41,10 +41,10 @@ from shmio.segment.doorbell import TURN_NS, Relay
 OFFLINE: Final = b"offline"
 STOPPED: Final = "the bridge was stopped"
 LEAVE_S: Final = 2.0
-"""Time limit for closing, in which the broker must accept the last messages."""
+"""Time limit for closing, within which the broker must accept the last messages."""
 TURN_S: Final = 0.2
 MAX_CLEARED: Final = 20_000
-"""Maximum number of retained topics to delete at the broker."""
+"""Maximum number of topics whose retained messages the bridge deletes at the broker."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -56,10 +56,15 @@ class Bridge:
     """
 
     def __init__(self, segment: Segment, slot: ProcessSlot, settings: Mqtt) -> None:
-        """``slot``: of this process.
+        """Create the feeds and the connections.
+
+        Args:
+            segment: The instance's shared memory.
+            slot: This process's entry in the process table.
+            settings: The configuration's ``[mqtt]`` section.
 
         Raises:
-            PathError: A rule has an invalid pattern.
+            PathError: The pattern of a rule is not valid.
 
         """
         self.prefix = settings.prefix or f"shmio/{segment.instance}"
@@ -72,14 +77,14 @@ class Bridge:
         client_id = settings.client_id or f"shmio-{segment.instance}"
         self._status = BridgeStatusChannel(f"{self.prefix}/status")
         self._channels: dict[str, Channel] = {self._status.topic: self._status}
-        """Every topic that is published now, with its channel."""
+        """The channel of every topic that is published now."""
         self._guard = TopicGuard(self)
         self._feeds: dict[str, Feed] = {}
         self._clients: dict[str, CommandClient] = {}
         self._relays: dict[int, Relay] = {}
         self._cleared: dict[str, ClearedTopic] = {}
         there = targets(settings, own_socket(segment))
-        # This connection receives nothing that the broker could keep.
+        # The broker has no messages to keep for this connection, so it needs no session.
         clean = msgspec.structs.replace(settings, session_expiry_s=0)
         self.connection = BrokerConnection(
             ReconnectPolicy(clean, client_id, there),
@@ -101,15 +106,15 @@ class Bridge:
         self.command_connection.connection.on_message = self._on_command
         self.connection.on_message = self._on_message
         self.connection.on_lost = self.outbox.lose
-        # Clients that see that we are online may send commands at once.
+        # When clients see that we are online, they may send commands at once.
         self.connection.is_ready = lambda: self.command_connection.ready
         self._recalled: frozenset[str] | None = None
         """Our topics when we asked for an earlier bridge's retained messages; None: not yet asked."""
         self._behind: set[Feed] = set()
         self._rest_s = 0.0
-        """How long :meth:`turn` may wait for events."""
+        """How long :meth:`turn` may wait for events, in s."""
         self._missed = 0
-        """Frames missed by feeds that have been removed."""
+        """Number of frames that removed feeds had missed."""
         self._generation = -1
         self._reader = ThreadPoolExecutor(1, "reader")
         self._sparkplug: Session | None = None
@@ -136,7 +141,7 @@ class Bridge:
 
     @property
     def problem(self) -> str:
-        """The current problem; empty: none."""
+        """The current problem; empty if there is none."""
         problem = self.connection.problem
         if problem and self.outbox.backlog:
             lost = f", {self.outbox.dropped} dropped" if self.outbox.dropped else ""
@@ -146,13 +151,13 @@ class Bridge:
         )
 
     def wake(self) -> None:
-        """Wake :meth:`turn`; may be called from any thread."""
+        """Wake :meth:`turn`. You may call this from any thread."""
         os.eventfd_write(self._wakeup, 1)
 
     # ---- a turn ------------------------------------------------------------------------------------------------------
 
     def turn(self) -> None:
-        """Wait for events, at most for ``TURN_S``, and handle them."""
+        """Wait up to ``TURN_S`` for events, and handle them."""
         for key, events in self._selector.select(self._rest_s):
             key.data(events)
         self._turn_connections()
@@ -169,9 +174,9 @@ class Bridge:
         self._rest_s = 0.0 if self._behind or self.outbox.can_send else min(due_s)
 
     def _mark_due(self) -> Iterator[float]:
-        """Mark changes whose rate limit has elapsed.
+        """Mark the changes whose rate limit no longer applies.
 
-        Yields each source's time to the next one, in s.
+        Yields, for each source, the time until the next such change, in s.
         """
         for feed in self._feeds.values():
             due_ns = None if feed.step_driven else feed.mark_due()
@@ -179,7 +184,7 @@ class Bridge:
                 yield max(0.0, (due_ns - feed.block.now_ns()) / 1e9)
 
     def _turn_connections(self) -> float:
-        """Run both connections, and return in how many seconds to run them again."""
+        """Run both connections, and return after how many seconds to run them again."""
         connection = self.connection
         rest_s = min(self.command_connection.turn(connection.at), connection.turn())
         if connection.problem and not connection.up:
@@ -193,7 +198,7 @@ class Bridge:
     def _publish_all(self) -> None:
         """Publish that we are online, and the current state of every topic.
 
-        The outbox sends what it kept during the outage first.
+        Before this state, the outbox sends the changes that it kept during an outage.
         """
         self.connection.send(self._status.message())
         if self._recalled is None:
@@ -223,7 +228,7 @@ class Bridge:
         return [*states, *output_filters(self.prefix, self._clients.values())]
 
     def correct(self, topic: str) -> None:
-        """Publish our value on a topic again, or delete what another client has left there."""
+        """Publish our value on a topic again, or delete what another client has published there."""
         log.warning(
             "another client publishes on %s, a topic of this instance, which now publishes its own value again: let no "
             "other account publish there, and no other bridge use this prefix",
@@ -263,7 +268,7 @@ class Bridge:
                 self._guard.report(message.topic)
 
     def _clear_old(self, message: MQTTMessage) -> None:
-        """Delete retained values that an earlier bridge left on topics that this one does not use."""
+        """Delete a retained value of an earlier bridge, on a topic that this one does not use."""
         if not (message.retain and message.payload and self._recalled is not None) or len(self._cleared) >= MAX_CLEARED:
             return
         with suppress(UnicodeDecodeError):
@@ -287,7 +292,7 @@ class Bridge:
     def _follow_reloads(self) -> None:
         """Add and remove sources after a reload.
 
-        A thread reads their layouts, which may take seconds.
+        A thread reads their layouts, because that may take seconds.
         """
         if self._reading is not None and self._reading.done():
             reading, self._reading = self._reading, None
@@ -307,7 +312,7 @@ class Bridge:
         return {feed.block.section for feed in self._feeds.values()}
 
     def _read(self, known: Container[int]) -> list[tuple[Feed, Device | None]]:
-        self._generation = self._segment.generation  # read first: a change in the meantime is taken up the next time
+        self._generation = self._segment.generation  # first, so that the next turn notices a change during the read
         self._segment.refresh()
         feeds = [
             Feed(block, self._rules, self.prefix, self.outbox, self._writer)
@@ -333,10 +338,7 @@ class Bridge:
             self._selector.register(relay.descriptor, selectors.EVENT_READ, partial(self._wake_feed, feed, relay))
 
     def _remove_feed(self, feed: Feed, successor: Feed | None = None) -> None:
-        """Remove a feed.
-
-        Retained messages on topics that its successor does not use are deleted.
-        """
+        """Remove a feed, and delete retained messages on topics that its successor does not use."""
         feed.command_client.poll()
         self._behind.discard(feed)
         stay = set() if successor is None else {channel.topic for channel in successor.all()}
@@ -344,7 +346,7 @@ class Bridge:
         for channel in feed.all():
             self._channels.pop(channel.topic, None)
         cleared = {channel.topic: ClearedTopic(channel.topic) for channel in feed.all() if channel.topic not in stay}
-        self._cleared |= cleared  # deleted again after each connect: the broker may be away
+        self._cleared |= cleared  # they are deleted again after each connect, as the broker may be away now
         self.outbox.mark_all(cleared.values())
         del self._feeds[feed.block.source], self._clients[feed.block.source]
         self._missed += feed.missed
@@ -357,7 +359,7 @@ class Bridge:
     # ---- the end -----------------------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Send what is queued, publish that we are offline, and disconnect."""
+        """Send the messages that wait, publish that we are offline, and disconnect."""
         self.steps.close()
         until_s = time.monotonic() + LEAVE_S
         self._drain(until_s, lambda: not self.outbox.busy)

@@ -1,4 +1,4 @@
-"""Commands: receives them on the ``/in`` topics, sends them to their sources, and publishes the results."""
+"""Commands: receives them on ``/in`` topics, sends them to their sources, and publishes results."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from shmio.segment import DONE, Block, EventKind
 from shmio.segment.commands import End, worst
 
 REPLIES: Final = "shmio/results"
-"""Below the prefix, the topics that clients may choose for their results.
+"""Topics below the prefix that clients may choose for their results.
 
-A response topic elsewhere could make us write, or publish false values.
+With a response topic elsewhere, a client could make us write values or publish false ones.
 """
 OUTPUTS: Final = ("/out", "/frames")
 RETAINED: Final = "a retained command is not carried out; publish commands without the retain flag"
@@ -45,16 +45,19 @@ log = logging.getLogger("shmio.mqtt")
 
 
 class CommandClient:
-    """Sends commands to one source. Use it from the bridge's thread."""
+    """Sends commands to one source. Use it only in the bridge's thread."""
 
     def __init__(self, block: Block, writer: int) -> None:
-        """``writer``: number of this process's command queue.
+        """Prepare to send commands. For a large layout this takes seconds.
 
-        For a large layout this takes seconds.
+        Args:
+            block: The block of the source.
+            writer: Number of this process's command queue.
+
         """
         self.block = block
         self.depths = _depths(block.layout)
-        """The numbers of segments that this source's paths have."""
+        """The numbers of segments that paths of this source have."""
         self._source_writer = SourceWriter(block, writer)
         self._source_writer.prepare()
         self._pending = InFlightTable(writer)
@@ -72,11 +75,14 @@ class CommandClient:
     def send(self, register: Register, value: object, done: Done) -> None:
         """Send a value for a register, an array or an element.
 
-        ``done`` is called once with the outcome.
+        Args:
+            register: The register.
+            value: The value.
+            done: Called once, with the outcome.
 
         Raises:
             CommandError: The command was not sent.
-            ValueRangeError: The value does not fit; the command was not sent.
+            ValueRangeError: The value does not fit. The command was not sent.
 
         """
         cost = CommandCost.of(sizes(register))
@@ -111,12 +117,15 @@ def _depths(layout: Layout) -> Sequence[int]:
 
 
 def command_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """The filters for commands: one for each path depth of a source; none matches our own topics."""
+    """Return the filters for commands, which match none of the topics that we publish.
+
+    There is one for each path depth of each source.
+    """
     return [f"{prefix}/{one.block.source}/{'+/' * depth}in" for one in clients for depth in one.depths]
 
 
 def output_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """The filters for values that an earlier bridge may have published, for these sources."""
+    """Return the filters for values that an earlier bridge may have published for these sources."""
     found = []
     for one in clients:
         base = f"{prefix}/{one.block.source}"
@@ -125,22 +134,30 @@ def output_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
 
 
 def result_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """The filters for the topics of results."""
+    """Return the filters for the topics of results."""
     return [f"{one}/result" for one in command_filters(prefix, clients)] + [f"{prefix}/{REPLIES}/#"]
 
 
 class CommandReceiver:
-    """Receives commands, and sends them to their sources. Use it from the bridge's thread."""
+    """Receives commands, and sends them to their sources. Use it only in the bridge's thread."""
 
     def __init__(self, prefix: str, rules: TopicRules, clients: Mapping[str, CommandClient], answer: Answer) -> None:
-        """``clients``: of the current sources; ``answer``: called with each result."""
+        """Create the receiver.
+
+        Args:
+            prefix: Prefix of all topics.
+            rules: The configuration's rules for topics.
+            clients: The clients of the current sources, by name.
+            answer: Called with each result.
+
+        """
         self.received = 0
         self.refused = 0
-        """Commands that were not sent to a source, such as retained ones."""
+        """Number of commands that were not sent to a source, such as retained ones."""
         self._prefix, self._rules, self._clients, self._answer = prefix, rules, clients, answer
 
     def take(self, message: MQTTMessage) -> None:
-        """Handle a message: if its topic is a command topic, send the value to the source."""
+        """Handle a message. If its topic is a command topic, send the value to the source."""
         try:
             topic = message.topic
         except UnicodeDecodeError:
@@ -153,13 +170,13 @@ class CommandReceiver:
             self.refused += 1
             return
         tell = _Reply(self._prefix, topic, message, self._answer)
-        if message.retain:  # the broker may have stored it before we connected: its age is unknown
+        if message.retain:  # its age is unknown: the broker may have stored it before we connected
             self.refused += 1
             tell(EventKind.REJECTED, RETAINED)
             return
         try:
             client, register = self._find(topic.removeprefix(f"{self._prefix}/"))
-            client.check(register)  # before decoding: no value would be accepted
+            client.check(register)  # before decoding, because no value would be accepted
             json = self._rules.of(client.block.source, register.path).payload != "text"
             client.send(register, _value(bytes(message.payload), register, json=json), tell)
         except (CommandError, PathError, ValueRangeError) as error:
@@ -189,7 +206,7 @@ class _Reply:
             self._topic = wanted
 
     def __call__(self, kind: EventKind, reason: str) -> None:
-        if kind not in DONE:  # MQTT does not say who sent it; the response topic is the only hint
+        if kind not in DONE:  # MQTT does not say who sent the command; the response topic is the only hint
             asked = "" if self._topic == f"{self._command}/result" else f" (response topic {shorten(self._topic)})"
             log.warning("command on %s%s: %s: %s", shorten(self._command, 400), asked, kind, reason)
         payload = msgspec.json.encode({"outcome": str(kind), "done": kind in DONE, "reason": reason})
@@ -201,7 +218,7 @@ class _Reply:
 
 
 def _value(payload: bytes, register: Register, *, json: bool) -> Any:
-    """Decode a payload: text, or JSON with a value or an object that has one.
+    """Decode a payload: a text, or JSON with a value or with an object that has one.
 
     Raises:
         ValueRangeError: The payload is not a value of the register.
@@ -217,7 +234,7 @@ def _value(payload: bytes, register: Register, *, json: bool) -> Any:
 
 
 def _bare(text: str, register: Register) -> str:
-    """Return the text of a JSON value, or of an object's ``value``.
+    """Return the text of a JSON value, or of the ``value`` of a JSON object.
 
     Raises:
         ValueRangeError: The text is not such JSON.

@@ -29,31 +29,37 @@ from shmio.segment.changed_registers import ChangeScan
 log = logging.getLogger("shmio.mqtt")
 
 MAX_FRAMES_PER_TURN: Final = 8
-"""Frames that are read before other work has its turn."""
+"""Maximum number of frames that are read in a row, before other work."""
 CATCH_UP_S: Final = 3.0
 """A bridge that is further behind than this, or than half the ring, skips to the newest frame."""
 
 
 def follow(block: Block) -> FrameFollower:
-    """Follow a block from its newest frame on, and never fall far behind."""
+    """Follow a block from its newest frame on. The follower skips frames if it falls far behind."""
     return FrameFollower(block, catch_up_s=CATCH_UP_S)
 
 
 class Feed:
     """Follows one source, and marks its changed topics in the outbox.
 
-    Use it from the bridge's thread.
+    Use it only in the bridge's thread.
     """
 
     def __init__(self, block: Block, rules: TopicRules, prefix: str, outbox: Outbox, writer: int) -> None:
-        """``writer``: number of this process's command queue.
+        """Create the feed. For a large layout this takes seconds.
 
-        For a large layout this takes seconds.
+        Args:
+            block: The block to follow.
+            rules: The configuration's rules for topics.
+            prefix: Prefix of all topics.
+            outbox: Queues the changed topics.
+            writer: Number of this process's command queue.
+
         """
         self.block = block
         self.follower = follow(block)
         self.step_driven = False
-        """Whether only steps publish: the block is on the instance's clock, which is virtual."""
+        """True if only steps publish: the block is on the instance's clock, and time is virtual."""
         self.command_client = CommandClient(block, writer)
         base = f"{prefix}/{block.source}"
         self.status = StatusChannel(self.follower, f"{base}/status")
@@ -68,7 +74,7 @@ class Feed:
         """The channels that are published as injected."""
         self._covered = self._injected
         self._injection_sequence = 0
-        """Sequence number of the standing injections from which ``_covered`` was made."""
+        """Sequence number of the list of injections from which ``_covered`` was made."""
         self._scan = ChangeScan([register for register, _ in chosen])
         self._outbox = outbox
         self._limited: dict[ValueChannel | FramesChannel, None] = {}
@@ -99,7 +105,7 @@ class Feed:
 
     @property
     def ended(self) -> bool:
-        """Whether a reload has ended the block, and all its frames have been read."""
+        """True if a reload has ended the block, and all its frames were read."""
         return self.follower.ended
 
     def poll(self) -> bool:
@@ -122,7 +128,7 @@ class Feed:
         return False
 
     def step(self) -> None:
-        """Publish what the step being delivered has changed, if steps drive this block."""
+        """Publish the changes of the present step, if steps drive this block."""
         if self.step_driven and (frame := self.follower.newest()):
             self.take(frame)
 
@@ -147,7 +153,7 @@ class Feed:
             self.mark_due()
 
     def _mark_injected(self, frame: Frame) -> None:
-        """Mark the channels that became injected or stopped being injected, even with equal values."""
+        """Mark the channels whose injections begin or end, even if the values are equal."""
         sequence, before = self.block.standing.sequence, self._injected
         if sequence != self._injection_sequence:
             self._injection_sequence = sequence
@@ -163,7 +169,7 @@ class Feed:
         self._outbox.mark_all(self.all())
 
     def resend(self) -> None:
-        """Publish all topics again, after what was kept during an outage."""
+        """Publish all topics again, after the changes that were kept during an outage."""
         self._limited.clear()
         self._outbox.resend(self.all())
 
@@ -172,7 +178,7 @@ class Feed:
         return [self.status, *self.channels, *([self.frames] if self.frames else [])]
 
     def _is_due(self, channel: ValueChannel | FramesChannel, frame: Frame) -> bool:
-        """Return whether to publish a change now; else it is rate-limited, or within the deadband."""
+        """Return whether to publish a change now: no rate limit or dead-band holds it back."""
         if not channel.limited:
             return True
         if channel in self._limited or channel.due_ns > self.block.now_ns():
@@ -181,10 +187,10 @@ class Feed:
         return channel.moved(frame.image)
 
     def mark_due(self) -> int | None:
-        """Mark the channels whose rate limit has elapsed.
+        """Mark the channels whose rate limit no longer applies.
 
         Returns:
-            When the next one elapses, in ns of the source's clock; None: none is waiting.
+            When the next rate limit ends, in ns of the source's clock, or None if none is pending.
 
         """
         now_ns, frame = self.block.now_ns(), self.follower.frame
@@ -204,5 +210,5 @@ def _chosen(layout: Layout, rules: TopicRules, source: str) -> Iterator[tuple[Re
         for part in elements(layout, register) if rule.elements and register.dims else (register,):
             yield part, rule
     for path in rules.parts(source):
-        with suppress(PathError):  # a reload has brought another layout; `check` tells
+        with suppress(PathError):  # a reload has changed the layout; `shmio-supervisor check` reports this
             yield find(layout, path), rules.of(source, path)

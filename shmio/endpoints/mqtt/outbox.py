@@ -1,7 +1,7 @@
 """Queues topics for the broker in the order of their first change, each with its newest value.
 
-While the broker is away, each change goes to a bounded backlog instead, which is sent first when the
-broker is back.
+While the broker is away, every change goes to a bounded backlog instead. The backlog is sent first
+when the broker is back.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from paho.mqtt.properties import Properties
 from shmio.endpoints.mqtt.topics import Channel, Message
 
 OVERHEAD_BYTES: Final = 200
-"""Approximate memory of one message beside its payload."""
+"""Approximate memory of one message in addition to its payload."""
 TURN_MESSAGES: Final = 500
-"""Messages that are sent before other work has its turn."""
+"""Maximum number of messages that are sent in a row, before other work."""
 MAX_RESULTS: Final = 1024
-"""Maximum number of queued results; beyond that, the oldest are dropped."""
+"""Maximum number of queued results. Beyond it, the oldest are dropped."""
 
 Item = TypeVar("Item")
 
@@ -34,14 +34,14 @@ class _Entry(NamedTuple, Generic[Item]):
 
 
 class Backlog(Generic[Item]):
-    """A bounded memory with rows of items, first in, first out in each.
+    """A bounded memory for items in rows; each row is first in, first out.
 
     When it is full, the oldest item of all rows is dropped.
     """
 
     def __init__(self, most_bytes: int) -> None:
         self.count = 0
-        """Number of changes that are kept."""
+        """Number of changes in the backlog."""
         self.dropped = 0
         """Number of changes that were dropped because there was no room."""
         self.bytes = 0
@@ -51,9 +51,14 @@ class Backlog(Generic[Item]):
         """Sequence number of the newest item; older items have lower numbers."""
 
     def put(self, item: Item, size: int, *, row: str = "", changes: int = 1) -> None:
-        """Append the newest item, and drop the oldest ones until everything fits.
+        """Append an item, and drop the oldest ones until everything fits.
 
-        ``size``: in bytes; ``changes``: how many changes the item holds.
+        Args:
+            item: The item.
+            size: Size of the item, in bytes.
+            row: The row.
+            changes: Number of changes in the item.
+
         """
         self._number += 1
         self._rows.setdefault(row, deque()).append(_Entry(self._number, item, size, changes))
@@ -64,7 +69,7 @@ class Backlog(Generic[Item]):
             self.dropped += oldest.changes
 
     def put_back(self, item: Item, size: int) -> None:
-        """Insert an item before all others; drop it if there is no room."""
+        """Insert an item before all others, or drop it if there is no room."""
         if self.bytes + size > self._most:
             self.dropped += 1
             return
@@ -73,7 +78,7 @@ class Backlog(Generic[Item]):
         self._add(1, size)
 
     def pop(self, row: str = "") -> Item | None:
-        """Remove and return the oldest item of a row; None: the row is empty."""
+        """Remove and return the oldest item of a row, or return None if the row is empty."""
         kept = self._rows.get(row)
         if not kept:
             return None
@@ -93,15 +98,15 @@ class Backlog(Generic[Item]):
 
 
 class Sender(Protocol):
-    """What the outbox needs of a connection."""
+    """The part of a connection that the outbox uses."""
 
     @property
     def up(self) -> bool:
-        """Whether the connection is up."""
+        """True if the connection is up."""
 
     @property
     def room(self) -> int:
-        """How many messages can be sent now without queueing them in memory."""
+        """Number of messages that can be sent now without queueing them in memory."""
 
     def send(self, message: Message, properties: Properties | None = None) -> None:
         """Queue a message for :meth:`push`."""
@@ -111,37 +116,46 @@ class Sender(Protocol):
 
 
 class Outbox:
-    """Queues topics and results for the broker. Use it from the bridge's thread."""
+    """Queues topics and results for the broker. Use it only in the bridge's thread."""
 
     def __init__(self, connection: Sender, results: Sender, backlog_bytes: int) -> None:
-        """``connection``: for values; ``results``: for the results of commands."""
+        """Create the outbox.
+
+        Args:
+            connection: The connection for values.
+            results: The connection for the results of commands.
+            backlog_bytes: Maximum size of the backlog.
+
+        """
         self._connection, self._results = connection, results
         self._most = backlog_bytes
         self._backlog: Backlog[Message] = Backlog(backlog_bytes)
         self._waiting: dict[Channel, None] = {}
         self._results_waiting: deque[tuple[Message, Properties | None]] = deque(maxlen=MAX_RESULTS)
         self.keeping = False
-        """Whether changes are kept while disconnected: a connection has failed, or has been made
-        before."""
+        """True if changes are kept while there is no connection.
+
+        This is so after the first connection, or after an attempt to connect has failed.
+        """
         self._catching_up = False
-        """Whether the backlog is being sent, and then the current state of every topic."""
+        """True while the backlog is being sent, and then the current state of every topic."""
         self._catch_up_bytes = 0
         """Size up to which the backlog takes new changes while it is being sent.
 
-        It shrinks with what was sent: a broker slower than the changes would otherwise never catch
-        up.
+        It shrinks with what was sent. Otherwise a broker that is slower than the changes would
+        never catch up.
         """
         self.sent = 0
         self._dropped_results = 0
 
     @property
     def busy(self) -> bool:
-        """Whether anything is queued."""
+        """True if anything is queued."""
         return bool(self._waiting or self._backlog.count or self._results_waiting)
 
     @property
     def can_send(self) -> bool:
-        """Whether :meth:`flush` would send something now."""
+        """True if :meth:`flush` would send something now."""
         values, answers = self._waiting or self._backlog.count, self._results_waiting
         return bool((values and self._connection.room) or (answers and self._results.room))
 
@@ -161,7 +175,7 @@ class Outbox:
         return self._backlog.dropped + self._dropped_results
 
     def mark(self, channel: Channel) -> None:
-        """Mark a topic as changed; a topic that waits already keeps its place.
+        """Mark a topic as changed. A topic that waits already keeps its place.
 
         Until the backlog has been sent, new changes are appended to it, if there is room.
         """
@@ -171,7 +185,7 @@ class Outbox:
             message = channel.message(late=True)
             if message.keep:
                 self._backlog.put(message, _size(message))
-            if self._connection.up:  # what is kept is not retained; it may have been shown already
+            if self._connection.up:  # backlog messages are not retained, so the retained value must follow
                 self._waiting[channel] = None
 
     def mark_all(self, channels: Iterable[Channel]) -> None:
@@ -190,13 +204,13 @@ class Outbox:
                 self._catching_up, self._catch_up_bytes = True, self._most
 
     def queue_result(self, message: Message, properties: Properties | None) -> None:
-        """Queue the result of a command; results are sent before values."""
+        """Queue the result of a command. Results are sent before values."""
         if self._results.up:
             self._dropped_results += len(self._results_waiting) == MAX_RESULTS
             self._results_waiting.append((message, properties))
 
     def lose(self, unacknowledged: Iterable[Message]) -> None:
-        """After a lost connection, keep its unacknowledged messages and what was queued."""
+        """After a lost connection, keep its unacknowledged messages and the changes that waited."""
         for message in reversed(list(unacknowledged)):
             if message.keep:
                 self._backlog.put_back(message._replace(retain=False), _size(message))
@@ -213,7 +227,7 @@ class Outbox:
             self._waiting.pop(channel, None)
 
     def flush(self) -> None:
-        """Send what is queued, up to a limit, in batches while the connections have room."""
+        """Send queued messages, up to a limit, in batches while the connections have room."""
         if not self._results.up:
             self._results_waiting.clear()  # results are lost with their connection
         self._pass(self._results, self._answered)
@@ -237,7 +251,7 @@ class Outbox:
             yield self._results_waiting.popleft()
 
     def _due(self) -> Iterator[tuple[Message, Properties | None]]:
-        """Yield the backlog's messages, then those of the changed topics."""
+        """Yield the messages of the backlog, then those of the changed topics."""
         while (message := self._backlog.pop()) is not None:
             self._catch_up_bytes -= _size(message) // 2
             yield message, _time_of(message)
@@ -248,7 +262,10 @@ class Outbox:
 
 
 def _time_of(message: Message) -> Properties | None:
-    """Make the MQTT 5 property with the source time of a late value; most payloads lack it."""
+    """Return the MQTT 5 property with the source time of a late value.
+
+    Most payloads do not have this time.
+    """
     if not message.source_ns:
         return None
     properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]

@@ -1,4 +1,4 @@
-"""Delivers steps of virtual time: each waits until the broker has acknowledged what it changed."""
+"""Delivers steps of virtual time: each waits until the broker has acknowledged its changes."""
 
 from __future__ import annotations
 
@@ -17,29 +17,38 @@ from shmio.model.clock import Clock
 from shmio.segment.clock import ClockPage
 
 PATIENCE_S: Final = 3.0
-"""Time limit for a broker to acknowledge a step; less than a step's own time-out."""
+"""Time limit for a broker to acknowledge a step; less than the time-out of a step."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 class StepDelivery:
-    """Delivers steps to the broker. Use it from the bridge's thread."""
+    """Delivers steps to the broker. Use it only in the bridge's thread."""
 
     def __init__(self, clock: ClockPage, index: int, topic: str, connection: BrokerConnection, outbox: Outbox) -> None:
-        """``index``: number of this process's slot."""
+        """Let each step from now on wait for this process.
+
+        Args:
+            clock: The clock page.
+            index: Index of this process's slot.
+            topic: Topic of the step markers.
+            connection: The connection for values.
+            outbox: Queues the messages.
+
+        """
         self._clock, self._index, self._topic, self._connection, self._outbox = clock, index, topic, connection, outbox
         self._delivering: StepMarker | None = None
         self._until_s = 0.0
         self._virtual = False  # whether time was virtual at the last poll
         self.done = clock.read().done
-        """The last step that was delivered."""
-        clock.deliver(index, self.done)  # from now on each step waits for it
+        """Number of the last step that was delivered."""
+        clock.deliver(index, self.done)  # from now on each step waits for this process
 
     def poll(self, feeds: Collection[Feed]) -> Collection[Feed]:
-        """Start to deliver a step that is done, or finish it; update which feeds steps drive.
+        """Begin to deliver a new step, or finish a delivery; update which feeds steps drive.
 
         Returns:
-            The feeds that steps no longer drive: they may have frames that were not read.
+            The feeds that steps no longer drive. They may have frames that were not read.
 
         """
         now = self._clock.read()
@@ -69,11 +78,11 @@ class StepDelivery:
         self._outbox.flush()
 
     def _over(self, marker: StepMarker) -> bool:
-        """Return whether the step is delivered: acknowledged, timed out, or the broker is away."""
+        """Return whether the delivery has ended: acknowledged, timed out, or without a broker."""
         if not self._connection.up:
             return True
         if marker.sent is not None and not self._connection.is_unacknowledged(marker.sent):
-            return True  # a broker acknowledges in the order in which it was sent (MQTT 5.0, section 4.6)
+            return True  # a broker acknowledges in the order of sending (MQTT 5.0, section 4.6)
         if time.monotonic() >= self._until_s:
             log.warning("step %d: the broker does not accept it", marker.number)
             self._connection.drop(f"it did not accept step {marker.number} within {PATIENCE_S:g} s")
@@ -81,12 +90,12 @@ class StepDelivery:
         return False
 
     def close(self) -> None:
-        """Tell the clock not to wait for this process any more."""
+        """Let steps no longer wait for this process."""
         self._clock.abstain(self._index)
 
 
 class StepMarker:
-    """The channel of the message that says that a step is over."""
+    """The channel of the message that reports the end of a step."""
 
     def __init__(self, topic: str, state: Clock) -> None:
         self.number = state.done

@@ -1,7 +1,7 @@
 """Corrects what other clients publish on the bridge's topics, with growing pauses.
 
-Without the pauses, two bridges with one prefix, or brokers that return each other's messages, would
-correct each other without end.
+Without the pauses, two bridges with the same prefix would correct each other endlessly. So would
+brokers that return each other's messages.
 """
 
 from __future__ import annotations
@@ -15,19 +15,22 @@ from typing import Final, Protocol
 from shmio.backoff import Backoff
 
 AT_ONCE: Final = 200
-"""Topics that are corrected together."""
+"""Maximum number of topics that are corrected together."""
 PAUSE: Final = Backoff(0.1, 5.0)
-"""Pauses between corrections; they grow while others keep publishing on our topics."""
+"""Pauses between corrections. They grow while others continue to publish on our topics."""
 CALM_PAUSES: Final = 4
-"""Number of pauses without a correction that resets the pause to its shortest."""
+"""Number of pauses without a correction after which the pauses are short again."""
 CALM_S: Final = 60.0
-"""Time without a rest that resets the rest to its shortest."""
+"""Time without a rest after which the rests are short again."""
 MOST_WAITING: Final = 1000
-"""Maximum number of topics to correct; beyond that, everything is published again."""
+"""Maximum number of topics to correct. Beyond it, everything is published again."""
 MOST_HEARD: Final = 2000
-"""Messages of others in one second beyond which a rest begins, in which nothing is corrected."""
+"""Maximum number of others' messages in one second.
+
+Beyond it, a rest begins without corrections.
+"""
 REST: Final = Backoff(10.0, 320.0)
-"""The rests; they grow while others keep publishing on our topics."""
+"""Durations of the rests. They grow while others continue to publish on our topics."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -49,20 +52,20 @@ class TopicOwner(Protocol):
 
 
 class TopicGuard:
-    """Decides when to correct which topics. Use it from the bridge's thread."""
+    """Decides when to correct which topics. Use it only in the bridge's thread."""
 
     def __init__(self, owner: TopicOwner, now_s: Callable[[], float] = time.monotonic) -> None:
         self._owner, self._now_s = owner, now_s
         self._waiting: dict[str, None] = {}
         self._everything = False
         self._pauses = self._rests = 0
-        """How many followed each other: the next one is longer."""
+        """Numbers of consecutive pauses and rests; each is longer than the one before."""
         self._due_s = self._until_s = self._second_s = 0.0
         self._count = 0
         self._resting = False
 
     def begin(self) -> None:
-        """Start after a connect: everything is being published, so nothing is left to correct."""
+        """Begin after a connect: everything is published anyway, so there is nothing to correct."""
         if not self._resting:
             self._waiting.clear()
             self._everything = False
@@ -91,7 +94,7 @@ class TopicGuard:
             self._waiting[topic] = None
 
     def turn(self) -> float:
-        """Correct what is due, and return in how many seconds to call again."""
+        """Correct what is due, and return after how many seconds to call this again."""
         now_s = self._now_s()
         if self._resting:
             if now_s < self._until_s:

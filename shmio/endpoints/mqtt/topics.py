@@ -1,4 +1,4 @@
-"""Topics that the bridge publishes: the configuration's rules, and channels.
+"""The topics that the bridge publishes: the configuration's rules, and channels.
 
 A channel makes the payload of one topic when the outbox sends it.
 """
@@ -29,13 +29,13 @@ _ToJson = Callable[[bytes], Any]
 
 
 class TopicRules:
-    """The configuration's rules; the first that matches counts."""
+    """The configuration's rules for topics. The first rule that matches is used."""
 
     def __init__(self, topics: Sequence[MqttTopic]) -> None:
         """Compile the rules.
 
         Raises:
-            PathError: A pattern is invalid.
+            PathError: A pattern is not valid.
 
         """
         self._frames = {pattern: rule for rule in topics if rule.payload == "frames" for pattern in rule.patterns}
@@ -59,7 +59,13 @@ class TopicRules:
                 yield path
 
     def structure(self, source: str, path: str) -> str | None:
-        """Return the structure that a register is published in; empty: the source; None: by itself."""
+        """Return the structure as part of which a register is published.
+
+        Returns:
+            The path of the structure; empty: the whole source; None: the register has its own
+                topic.
+
+        """
         glob, rule = self._first(f"{source}/{path}")
         if glob is None or rule.payload != "structure":
             return None
@@ -71,7 +77,7 @@ class TopicRules:
         return next((found for found in self._rules if found[0].matches(full)), (None, DEFAULT))
 
     def frames(self, source: str) -> MqttTopic | None:
-        """Return the rule for a source's whole frames; None: they are not published."""
+        """Return the rule for a source's whole frames, or None if these are not published."""
         rule = self._frames.get(source)
         return rule if rule and rule.publish else None
 
@@ -79,8 +85,8 @@ class TopicRules:
 class Message(NamedTuple):
     """One message for the broker.
 
-    ``keep``: it is a change of a value, which the backlog keeps while the broker is away.
-    ``source_ns``: when the source had the value, in ns since 1970; 0: unknown, or no value.
+    ``keep`` is True for a change of a value, which the backlog keeps while the broker is away.
+    ``source_ns`` is the time of the value at the source, in ns since 1970; 0: unknown, or no value.
     """
 
     topic: str
@@ -99,19 +105,19 @@ class Channel(Protocol):
     def message(self, *, late: bool = False) -> Message:
         """Make the message from the current state.
 
-        ``late``: it will not be sent now, but when the broker is back.
+        If ``late``, it is not sent now, but when the broker is back.
         """
 
 
 class _RuledChannel:
-    """A topic that a rule selects."""
+    """A topic that has a rule of the configuration."""
 
     json = False
 
     def __init__(self, follower: FrameFollower, topic: str, rule: MqttTopic) -> None:
         self.topic = topic
         self.limited = rule.deadband > 0 or rule.max_rate_hz is not None
-        """Whether a deadband or a maximum rate limits what is published."""
+        """True if a dead-band or a maximum rate applies."""
         self.due_ns = 0
         """When the next message may be sent, in ns of the source's clock."""
         self._follower = follower
@@ -119,11 +125,11 @@ class _RuledChannel:
         self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
 
     def moved(self, _image: bytes) -> bool:
-        """Return whether a change is large enough to publish: always, without a deadband."""
+        """Return whether a change is large enough to publish. Without a dead-band it always is."""
         return True
 
     def _pause(self) -> None:
-        """Start the pause until the next message."""
+        """Start the pause before the next message."""
         if self.limited:
             self.due_ns = self._follower.block.now_ns() + self._pause_ns
 
@@ -133,7 +139,7 @@ class _RuledChannel:
 
 
 class RegisterChannel(_RuledChannel):
-    """The topic of a register or an array's element, as text or JSON."""
+    """The topic of a register or an array element, as text or JSON."""
 
     def __init__(self, follower: FrameFollower, register: Register, topic: str, rule: MqttTopic) -> None:
         super().__init__(follower, topic, rule)
@@ -145,14 +151,14 @@ class RegisterChannel(_RuledChannel):
         self._sent: Value = None
 
     def moved(self, image: bytes) -> bool:
-        """Return whether the value is outside the deadband around the last one sent."""
+        """Return whether the value is outside the dead-band around the last value sent."""
         if not self._deadband:
             return True
         pairs = zip(_flat(self._decode(image)), _flat(self._sent), strict=False)
         return self._sent is None or any(_apart(new, old, self._deadband) for new, old in pairs)
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message; without a good value, text is empty, and JSON says why."""
+        """Make the message. Without a good value, a text is empty, and JSON has the reason."""
         return self._message(self._json(late=late) if self.json else self._text(), late=late)
 
     def _text(self) -> bytes:
@@ -188,7 +194,16 @@ class StructureChannel(_RuledChannel):
     def __init__(
         self, follower: FrameFollower, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic
     ) -> None:
-        """``path``: of the structure that contains the registers; empty: the whole source."""
+        """Create the channel.
+
+        Args:
+            follower: Follows the block.
+            path: Path of the structure; empty: the whole source.
+            registers: The registers of the structure.
+            topic: The topic.
+            rule: The rule of the topic.
+
+        """
         super().__init__(follower, topic, rule)
         self.registers = registers
         depth = path.count("/") + 1 if path else 0
@@ -196,7 +211,7 @@ class StructureChannel(_RuledChannel):
         self._value = _members(parts, follower.block.layout)
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message; while the quality is bad, with the last known values."""
+        """Make the message. While the quality is bad, it has the last known values."""
         follower = self._follower
         block, frame = follower.block, follower.frame
         self._pause()
@@ -212,10 +227,10 @@ ValueChannel = RegisterChannel | StructureChannel
 
 
 class FramesChannel(_RuledChannel):
-    """The topic of a block's frames: the bytes of the effective image."""
+    """The topic of a block's frames: the bytes of the image that consumers see."""
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message; empty while there is no good frame."""
+        """Make the message, which is empty while there is no good frame."""
         frame, quality = self._follower.frame, self._follower.quality
         self._pause()
         return self._message(b"" if frame is None or quality is Quality.BAD else frame.image, late=late)
@@ -228,14 +243,14 @@ class StatusChannel:
         self.topic = topic
         self._follower = follower
 
-    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is published again when the broker is back
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is sent again when the broker is back
         """Make the message from the current state."""
         follower = self._follower
         return status(self.topic, follower.quality, follower.reason, follower.missed, follower.frame)
 
 
 class BridgeStatusChannel:
-    """The topic of the bridge's status: always online; the will says offline."""
+    """The topic of the bridge's status. Its message is ``online``; the will is ``offline``."""
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
@@ -246,7 +261,10 @@ class BridgeStatusChannel:
 
 
 class ClearedTopic:
-    """A topic that is no longer published; an empty message deletes the broker's retained one."""
+    """A topic that is no longer published.
+
+    An empty message deletes the retained one at the broker.
+    """
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
@@ -274,7 +292,13 @@ def _json_payload(
 def status(topic: str, quality: Quality, reason: str, missed: int, frame: Frame | None = None) -> Message:
     """Make the message of a source's status topic.
 
-    ``missed``: number of frames that were skipped.
+    Args:
+        topic: The topic.
+        quality: The source's quality.
+        reason: Why the quality is not good.
+        missed: Number of frames that were skipped.
+        frame: The newest frame, or None.
+
     """
     fields = {
         "quality": str(quality),
@@ -301,9 +325,12 @@ def _apart(new: Value, old: Value, deadband: float) -> bool:
 
 
 def _members(parts: Sequence[tuple[list[str], Register]], layout: Layout) -> _ToJson:
-    """Make the decoder of a JSON object.
+    """Return the function that makes a JSON object of an image.
 
-    ``parts``: each register with the names that lead to it from here.
+    Args:
+        parts: Each register, with the names of its path below this object.
+        layout: The layout of the block.
+
     """
     groups: dict[str, list[tuple[list[str], Register]]] = {}
     for (name, *rest), register in parts:

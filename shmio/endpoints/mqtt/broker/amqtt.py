@@ -1,8 +1,8 @@
-"""Our own broker where there is no mosquitto: aMQTT, MQTT 3.1.1, for development on one host.
+"""aMQTT as our own broker where mosquitto is not installed. It is for development on one host.
 
-Every program that reaches it may publish and subscribe to everything. aMQTT publishes wills without
-asking its plugins, and replaces a client's session before it authenticates, so that roles cannot be
-enforced.
+It speaks MQTT 3.1.1. Every program that reaches it may publish and subscribe to everything. Roles
+cannot be enforced: aMQTT publishes wills without asking its plugins, and replaces a client's
+session before it authenticates the new client.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from shmio.worker import BEAT_S, Worker
 GREETING_S: Final = 10.0
 _LISTENER: Final = "default"
 _CONFIG: Final = {
-    "listeners": {_LISTENER: {"type": "external"}},  # we accept the connections, one listener being a UNIX socket
+    "listeners": {_LISTENER: {"type": "external"}},  # we accept the connections, because one socket is a UNIX socket
     "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {}},
 }
 _UNSUPPORTED: Final = b"\x20\x03\x00\x84\x00"
-"""MQTT 5.0, section 3.2: a CONNACK that refuses the protocol's version."""
+"""A CONNACK that refuses the version of the protocol (MQTT 5.0, section 3.2)."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -37,14 +37,14 @@ async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
     """Run the broker until the worker is stopped.
 
     Raises:
-        EndpointError: It cannot listen on the address.
+        EndpointError: The broker cannot listen on the address.
 
     """
     for library in ("amqtt", "transitions"):
         logging.getLogger(library).setLevel(logging.ERROR)
     broker = Broker(_CONFIG)
     await broker.start()
-    new_secret(place)  # the bridge's client ids contain it: others, not knowing them, cannot take them over
+    new_secret(place)  # the bridge's client ids contain it, so that others cannot guess them and take them over
     servers: list[asyncio.Server] = []
 
     async def take(reader: StreamReader, writer: StreamWriter) -> None:
@@ -78,19 +78,19 @@ async def _serve(broker: Broker, reader: StreamReader, writer: StreamWriter) -> 
     try:
         begun = await asyncio.wait_for(_until_version(reader), GREETING_S)
         if begun.endswith(b"MQTT\5"):
-            writer.write(_UNSUPPORTED)  # aMQTT would wait for more of what it takes for version 3.1.1
+            writer.write(_UNSUPPORTED)  # aMQTT would parse the packet as version 3.1.1, and wait for more bytes
         else:
             await broker.external_connected(_Reader(reader, begun), _Writer(writer), _LISTENER)
     except (OSError, TimeoutError, IncompleteReadError):
         pass  # the client is gone, or speaks another protocol
-    except Exception as error:  # noqa: BLE001  such as "dictionary changed size": others subscribed at the same time
+    except Exception as error:  # noqa: BLE001  such as "dictionary changed size" when others subscribe concurrently
         log.warning("aMQTT ended a connection, for %r; the client has to connect again", error)
     finally:
         writer.close()
 
 
 async def _until_version(reader: StreamReader) -> bytes:
-    """Read what a client sends first, up to the protocol's version in a CONNECT."""
+    """Read the beginning of a CONNECT packet, up to the version of the protocol."""
     head = await reader.readexactly(2)
     while head[-1] & 0x80 and len(head) < 5:  # the packet's length has one to four bytes
         head += await reader.readexactly(1)
@@ -98,7 +98,7 @@ async def _until_version(reader: StreamReader) -> bytes:
 
 
 class _Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classes have no types
-    """Reads the bytes that were already read, then the rest."""
+    """Returns the bytes that were read before, then reads the rest."""
 
     def __init__(self, reader: StreamReader, begun: bytes) -> None:
         super().__init__(reader)
@@ -115,5 +115,5 @@ class _Writer(StreamWriterAdapter):  # type: ignore[misc]
     """Gives clients of the UNIX socket an address, because aMQTT refuses clients without one."""
 
     def get_peer_info(self) -> tuple[str, int]:
-        """The client's host and port."""
+        """Return the host and port of the client."""
         return super().get_peer_info() or ("bridge", 0)

@@ -1,7 +1,7 @@
 """The directory of our own broker, with its socket and the bridge's password.
 
-It is beside the supervisor's socket, and only this user can read it. The password is new at each
-start of the broker, and only the UNIX socket accepts it.
+The directory is next to the supervisor's socket, and only this user can read it. Each start of the
+broker makes a new password, which only the UNIX socket accepts.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shmio.errors import EndpointError
 from shmio.segment import Segment
 
 SOCKET: Final = "s"
-"""Name of the socket; its path must be no longer than that of the supervisor's socket."""
+"""Name of the socket. The socket's path must not be longer than that of the supervisor's socket."""
 SECRET: Final = "key"  # noqa: S105  a name
 """Name of the file with the bridge's password."""
 BRIDGE: Final = "bridge"
@@ -28,7 +28,7 @@ ID: Final = re.compile(r"(?<=-)[0-9a-f]{32}\b")
 
 
 def folder(segment: Segment) -> Path:
-    """Return the directory's path; the directory need not exist."""
+    """Return the path of the directory, which need not exist."""
     return Path(f"{segment.header.control.removesuffix('.sock')}.mq")
 
 
@@ -38,7 +38,7 @@ def own_socket(segment: Segment) -> str:
 
 
 def write_private(file: Path, text: str) -> None:
-    """Create a file with mode 0600; it must not exist."""
+    """Create a file with mode 0600. The file must not exist."""
     fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     with open(fd, "w", encoding="utf-8") as stream:  # noqa: PTH123  a descriptor
         stream.write(text)
@@ -48,7 +48,7 @@ def prepare(place: Path) -> None:
     """Create the directory with mode 0700, or empty it.
 
     Raises:
-        EndpointError: It is not a directory, or belongs to another user.
+        EndpointError: The path is not a directory, or belongs to another user.
 
     """
     try:
@@ -66,7 +66,7 @@ def prepare(place: Path) -> None:
 
 
 def clear(place: Path) -> None:
-    """Remove the directory's files."""
+    """Remove the files in the directory."""
     for entry in place.iterdir():
         if not entry.is_dir():
             entry.unlink(missing_ok=True)
@@ -86,15 +86,18 @@ def new_secret(place: Path) -> str:
 
 
 def secret_of(socket: str) -> str:
-    """Read the bridge's password for the broker of a socket.
+    """Read the bridge's password for the broker at a socket.
 
     Raises:
-        FileNotFoundError: The broker does not run.
+        FileNotFoundError: The broker is not running.
 
     """
     return Path(socket).with_name(SECRET).read_text(encoding="utf-8")
 
 
 def secret_id(client_id: str, secret: str) -> str:
-    """Return a client id that others cannot guess: whoever knows it can disconnect the client."""
+    """Return a client id that others cannot guess.
+
+    Anyone who knows the id of a client can disconnect that client.
+    """
     return f"{client_id}-{hashlib.sha256(f'{secret} {client_id}'.encode()).hexdigest()[:32]}"

@@ -1,6 +1,6 @@
-"""Eclipse Mosquitto as our own broker: its configuration, its access rules, and the process itself.
+"""Eclipse Mosquitto as our own broker: its configuration, its access rules, and its process.
 
-Only the bridge publishes values, status and results.
+Only the bridge may publish values, status and results.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ STOP_S: Final = 3.0
 MAX_PACKET_BYTES: Final = 1 << 21
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
-"""Maximum queue for one slow client; newer messages are dropped for it alone."""
+"""Maximum size of the queue for one slow client. The client loses newer messages."""
 MAX_LEVELS: Final = 64
-"""Maximum number of levels of a register's path that can be written by MQTT."""
+"""Maximum number of levels in the path of a register that can be written by MQTT."""
 READERS: Final = MqttAccount(roles=["read"])
 """The account of clients that have no ``[[mqtt.account]]``."""
 _STAMP: Final = re.compile(r"^\d+: ")
@@ -38,14 +38,18 @@ log = logging.getLogger("shmio.mqtt")
 
 
 def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
-    """Make the text of mosquitto.conf(5).
+    """Return the text of mosquitto.conf(5).
 
-    ``anonymous``: clients without an account are let in.
+    Args:
+        settings: The configuration's ``[mqtt]`` section.
+        place: The broker's directory.
+        anonymous: Whether clients without an account may connect.
+
     """
     address = Address.parse(str(settings.listen))
     lines = [
         "per_listener_settings true",
-        "user root",  # only used when started by root: with another user it would not die with its parent
+        "user root",  # matters only if root starts it: under another user it would not die with its parent
         "persistence false",
         "log_dest stderr",
         *(f"log_type {kind}" for kind in ("error", "warning", "notice")),
@@ -62,16 +66,16 @@ def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
         lines += [f"certfile {tls.certificate}", f"keyfile {tls.key}"]
         if tls.ca:
             lines += [f"cafile {tls.ca}", "require_certificate true"]
-    # Our socket comes last: once it accepts connections, the other listener does, too.
+    # Our socket comes last: when it accepts connections, the other listener already does.
     lines += [f"listener 0 {place / SOCKET}", "allow_anonymous false"]
     lines += [f"password_file {place / 'bridge'}", f"acl_file {place / 'bridge-rights'}"]
     return "".join(f"{line}\n" for line in lines)
 
 
 class Rights(NamedTuple):
-    """What an account may do.
+    """The rights of an account.
 
-    ``filters``: the topics on which it may publish.
+    ``filters`` are the topics on which it may publish.
     """
 
     read: bool
@@ -79,9 +83,15 @@ class Rights(NamedTuple):
 
 
 def rights(settings: Mqtt, instance: str, accounts: Iterable[str] | None) -> dict[str | None, Rights]:
-    """Return each account's rights by name; None: clients without an account.
+    """Return the rights of each account, by its name.
 
-    ``accounts``: names of the accounts that have a password; None: passwords are not used.
+    The name None stands for clients without an account.
+
+    Args:
+        settings: The configuration's ``[mqtt]`` section.
+        instance: Name of the instance.
+        accounts: Names of the accounts that have a password; None: passwords are not used.
+
     """
     given = {account.name: account for account in settings.account}
     for name in [None] if accounts is None else accounts:
@@ -103,9 +113,12 @@ def _commands(settings: Mqtt, instance: str) -> Iterator[str]:
 
 
 def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
-    """Make an ACL file; mosquitto denies what it does not allow, wills too.
+    """Return the text of an ACL file. Mosquitto denies everything else, also in wills.
 
-    ``accounts``: there are accounts; else the user name that a client gives is ignored.
+    Args:
+        given: The rights of each account, by its name.
+        accounts: Whether there are accounts; if not, the user name that a client gives is ignored.
+
     """
     lines = []
     # Clients without an account come before all names.
@@ -120,13 +133,16 @@ def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
 
 
 class Mosquitto:
-    """The mosquitto process. Start it from the main thread: it dies with that thread."""
+    """The mosquitto process.
+
+    Start it from the main thread, because it dies with the thread that starts it.
+    """
 
     def __init__(self, program: str, settings: Mqtt, instance: str, place: Path) -> None:
         """Start mosquitto.
 
         Raises:
-            ConfigError: The file of accounts cannot be read.
+            ConfigError: The file with the accounts cannot be read.
 
         """
         accounts = read_accounts(settings.password_file, settings.account) if settings.password_file else None
@@ -154,8 +170,12 @@ class Mosquitto:
     def await_start(self, beat: Callable[[], object]) -> None:
         """Wait until mosquitto accepts connections.
 
+        Args:
+            beat: Called repeatedly while waiting.
+
         Raises:
-            EndpointError: It has ended, or takes too long; with its last log line.
+            EndpointError: Mosquitto has ended, or takes too long. The message has its last log
+                line.
 
         """
         until_s = time.monotonic() + START_S
@@ -173,10 +193,10 @@ class Mosquitto:
             time.sleep(0.02)
 
     def check(self) -> None:
-        """Check that mosquitto runs.
+        """Check that mosquitto is running.
 
         Raises:
-            EndpointError: It has ended.
+            EndpointError: Mosquitto has ended.
 
         """
         code = self._process.poll()
@@ -197,7 +217,7 @@ class Mosquitto:
             self._process.stderr.close()
 
     def _read(self) -> None:
-        """Copy mosquitto's log lines to ours."""
+        """Copy mosquitto's log lines to our log."""
         for line in self._process.stderr or ():
             self._last = ID.sub("…", _STAMP.sub("", line.strip()))
             log.info("mosquitto: %s", self._last)

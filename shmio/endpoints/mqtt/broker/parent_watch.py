@@ -1,6 +1,7 @@
 """Runs a program that dies with the process that started it.
 
-Usage: ``parent_watch PARENT PROGRAM [ARGUMENT...]``.
+Usage: ``parent_watch PARENT PROGRAM [ARGUMENT...]``. PARENT is the id of the process that starts
+it.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ _PR_SET_PDEATHSIG: Final = 1  # prctl(2)
 
 
 def main() -> None:
-    """Replace this process by the program, or exit if the parent is dead already."""
+    """Replace this process by the program, or exit if the parent has died already."""
     parent, program = int(sys.argv[1]), sys.argv[2]
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() == parent:
-        os.execv(program, sys.argv[2:])  # noqa: S606  that is its purpose
+        os.execv(program, sys.argv[2:])  # noqa: S606  to run this program is the purpose
 
 
 if __name__ == "__main__":

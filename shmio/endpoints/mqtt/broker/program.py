@@ -1,4 +1,4 @@
-"""Selects the program of our own broker: mosquitto, or aMQTT for development where there is none."""
+"""Chooses the program of our own broker: mosquitto, or aMQTT for development where there is none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shmio.config import Address, Mqtt
 from shmio.errors import ConfigError
 
 PLACES: Final = ("/usr/local/sbin", "/usr/sbin", "/sbin")
-"""Searched after the PATH: Debian installs mosquitto where users do not look."""
+"""Directories to search after the PATH, because Debian installs mosquitto in one of them."""
 INSTALL: Final = "install mosquitto (Debian: apt install mosquitto)"
 EXTRA: Final = "pip install 'shmio[broker]'"
 MISSING: Final = f'mqtt.broker: "mosquitto" is not on this machine; {INSTALL}'
@@ -27,8 +27,9 @@ def find_mosquitto() -> str | None:
     """Find mosquitto.
 
     Returns:
-        The program that ``SHMIO_MOSQUITTO`` names, if it is set; else the one in the PATH or the usual places. None:
-        there is none, or ``SHMIO_MOSQUITTO`` is empty.
+        The program that ``SHMIO_MOSQUITTO`` names, if it is set; otherwise the one in the PATH or
+            in the
+        usual directories. None: there is none, or ``SHMIO_MOSQUITTO`` is empty.
 
     """
     named = os.environ.get("SHMIO_MOSQUITTO")
@@ -38,13 +39,14 @@ def find_mosquitto() -> str | None:
 
 
 def choose_broker(settings: Mqtt) -> str | None:
-    """Choose the program that is our own broker.
+    """Choose the program of our own broker.
 
     Returns:
         The path of mosquitto; None: aMQTT.
 
     Raises:
-        ConfigError: The program is not installed, or only aMQTT is, and cannot do what the settings demand.
+        ConfigError: Neither program is installed, or the settings demand mosquitto and only aMQTT
+            is installed.
 
     """
     program = find_mosquitto()
@@ -64,7 +66,7 @@ def choose_broker(settings: Mqtt) -> str | None:
 
 
 def _only_mosquitto(settings: Mqtt) -> Iterator[str]:
-    """Yield each setting that aMQTT does not enforce: its key, with what it says."""
+    """Yield each setting that aMQTT cannot satisfy: its key, and its meaning."""
     if not Address.parse(str(settings.listen)).loopback:
         yield f"mqtt.listen: {settings.listen} can be reached from other hosts"
     if settings.tls is not None:

@@ -1,1 +1,1 @@
-"""Connections to the broker: connecting, retrying, reading and writing the socket."""
+"""Connections to the broker: connecting, retrying, and reading and writing the socket."""

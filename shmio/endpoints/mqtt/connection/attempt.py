@@ -1,6 +1,6 @@
-"""One attempt to connect, and why it failed.
+"""Attempts to connect, and the reasons why they fail.
 
-It runs in a thread of its own, because files, DNS, TCP and TLS may block.
+Each attempt runs in its own thread, because files, DNS, TCP and TLS may block.
 """
 
 from __future__ import annotations
@@ -31,31 +31,31 @@ CONNECT_S: Final = 4.0
 SLOW_S: Final = 15.0
 SLOW: Final = "no answer yet: the broker, the name server, or the file system of mqtt.tls or mqtt.password_file is slow"
 MAX_PACKET_BYTES: Final = 1 << 21
-"""Maximum packet size that we accept; only MQTT 5 brokers are told."""
-# MQTT 5.0, section 2.4; paho gives those of 3.1.1 the same numbers.
+"""Maximum packet size that we accept. Only MQTT 5 tells the broker."""
+# Reason codes: MQTT 5.0, section 2.4. Paho uses the same numbers for MQTT 3.1.1.
 _WHO: Final = frozenset({0x86, 0x87})
 _BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
 _TAKEN_OVER: Final = 0x8E
 
 
 class BrokerClient(Client):
-    """A paho client that keeps the TLS error that ended the connection."""
+    """A paho client that remembers the TLS error that ended the connection."""
 
     tls_error: ssl.SSLError | None = None
-    """The TLS error after the connection was made, if that ended it."""
+    """The TLS error that ended the established connection, or None."""
 
 
 class _TlsClient(BrokerClient):
     def _sock_recv(self, bufsize: int) -> bytes:
         try:
             return super()._sock_recv(bufsize)
-        except ssl.SSLError as error:  # with TLS 1.3 a broker rejects our certificate only now
+        except ssl.SSLError as error:  # with TLS 1.3 a broker rejects our certificate only after the handshake
             self.tls_error = error
             raise
 
 
 class ConnectAttempt:
-    """An attempt to connect to the next broker; its thread starts at once."""
+    """An attempt to connect to the next broker. Its thread starts at once."""
 
     def __init__(
         self,
@@ -67,21 +67,29 @@ class ConnectAttempt:
     ) -> None:
         """Start the attempt.
 
-        ``most``: messages that the broker may send us unacknowledged; only MQTT 5 brokers are told.
-        ``wake``: called by the thread at the end, unless the attempt was abandoned.
+        Args:
+            policy: Chooses the broker.
+            protocol: The version of MQTT.
+            will: The will of the connection, or None.
+            most: Maximum number of messages that the broker may send before we acknowledge one.
+                Only MQTT 5 tells the broker.
+            wake: Called by the thread at the end, unless the attempt was abandoned.
+
         """
         self.target = policy.next()
         self._begun_s = time.monotonic()
         self.over = False
-        """Whether the attempt has ended, so that ``client``, ``socket`` and ``problem`` are final.
+        """True when the attempt has ended.
+
+        Then ``client``, ``socket`` and ``problem`` are final.
         """
         self.client: BrokerClient | None = None
         self.socket: socket.socket | None = None
-        """The connected socket, from which nothing has been read yet."""
+        """The connected socket, from which nothing was read yet."""
         self.sent = False
-        """Whether a CONNECT, with our client id and will, may have reached a broker."""
+        """True if a broker may have received a CONNECT, with our client id and will."""
         self.problem = ""
-        """Why the attempt failed; empty: it did not."""
+        """Why the attempt failed; empty if it did not."""
         self._policy, self._protocol, self._will, self._most, self._wake = policy, protocol, will, most, wake
         self._lock = threading.Lock()
         self._abandoned = False
@@ -89,7 +97,7 @@ class ConnectAttempt:
 
     @property
     def slow(self) -> bool:
-        """Whether the attempt takes unusually long."""
+        """True if the attempt takes unusually long."""
         return time.monotonic() >= self._begun_s + SLOW_S
 
     def abandon(self) -> None:
@@ -104,7 +112,7 @@ class ConnectAttempt:
             self._connect()
         except ConfigError as error:
             self.problem = str(error)
-        except (OSError, ValueError) as error:  # ValueError: a name with an empty part
+        except (OSError, ValueError) as error:  # ValueError: a host name with an empty part
             tls = self._policy.settings.tls is not None
             self.problem = f"broker {self.target}: {_why(error, self.target, tls=tls)}"
         if self.problem:
@@ -117,7 +125,7 @@ class ConnectAttempt:
         self._close()
 
     def _connect(self) -> None:
-        """Connect.
+        """Connect to the broker.
 
         Raises:
             ConfigError: A password or TLS file cannot be used.
@@ -126,7 +134,7 @@ class ConnectAttempt:
         settings, target, new = self._policy.settings, self.target, self._protocol == MQTTv5
         own = secret_of(target.host) if target.transport == "unix" else None
         client_id = self._policy.client_id
-        # Each attempt has a client of its own, so that no state is left from the one before.
+        # Each attempt has a new client, so that no state is left from the attempt before.
         client = self.client = (BrokerClient if settings.tls is None else _TlsClient)(
             CallbackAPIVersion.VERSION2,
             client_id if own is None else secret_id(client_id, own),
@@ -166,7 +174,7 @@ class ConnectAttempt:
 
 
 def close_socket(client: Client) -> None:
-    """Close a client's socket, whatever state it is in."""
+    """Close the socket of a client, whatever state the client is in."""
     client.on_disconnect = None
     made = client.socket()
     if made is not None:
@@ -175,7 +183,7 @@ def close_socket(client: Client) -> None:
 
 
 def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
-    """Describe a broker's reason code."""
+    """Describe the reason code of a broker."""
     if code.value in _WHO:
         return f"it refuses our login ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
     if code.value in _BUSY:
@@ -188,7 +196,11 @@ def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
 def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
     """Describe why a connection ended.
 
-    ``error``: the TLS error, if any; ``up``: the broker had accepted us; ``tls``: TLS is in use.
+    Args:
+        error: The TLS error, if there was one.
+        up: The broker had accepted us.
+        tls: TLS is in use.
+
     """
     if error is not None:
         return _tls(error)
@@ -198,10 +210,7 @@ def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
 
 
 def _why(error: Exception, target: Target, *, tls: bool) -> str:
-    """Describe why no connection could be made.
-
-    ``tls``: TLS is in use.
-    """
+    """Describe why no connection could be made; ``tls`` is True if TLS is in use."""
     if isinstance(error, ssl.SSLError):
         return _tls(error)
     if isinstance(error, socket.gaierror):

@@ -1,8 +1,8 @@
 """Connections to the broker: they reconnect with growing waits, and never block.
 
-Commands and their results have a connection of their own. On the connection for values, the broker's
-acknowledgements would queue behind all commands, and a flood of commands with QoS 0, which no limit
-holds back (MQTT 5.0, section 4.9), would delay values.
+Commands and their results have their own connection. On the connection for values, the broker's
+acknowledgements would wait behind all commands. A flood of commands with QoS 0, which no limit
+holds back (MQTT 5.0, section 4.9), would then delay values.
 """
 
 from __future__ import annotations
@@ -35,22 +35,25 @@ from shmio.endpoints.mqtt.topics import Message
 from shmio.layout.topic import shorten
 
 STABLE_S: Final = 5.0
-"""A connection that lasted this long resets the back-off."""
+"""A connection that has lasted this long resets the back-off."""
 MOST_TOLD: Final = 300
-"""Maximum length of the text with the problems of all brokers."""
+"""Maximum length of the text with the problems of all brokers, in characters."""
 SUBSCRIBE_S: Final = CONNECT_S
 """Time limit for the SUBACK of the subscription to commands."""
 MOST_IN_FLIGHT: Final = 1000
 """Maximum number of unacknowledged messages."""
 FEW_IN_FLIGHT: Final = 4
-"""The maximum where commands arrive: so many may be read in one turn, and each takes time."""
+"""The same for connections that receive commands.
+
+The broker may send so many in one turn, and each takes time.
+"""
 HEAD_BYTES: Final = 128
-"""Maximum size of a packet beside topic and payload."""
+"""Maximum size of the parts of a packet other than topic and payload."""
 OFTEN: Final = 4
 OFTEN_S: Final = 60.0
-"""After so many lost connections in this time, the problem names a likely cause."""
+"""If ``OFTEN`` connections are lost within this time, the problem names a likely cause."""
 REFUSED_S: Final = 10.0
-"""How long a refusal stays the current problem though the broker accepts other messages."""
+"""How long a refused message stays the current problem while the broker accepts others."""
 WITH_WILL: Final = "Disconnect with will message"
 _WATCHED: Final = 1
 """Identifier of the subscription to our own topics."""
@@ -59,9 +62,10 @@ log = logging.getLogger("shmio.mqtt")
 
 
 class Limits(NamedTuple):
-    """The limits that a broker states in its CONNACK (MQTT 5.0, section 3.2.2.3); MQTT 3.1.1 has none.
+    """The limits that a broker states in its CONNACK (MQTT 5.0, section 3.2.2.3).
 
-    ``in_flight``: unacknowledged messages; ``packet_bytes``: None: unlimited.
+    MQTT 3.1.1 has none. ``in_flight`` is the maximum number of unacknowledged messages.
+    ``packet_bytes`` is None if packets may have any size.
     """
 
     in_flight: int = MOST_IN_FLIGHT
@@ -69,13 +73,16 @@ class Limits(NamedTuple):
     qos: int = 1
     retain: bool = True
     identifiers: bool = True
-    """Whether subscriptions may have an identifier, which the broker adds to their messages."""
+    """True if subscriptions may have an identifier, which the broker adds to their messages."""
 
     @classmethod
     def from_connack(cls, properties: Properties | None, most: int) -> Limits:
         """Read the limits of a CONNACK.
 
-        ``most``: number of unacknowledged messages that we want.
+        Args:
+            properties: The properties of the CONNACK; None with MQTT 3.1.1.
+            most: The number of unacknowledged messages that we want.
+
         """
         given = vars(properties) if properties is not None else {}
         return cls(
@@ -94,20 +101,20 @@ class Limits(NamedTuple):
 
 
 def _subscription(*, retained: bool) -> SubscribeOptions:
-    """Make the options of a subscription to other clients' messages, each with its own retain flag.
+    """Return the options to subscribe to other clients' messages, each with its own retain flag.
 
-    ``retained``: the broker sends retained messages, too.
+    If ``retained``, the broker also sends retained messages.
     """
     before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
     return SubscribeOptions(1, noLocal=True, retainAsPublished=True, retainHandling=before)
 
 
 class ConnectionProblems:
-    """The current problem of a connection; each is logged once."""
+    """The current problem of a connection. Each problem is logged once."""
 
     def __init__(self) -> None:
         self.problem = ""
-        """The current problem; empty: none."""
+        """The current problem; empty if there is none."""
         self.refused = 0
         """Number of messages that the broker refused."""
         self._refused_s = 0.0
@@ -128,7 +135,7 @@ class ConnectionProblems:
         return f"{problem}, again and again; does another client connect as {client_id} (mqtt.client_id)?"
 
     def clear(self) -> None:
-        """Forget the problem: the connection is up."""
+        """Forget the problem, because the connection is up."""
         self.problem = self._subscription_problem = ""
 
     def subscription_refused(self, problem: str) -> None:
@@ -137,27 +144,28 @@ class ConnectionProblems:
         self.report(problem)
 
     def message_refused(self, problem: str) -> None:
-        """Count a message that was refused, and report it if there is no other problem."""
+        """Count a refused message, and report it unless there is another problem."""
         self.refused += 1
         self._refused_s = time.monotonic()
-        if not self.problem:  # the first stands for all that follow
+        if not self.problem:  # the first refusal represents those that follow
             self.report(problem)
 
     def message_accepted(self) -> None:
-        """End the problem of refused messages if the last refusal is long enough ago."""
+        """End the problem of refused messages if the last refusal was long enough ago."""
         if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
             self.problem = self._subscription_problem
 
 
 def is_watched(message: MQTTMessage) -> bool:
-    """Return whether a message is another client's, on one of our own topics."""
+    """Return whether a message comes from another client, on one of our own topics."""
     return _WATCHED in (vars(message.properties) if message.properties else {}).get("SubscriptionIdentifier", ())
 
 
 class BrokerConnection:
-    """A connection that reconnects. Use it from the bridge's thread.
+    """A connection to a broker that reconnects. Use it only in the bridge's thread.
 
-    It registers its socket with ``selector``; call the key's ``data`` when the socket is ready.
+    It registers its socket with ``selector``. Call the ``data`` of the key when the socket is
+    ready.
     """
 
     def __init__(
@@ -168,22 +176,27 @@ class BrokerConnection:
         will: Callable[[], Message | None],
         most: int,
     ) -> None:
-        """``wake``: called by a thread that needs :meth:`turn` to run.
+        """Prepare to connect; :meth:`turn` connects.
 
-        ``will``: returns the will for each CONNECT. ``most``: messages in flight, each way.
+        Args:
+            policy: Chooses the broker and the waits.
+            selector: Selects the sockets that are ready.
+            wake: Called by a thread that needs :meth:`turn` to run.
+            will: Returns the will for each CONNECT.
+            most: Maximum number of unacknowledged messages, in each direction.
+
         """
         self.up = False
         self.is_ready: Callable[[], bool] = lambda: True
-        """Called after CONNACK until it returns True; only then is the connection ``up``."""
+        """Called after CONNACK until it returns True. Only then the connection is ``up``."""
         self.came_up = False
-        """Set when the connection comes up; the user resets it."""
+        """Set when the connection comes up; the user of this object resets it."""
         self.on_lost: Callable[[list[Message]], None] = lambda _: None
-        """Called when the connection is lost, with the messages that the broker has not
-        acknowledged."""
+        """Called with the unacknowledged messages when the connection is lost."""
         self.problems = ConnectionProblems()
         self.connects = 0
         self.subscribed = False
-        """Whether the broker has answered the last subscription."""
+        """True if the broker has answered the last subscription."""
         self._policy, self._selector, self._wake, self._will, self._most = policy, selector, wake, will, most
         self.on_message: Callable[[MQTTMessage], None] = lambda _: None
         """Called with each message that arrives."""
@@ -191,35 +204,35 @@ class BrokerConnection:
         self._socket_io: SocketIo | None = None
         self._target: Target | None = None
         self._problem_of: dict[Target | None, str] = {}
-        """The last problem of each broker tried since the last connection."""
+        """The last problem of each broker that was tried since the last connection."""
         self._attempt: ConnectAttempt | None = None
         self._protocol = MQTTv5
         self._deadline_s: float | None = None
-        """Deadline for the broker's CONNACK; None: not waiting for it."""
+        """Deadline for the broker's CONNACK; None if we are not waiting for it."""
         self._retry_s = self._up_s = self._misc_s = 0.0
         self._new_will: Message | None = None  # not yet sent to any broker
         self._in_flight: dict[int, Message] = {}
         self._limits = Limits()
-        self._subscription = 0  # the subscription to commands
+        self._subscription = 0  # packet identifier of the subscription to commands
 
     @property
     def problem(self) -> str:
-        """Why there is no connection, or what the broker refuses; empty: no problem."""
+        """Why there is no connection, or what the broker refuses; empty if there is no problem."""
         return self.problems.problem
 
     @property
     def at(self) -> Target | None:
-        """The broker that has accepted our CONNECT."""
+        """The broker that has accepted our CONNECT, or None."""
         return None if self._client is None or self._deadline_s is not None else self._target
 
     @property
     def mqtt5(self) -> bool:
-        """Whether the connection is up and uses MQTT 5."""
+        """True if the connection is up and uses MQTT 5."""
         return self.up and self._protocol == MQTTv5
 
     @property
     def room(self) -> int:
-        """How many messages can be sent now without queueing them in memory."""
+        """Number of messages that can be sent now without queueing them in memory."""
         blocked = not self.up or self._socket_io is None or self._socket_io.writing
         return 0 if blocked else min(BATCH, self._limits.in_flight - len(self._in_flight))
 
@@ -231,7 +244,7 @@ class BrokerConnection:
     # ---- a turn ------------------------------------------------------------------------------------------------------
 
     def turn(self) -> float:
-        """Do what is due, and return in how many seconds to call again."""
+        """Do what is due, and return after how many seconds to call this again."""
         now_s = time.monotonic()
         if self._attempt is not None and self._attempt.over:
             self._take(self._attempt)
@@ -329,10 +342,13 @@ class BrokerConnection:
     # ---- dropping it -------------------------------------------------------------------------------------------------
 
     def drop(self, problem: str, *, politely: bool = False) -> None:
-        """Drop the connection, or the attempt that waits for CONNACK, for this reason.
+        """Drop the connection, or the attempt that waits for CONNACK.
 
-        ``politely``: send DISCONNECT, so that the will is not published. Do not call it so from a
-        callback.
+        Args:
+            problem: Why.
+            politely: Send DISCONNECT, so that the will is not published. Do not set this in a
+                callback.
+
         """
         problem = f"broker {self._target}: {problem}"
         if politely and self._client is not None:
@@ -351,7 +367,7 @@ class BrokerConnection:
             self._fail(problem)
 
     def _fall_back(self) -> None:
-        """Retry the same broker at once with MQTT 3.1.1."""
+        """Try the same broker again at once, with MQTT 3.1.1."""
         self._close()
         self._protocol = MQTTv311
         self._policy.retry_same()
@@ -361,7 +377,7 @@ class BrokerConnection:
     def _fail(self, problem: str) -> None:
         self._close()
         self._protocol = MQTTv5
-        # The status shows the last problem of each broker, since all are tried in turn.
+        # The status shows the last problem of each broker, because all are tried in turn.
         self._problem_of[self._target] = problem
         self.problems.report(
             shorten("; ".join(self._problem_of[one] for one in sorted(self._problem_of, key=str)), MOST_TOLD)
@@ -378,7 +394,7 @@ class BrokerConnection:
     # ---- sending and subscribing -------------------------------------------------------------------------------------
 
     def send(self, message: Message, properties: Properties | None = None) -> None:
-        """Queue a message for :meth:`push`; without a connection, drop it."""
+        """Queue a message for :meth:`push`. Without a connection, drop it."""
         client, limits = self._client, self._limits
         if client is None or not self.up:
             return
@@ -400,14 +416,14 @@ class BrokerConnection:
             self._socket_io.push()
 
     def is_unacknowledged(self, message: Message) -> bool:
-        """Return whether this very message was sent and is not acknowledged."""
+        """Return whether this message object was sent and is not acknowledged."""
         return any(one is message for one in self._in_flight.values())
 
     def subscribe(self, filters: Sequence[str], *, retained: bool = False) -> None:
         """Subscribe to filters.
 
-        Unless ``retained``, MQTT 5 brokers leave out retained messages; others mark them with the
-        retain flag. Messages from bridged brokers may have it, too: they are new to ours.
+        Unless ``retained``, MQTT 5 brokers leave out retained messages. MQTT 3.1.1 brokers send
+        them with the retain flag. New messages from bridged brokers may have this flag, too.
         """
         client = self._client
         self.subscribed = not filters
@@ -419,7 +435,10 @@ class BrokerConnection:
         self._subscription = self._subscription if retained or mid is None else mid
 
     def watch(self, filters: Sequence[str]) -> None:
-        """Subscribe to other clients' messages on our own topics; see :func:`is_watched`. MQTT 5 only."""
+        """Subscribe to other clients' messages on our own topics; see :func:`is_watched`.
+
+        This needs MQTT 5.
+        """
         if self._client is None or not (filters and self.mqtt5 and self._limits.identifiers):
             return  # we would receive our own messages, and could not tell them from retained ones
         properties = Properties(PacketTypes.SUBSCRIBE)  # type: ignore[no-untyped-call]
@@ -433,7 +452,7 @@ class BrokerConnection:
             self._client.unsubscribe(list(filters))
 
     def recall(self, filters: Sequence[str]) -> None:
-        """Ask the broker once for the messages that it retains on these filters."""
+        """Ask the broker once for the retained messages that match these filters."""
         self.subscribe(filters, retained=True)
         if self._client is not None and filters:
             self._client.unsubscribe(list(filters))
@@ -445,9 +464,11 @@ class BrokerConnection:
         self._problem_of.clear()
 
     def close(self, *, will: bool = False) -> None:
-        """Disconnect; messages already written to the socket still arrive.
+        """Disconnect. Messages that were written to the socket still arrive.
 
-        ``will``: have the broker publish the will, which needs MQTT 5.
+        Args:
+            will: Ask the broker to publish the will. This needs MQTT 5.
+
         """
         if self._client is not None:
             self._client.on_disconnect = None
@@ -463,7 +484,7 @@ class BrokerConnection:
 
 
 class CommandConnection:
-    """The connection for commands and results. Use it from the bridge's thread."""
+    """The connection for commands and their results. Use it only in the bridge's thread."""
 
     def __init__(
         self,
@@ -474,9 +495,16 @@ class CommandConnection:
         filters: Callable[[], Sequence[str]],
         answers: Callable[[], Sequence[str]],
     ) -> None:
-        """``selector``, ``wake``: see :class:`BrokerConnection`.
+        """Create the connection; :meth:`turn` connects.
 
-        ``filters``: returns the topics of commands; ``answers``: the topics of results.
+        Args:
+            settings: The configuration's ``[mqtt]`` section.
+            client_id: The client id of this connection.
+            selector: Selects the sockets that are ready.
+            wake: Called by a thread that needs :meth:`turn` to run.
+            filters: Returns the filters for commands.
+            answers: Returns the filters for results.
+
         """
         self._policy = ReconnectPolicy(settings, client_id, ())
         self.connection = BrokerConnection(self._policy, selector, wake, lambda: None, FEW_IN_FLIGHT)
@@ -488,16 +516,24 @@ class CommandConnection:
 
     @property
     def ready(self) -> bool:
-        """Whether commands can arrive, or it is known why not."""
+        """True if commands can arrive, or if the reason is known why they cannot."""
         return self.connection.subscribed or bool(self.connection.problem)
 
     @property
     def problem(self) -> str:
-        """Why no commands arrive or no results are sent; empty: no problem."""
+        """Why no commands arrive or no results are sent; empty if there is no problem."""
         return f"commands: {self.connection.problem}" if self.connection.problem else ""
 
     def turn(self, at: Target | None) -> float:
-        """Connect to the broker that has the values, and return in how many seconds to call again."""
+        """Connect to the broker that gets the values, and do what is due.
+
+        Args:
+            at: This broker, or None if there is no connection for values.
+
+        Returns:
+            After how many seconds to call this again.
+
+        """
         if at is not self._at:
             self._at = at
             self.connection.close()

@@ -1,4 +1,7 @@
-"""Reads and writes the socket of a connection when it is ready: reads a few packets at a time, writes in batches."""
+"""Reads and writes the socket of a connection, as far as it is ready.
+
+It reads a few packets at a time, and writes in batches.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +18,22 @@ from paho.mqtt.enums import MQTTErrorCode
 from shmio.endpoints.mqtt.connection.attempt import close_socket
 
 BATCH: Final = 32
-"""Messages in a batch, which share TCP segments; the first is not sent before the last is made."""
+"""Maximum number of messages in a batch.
+
+The messages of a batch share TCP segments. The first is sent when the last has been made.
+"""
 PACKETS: Final = 4
-"""Packets that are read before other work has its turn.
+"""Maximum number of packets that are read in a row, before other work.
 
 One call of paho may read one for each of our unacknowledged messages, which takes hardly any time.
 """
 
 
 class SocketIo:
-    """Reads and writes a client's socket. Use it from the bridge's thread.
+    """Reads and writes the socket of a client. Use it only in the bridge's thread.
 
-    It registers the socket with ``selector``; call the key's ``data`` when the socket is ready.
+    It registers the socket with ``selector``. Call the ``data`` of the key when the socket is
+    ready.
     """
 
     def __init__(
@@ -36,19 +43,27 @@ class SocketIo:
         selector: selectors.BaseSelector,
         on_failure: Callable[[str], object],
     ) -> None:
-        """``on_failure``: called with the reason when reading or writing fails."""
+        """Register the socket.
+
+        Args:
+            client: The paho client.
+            made: The client's socket.
+            selector: Selects the sockets that are ready.
+            on_failure: Called with the reason when reading or writing fails.
+
+        """
         self._client, self._selector, self._on_failure = client, selector, on_failure
         self._socket: socket.socket | None = made
         self.writing = False
-        """Whether data waits for room in the socket."""
+        """True while data waits until the socket has room."""
         self._packets = 0
-        """Number of packets read that called one of the client's callbacks."""
-        client.on_socket_register_write = lambda *_: None  # only we write from now on
+        """Number of packets that called one of the client's callbacks."""
+        client.on_socket_register_write = lambda *_: None  # from now on this object writes, not paho
         _set(made, socket.TCP_NODELAY, 1)  # a batch does not wait for the acknowledgement of the one before
         selector.register(made, selectors.EVENT_READ, self._serve)
 
     def counting(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Wrap a callback of the client so that each packet it reports is counted."""
+        """Wrap a callback of the client, to count the packets that call it."""
 
         def counted(*told: object) -> None:
             self._packets += 1
@@ -57,14 +72,14 @@ class SocketIo:
         return counted
 
     def turn(self) -> float:
-        """Do what the selector cannot see, and return in how many seconds to call again."""
+        """Do what the selector cannot see, and return after how many seconds to call this again."""
         if self._unseen():
             self._serve(selectors.EVENT_READ)
         self.push()
         return 0.0 if self._unseen() else 1.0
 
     def push(self) -> None:
-        """Write what the client has queued."""
+        """Write the messages that the client has queued."""
         if self._socket is not None and not self.writing and self._client.want_write():
             self._serve(0)
 
@@ -77,7 +92,7 @@ class SocketIo:
         close_socket(self._client)
 
     def _serve(self, events: int) -> None:
-        """Read and write a socket that is ready."""
+        """Read and write the socket as far as it is ready."""
         code = self._read() if events & selectors.EVENT_READ else MQTTErrorCode.MQTT_ERR_SUCCESS
         if not code and self._socket is not None and (events & selectors.EVENT_WRITE or not self.writing):
             code = self._write(self._socket)
@@ -89,7 +104,10 @@ class SocketIo:
             self._selector.modify(self._socket, events, self._serve)
 
     def _read(self) -> MQTTErrorCode:
-        """Read a few packets: by itself paho reads one for each of our unacknowledged messages."""
+        """Read a few packets.
+
+        Without a limit, paho reads one for each of our unacknowledged messages.
+        """
         before, most = -1, self._packets + PACKETS
         code = MQTTErrorCode.MQTT_ERR_SUCCESS
         while not code and before < self._packets < most and self._socket is not None:
@@ -98,12 +116,13 @@ class SocketIo:
         return code
 
     def _write(self, made: socket.socket) -> MQTTErrorCode:
-        """Write the client's queued messages, as many as the socket takes.
+        """Write the client's queued messages, as many as the socket accepts.
 
-        Do not use it for a DISCONNECT, after which paho closes the socket: corked data may be lost.
+        Do not use this for a DISCONNECT. Paho closes the socket after it, and corked data may be
+        lost.
         """
         client = self._client
-        # Else paho would call it for each message of QoS 0, which is slow.
+        # Otherwise paho would call it for each message of QoS 0, which is slow.
         acknowledged, client.on_publish = client.on_publish, None
         _set(made, socket.TCP_CORK, 1)
         code = client.loop_write()
@@ -112,12 +131,12 @@ class SocketIo:
         return code
 
     def _unseen(self) -> bool:
-        """Return whether TLS has buffered data, which a selector does not see."""
+        """Return whether TLS has buffered data, which the selector does not see."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
 
 def _set(made: socket.socket, option: int, value: int) -> None:
     """Set a TCP option; see tcp(7)."""
     if made.family != socket.AF_UNIX:
-        with suppress(OSError):  # it may have been closed
+        with suppress(OSError):  # the socket may have been closed
             made.setsockopt(socket.IPPROTO_TCP, option, value)

@@ -1,4 +1,4 @@
-"""The brokers' addresses, and when to try which of them."""
+"""The addresses of the brokers, and the order and times in which to try them."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from shmio.config import Mqtt
 from shmio.config.mqtt import brokers
 
 RECONNECT: Final = Backoff(0.25, 15.0, jitter=0.5)
-"""Waits before the next attempt. Jitter: the bridges of a plant must not all reconnect at once."""
+"""Waits before the next attempt.
+
+They vary at random, because the bridges of a plant must not all reconnect at the same time.
+"""
 RECONNECT_OWN: Final = Backoff(0.25, 0.5, jitter=0.5)
-"""The same for our own broker: it is on this host and is restarted at once."""
+"""Waits for our own broker, which is on this host and is restarted at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One broker.
-
-    ``host``: the socket's path if ``transport`` is unix.
-    """
+    """The address of one broker; ``host`` is the path of the socket if ``transport`` is ``unix``."""
 
     host: str
     port: int = 1883
@@ -35,7 +35,10 @@ class Target:
 def targets(settings: Mqtt, own_socket: str) -> list[Target]:
     """Return the brokers in the order in which to try them.
 
-    ``own_socket``: the socket of our own broker, which is used unless there is an external one.
+    Args:
+        settings: The configuration's ``[mqtt]`` section.
+        own_socket: Path of our own broker's socket, which is used unless the broker is external.
+
     """
     if settings.broker != "external":
         return [Target(own_socket, transport="unix", name="of this instance")]
@@ -43,7 +46,7 @@ def targets(settings: Mqtt, own_socket: str) -> list[Target]:
 
 
 class ReconnectPolicy:
-    """Selects the broker to try next, and how long to wait before."""
+    """Chooses the broker to try next, and the wait before."""
 
     def __init__(self, settings: Mqtt, client_id: str, there: Sequence[Target]) -> None:
         self.settings = settings
@@ -63,16 +66,19 @@ class ReconnectPolicy:
         self.reset_failures()
 
     def retry_same(self) -> None:
-        """Select the last broker again next."""
+        """Choose the last broker again next time."""
         self._next -= 1
 
     def next(self) -> Target:
-        """Return the next broker, and go on to the one after it."""
+        """Return the next broker, and advance to the one after it."""
         self._next += 1
         return self._targets[(self._next - 1) % len(self._targets)]
 
     def wait_s(self) -> float:
-        """Count a failure, and return how long to wait, in s: longer after each."""
+        """Count a failure, and return the wait before the next attempt, in s.
+
+        It grows with each failure.
+        """
         backoff = RECONNECT_OWN if all(target.transport == "unix" for target in self._targets) else RECONNECT
         wait_s = backoff.wait_s(self._failures // self.count)
         self._failures += 1

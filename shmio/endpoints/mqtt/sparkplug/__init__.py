@@ -1,1 +1,4 @@
-"""Sparkplug B (Eclipse Sparkplug Specification 3.0.0): the instance as an edge node, its sources as devices."""
+"""Sparkplug B (Eclipse Sparkplug Specification 3.0.0).
+
+The instance is an edge node, and its sources are devices.
+"""

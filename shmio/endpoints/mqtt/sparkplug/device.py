@@ -25,26 +25,27 @@ class DeviceEvent(Enum):
 
 
 class DeviceChange(NamedTuple):
-    """A change of a device.
-
-    ``at``: indices of the metrics that are new.
-    """
+    """A change of a device; ``at`` has the indices of the metrics with new values."""
 
     kind: DeviceEvent
     at: Sequence[int] = ()
 
 
 class Device:
-    """Follows one block for Sparkplug. Use it from the bridge's thread.
+    """Follows one block for Sparkplug. Use it only in the bridge's thread.
 
-    For a large layout, creating one takes seconds.
+    To create one takes seconds for a large layout.
     """
 
     def __init__(self, block: Block, command_client: CommandClient, globs: Sequence[Glob], *, elements: bool) -> None:
-        """``command_client``: sends commands to the source.
+        """Create the device.
 
-        ``globs``: select the metrics, by path with the source. ``elements``: each element of an
-        array is a metric.
+        Args:
+            block: The block of the source.
+            command_client: Sends commands to the source.
+            globs: Select the metrics, by path with the source's name.
+            elements: Make each element of an array a metric.
+
         """
         self.block = block
         self.command_client = command_client
@@ -58,16 +59,16 @@ class Device:
         self._follower = follow(block)
 
     def set_metrics(self, metrics: Sequence[Metric]) -> None:
-        """Set the metrics of the device's parts, in their order."""
+        """Set the metrics of the device's parts, in the order of the parts."""
         self._metrics = metrics
 
     @property
     def alive(self) -> bool:
-        """Whether the source's quality is good or uncertain."""
+        """True if the source's quality is good or uncertain."""
         return self._follower.quality is not Quality.BAD
 
     def poll(self) -> Iterator[DeviceChange]:
-        """Read a few new frames, and yield what changed."""
+        """Read a few new frames, and yield the changes."""
         for frame in self._follower.read(MAX_FRAMES_PER_TURN):
             if (change := self._take(frame)) is not None:
                 yield change

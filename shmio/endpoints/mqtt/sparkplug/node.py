@@ -1,7 +1,8 @@
 """A Sparkplug B edge node: makes its messages in order, and decodes its commands. No I/O.
 
-Sources are its devices. A device is born when its source is good for the first time, dies when that
-turns bad, and is born again. (Eclipse Sparkplug Specification 3.0.0, 5 and 6.4.)
+Sources are the devices of the node. A device is born when its source is good for the first time. It
+dies when the source turns bad, and is born again when the source recovers (Eclipse Sparkplug
+Specification 3.0.0, 5 and 6.4).
 
 Registers are the metrics:
 
@@ -15,8 +16,9 @@ REAL; LREAL                          Float; Double
 texts, dates, POINTER, ANY           String
 ===================================  ==========================================================================
 
-Types on whose field or sign implementations disagree are not used: Int8, Int16 and UInt32. An array of numbers or bits
-is one metric, with the array type of its own width; one of anything else is a metric for each element.
+Int8, Int16 and UInt32 are not used, because implementations disagree on their protobuf field or their
+sign. An array of numbers or bits is one metric, with the array type for the width of its elements. In
+any other array, each element is a metric.
 """
 
 from __future__ import annotations
@@ -49,14 +51,14 @@ INT64: Final = 4
 BOOLEAN: Final = 11
 BOOLEANS: Final = 32
 _SEQUENCE: Final = 256
-_COUNT: Final = struct.Struct("<I")  # of bits, before them
+_COUNT: Final = struct.Struct("<I")  # the number of bits, which precedes them
 _QUALITY: Final = {Quality.BAD: 0, Quality.UNCERTAIN: 500, Quality.GOOD: 192}  # 6.4.8.1: bad, stale, good
 
 
 class _Datatype(NamedTuple):
-    """Sparkplug's representation of a type: data type and protobuf field of a single value.
+    """Sparkplug's representation of a type: the data type and the protobuf field of a single value.
 
-    For an array, it also has the data type of the array and of its elements.
+    For arrays of the type, it also has the data type of the array and the format of its elements.
     """
 
     datatype: int
@@ -92,10 +94,7 @@ _BITS: Final = {INT32: 32, INT64: 64}
 
 
 class Metric:
-    """A metric: a register, or an element of an array.
-
-    ``alias`` is unique in its edge node.
-    """
+    """A metric: a register, or an element of an array. ``alias`` is unique in its edge node."""
 
     def __init__(self, register: Register, alias: int) -> None:
         kind = _DATATYPES.get(register.element.base, _STRING)
@@ -108,7 +107,7 @@ class Metric:
         self._bits = 0 if register.dims else _BITS.get(kind.datatype, 0)
 
     def put(self, metric: wire.Metric, value: Any) -> None:
-        """Write a value to a message; None, also as an element, becomes null."""
+        """Write a value to a message. None becomes null, also for an array with an element None."""
         data: Any = self._packed(value) if self.register.dims else value
         if data is None:
             metric.is_null = True
@@ -127,7 +126,7 @@ class Metric:
             raise ValueRangeError(f"{self.name}: there is no value")
         value = getattr(metric, field)
         expected = {self._field}
-        if self._field in ("int_value", "long_value"):  # clients differ in which
+        if self._field in ("int_value", "long_value"):  # clients differ in which one they use
             expected = {"int_value", "long_value"}
         elif self._field in ("float_value", "double_value"):
             expected = {"float_value", "double_value"}
@@ -144,7 +143,7 @@ class Metric:
         if self.datatype == BOOLEANS:
             flat = np.array(value, bool).reshape(-1)
             return _COUNT.pack(len(flat)) + np.packbits(flat).tobytes()
-        return np.array(value, self._element).tobytes()  # by its type at once: no float has all digits of a ULINT
+        return np.array(value, self._element).tobytes()  # with its type: a float would lose digits of a ULINT
 
     def _unpacked(self, data: bytes) -> list[Any]:
         count = self.register.count
@@ -163,8 +162,8 @@ class Metric:
 def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = False) -> Iterator[Register]:
     """Yield the registers, and the elements of arrays, to publish as metrics.
 
-    An array of numbers or bits is one metric; others are split up into their elements.
-    ``single``: split up all arrays.
+    An array of numbers or bits is one metric. Other arrays are split into their elements. If
+    ``single``, all arrays are split.
     """
     for register in registers:
         if register.dims and (single or register.element.base not in _DATATYPES):
@@ -174,10 +173,7 @@ def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = Fa
 
 
 class Sample(NamedTuple):
-    """A value of one metric.
-
-    ``at_ms``: when the source had it, in ms since 1970.
-    """
+    """A value of one metric; ``at_ms`` is its time at the source, in ms since 1970."""
 
     metric: Metric
     value: Any
@@ -187,9 +183,10 @@ class Sample(NamedTuple):
 
 
 class Command(NamedTuple):
-    """A host application's command.
+    """A command of a host application.
 
-    ``rebirth``: the node shall be born again; else ``values`` has values by path of ``device``.
+    If ``rebirth``, the node has to publish its births again. Otherwise ``values`` has values for
+    ``device``, by path.
     """
 
     rebirth: bool = False
@@ -198,7 +195,7 @@ class Command(NamedTuple):
 
 
 class EdgeNode:
-    """One node, through all its sessions. Use it from one thread."""
+    """One edge node, through all its sessions. Use it from one thread."""
 
     def __init__(
         self,
@@ -208,22 +205,30 @@ class EdgeNode:
         *,
         datatypes: bool = True,
     ) -> None:
-        """Begin; ``datatypes`` adds data types to data messages, for hosts that do not store births."""
+        """Create the node, without devices.
+
+        Args:
+            group: The group id.
+            node: The edge node id.
+            now_ms: Returns the time, in ms since 1970.
+            datatypes: Add data types to data messages, for hosts that do not store births.
+
+        """
         self._group, self._node, self._datatypes = group, node, datatypes
         self._now_ms = now_ms
         self._sequence = 0
-        # Not from 0 after each restart: a late will of the process before must not be taken for this one's. In
-        # tenths of a second, which no series of attempts to connect overtakes.
+        # A restart must not begin at 0 again: a late will of the previous process must not look like ours. The time
+        # in tenths of a second advances faster than attempts to connect do.
         self._session = now_ms() // 100 % _SEQUENCE
         self.alive = False
-        """Whether the node was born in this session and has not died."""
+        """True if the node was born in this session and has not died."""
         self._born: set[str] = set()
         self.metrics: dict[str, dict[str, Metric]] = {}
-        """Each device's metrics by name, in the order in which they were given."""
+        """The metrics of each device by name, in the order in which they were defined."""
         self._by_alias: dict[int, Metric] = {}
 
     def define(self, devices: Mapping[str, Iterable[Register]]) -> None:
-        """Define the devices and their registers; everything has to be born again."""
+        """Define the devices and their registers. After this, everything has to be born again."""
         aliases = count(1)
         self.metrics = {
             device: {register.path: Metric(register, next(aliases)) for register in registers}
@@ -238,22 +243,22 @@ class EdgeNode:
         return [self._topic("NCMD"), self._topic("DCMD", "+")]
 
     def will(self) -> Message:
-        """Begin a new session, and make the will of its connection."""
+        """Begin a new session, and return the will of its connection."""
         self._session = (self._session + 1) % _SEQUENCE
         self._born.clear()
         return self.death()
 
     def death(self) -> Message:
-        """Make the message to publish before the node disconnects by itself."""
+        """Return the message to publish before the node disconnects by itself."""
         self.alive = False
         payload = wire.Payload(timestamp=self._now_ms())
         self._put_session(payload)
         return Message(self._topic("NDEATH"), payload.SerializeToString(), 1, retain=False)
 
     def birth(self) -> Message:
-        """Make the node's birth: the first message of a session, or after a request.
+        """Return the birth of the node: the first message of a session, or the answer to a request.
 
-        The devices' births follow it.
+        Publish the births of the devices after it.
         """
         self.alive = True
         self._born.clear()
@@ -264,7 +269,7 @@ class EdgeNode:
         return self._message(payload, "NBIRTH")
 
     def device_birth(self, device: str, samples: Iterable[Sample]) -> Message:
-        """Make a device's birth with all its metrics; those without a sample are null."""
+        """Return the birth of a device with all its metrics; those without a sample are null."""
         self._born.add(device)
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         given = {sample.metric.name: sample for sample in samples}
@@ -275,9 +280,9 @@ class EdgeNode:
         return self._message(payload, "DBIRTH", device)
 
     def data(self, device: str, samples: Iterable[Sample], *, historical: bool = False) -> Message:
-        """Make a message with changed values.
+        """Return a message with changed values.
 
-        ``historical``: the values are late and not the current ones.
+        If ``historical``, the values are late, and not the current ones.
         """
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         for sample in samples:
@@ -290,7 +295,7 @@ class EdgeNode:
         return self._message(payload, "DDATA", device)
 
     def device_death(self, device: str) -> Message:
-        """Make a device's death: its values are no longer valid."""
+        """Return the death of a device, whose values are no longer valid."""
         self._born.discard(device)
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         return self._message(payload, "DDEATH", device)
@@ -302,14 +307,18 @@ class EdgeNode:
     def command(self, topic: str, data: bytes, check: Callable[[str, Register], object] = lambda *_: None) -> Command:
         """Decode a message on one of the topics of :attr:`commands`.
 
-        ``check``: called with the register of a wrong value; it may raise a more important error.
+        Args:
+            topic: The topic.
+            data: The payload.
+            check: Called with the device and the register of a wrong value; it may raise a more
+                important error.
 
         Raises:
-            ValueRangeError: It is not a payload of Sparkplug B, or a value does not fit its metric.
+            ValueRangeError: The payload is not Sparkplug B, or a value does not fit its metric.
             PathError: There is no such device or metric.
 
         """
-        if len(data) > MAX_BYTES:  # before decoding, which makes an object for each metric
+        if len(data) > MAX_BYTES:  # checked before decoding, which makes an object for each metric
             raise ValueRangeError(f"{topic}: the payload is longer than {MAX_BYTES} bytes")
         try:
             payload = wire.Payload.FromString(data)
@@ -347,7 +356,8 @@ class EdgeNode:
 
         """
         metrics = self.metrics[device]
-        metric = metrics.get(found.name) if found.name else self._by_alias.get(found.alias)  # some send an empty name
+        # Some hosts send an empty name with an alias.
+        metric = metrics.get(found.name) if found.name else self._by_alias.get(found.alias)
         if metric is None or metrics.get(metric.name) is not metric:
             what = repr(found.name[:100]) if found.name else f"alias {found.alias}"
             raise PathError(f"{device}: there is no metric {what}")
@@ -373,7 +383,7 @@ class EdgeNode:
 
 
 def _put_quality(metric: wire.Metric, quality: Quality, reason: str) -> None:
-    """Add quality and reason to a value; nothing if it is good (6.4.8.1)."""
+    """Add quality and reason to a value, unless the quality is good (6.4.8.1)."""
     if quality is not Quality.GOOD:
         metric.properties.keys.extend(("Quality", "Reason"))
         metric.properties.values.add(type=INT32, int_value=_QUALITY[quality])

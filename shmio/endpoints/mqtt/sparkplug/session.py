@@ -1,6 +1,6 @@
 """Publishes an instance as an edge node of Sparkplug B.
 
-It has a connection of its own: a connection has one will, and the bridge's says something else.
+It has its own connection, because a connection has only one will, and the bridge needs another.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind, Segment
 
 SAMPLE_BYTES: Final = 96
-"""Approximate memory of a sample beside its value."""
+"""Approximate memory of a sample in addition to its value."""
 ELEMENT_BYTES: Final = 32
 """Approximate memory of a number in a list."""
 TURN_SAMPLES: Final = 2000
-"""Samples of the backlog that are sent before other work has its turn."""
+"""Maximum number of samples of the backlog that are sent in a row, before other work."""
 AHEAD_MS: Final = 86_400_000
-"""Maximum by which a host's clock may be ahead of ours."""
+"""Maximum by which the clock of a host may be ahead of ours."""
 HOST_S: Final = 10.0
 """Time limit for a primary host to announce itself at one of several brokers."""
 
@@ -66,17 +66,18 @@ class PrimaryHost:
     def __init__(self, name: str) -> None:
         self.topic = f"{NAMESPACE}/STATE/{name}"
         self.online: bool | None = None
-        """None: the host has published no state."""
+        """The state; None if the host has published none."""
         self._at_ms = float("-inf")
 
     def forget(self) -> None:
-        """Forget the state for a new connection: brokers have states of different age."""
+        """Forget the state for a new connection, because the state at another broker may be older."""
         self.online, self._at_ms = None, float("-inf")
 
     def update(self, payload: bytes) -> None:
         """Read a state message.
 
-        One older than the last, such as the late will of an earlier session, is ignored.
+        A message that is older than the last one is ignored, such as the late will of an earlier
+        session.
         """
         try:
             state = msgspec.json.decode(payload, type=_State)
@@ -95,7 +96,7 @@ class PrimaryHost:
 class Session:
     """The Sparkplug session of an instance. Call :meth:`turn` in each turn of the bridge's thread.
 
-    Changes are merged while the broker is slow. While it is away they are kept, and sent later as
+    While the broker is slow, changes are merged. While it is away, they are kept, and sent later as
     historical.
     """
 
@@ -107,15 +108,22 @@ class Session:
         selector: selectors.BaseSelector,
         wake: Callable[[], object],
     ) -> None:
-        """``selector``, ``wake``: see :class:`BrokerConnection`.
+        """Create the session, without devices.
+
+        Args:
+            settings: The configuration's ``[mqtt]`` section.
+            sparkplug: The configuration's ``[mqtt.sparkplug]`` section.
+            segment: The instance's shared memory.
+            selector: Selects the sockets that are ready.
+            wake: Called by a thread that needs :meth:`turn` to run.
 
         Raises:
-            PathError: A pattern is invalid.
+            PathError: A pattern is not valid.
 
         """
         self.node = EdgeNode(sparkplug.group, sparkplug.node or segment.instance, datatypes=sparkplug.datatypes)
         client_id = f"{settings.client_id or f'shmio-{segment.instance}'}-sparkplug"
-        # A session begins with births: the broker must keep nothing of the one before (5.4).
+        # A session begins with births: the broker must keep nothing of the session before (5.4).
         clean = msgspec.structs.replace(settings, session_expiry_s=0)
         self._policy = ReconnectPolicy(clean, client_id, targets(settings, own_socket(segment)))
         self.connection = BrokerConnection(self._policy, selector, wake, self.node.will, FEW_IN_FLIGHT)
@@ -123,9 +131,9 @@ class Session:
         self.connection.on_lost = self._lose
         self._host = None if sparkplug.primary_host is None else PrimaryHost(sparkplug.primary_host)
         self._host_lost = False
-        """Whether the host has gone since the births: even if it is back, it does not know them."""
+        """True if the host has gone since the births. Even if it is back, it does not know them."""
         self._until_s = 0.0
-        """Deadline for the host to announce itself; then the session tries the next broker."""
+        """Deadline for the host to announce itself. After it, the session tries the next broker."""
         self._elements = sparkplug.elements
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
         self._devices: dict[str, Device] = {}
@@ -138,14 +146,17 @@ class Session:
         self._room = 0
         """Number of samples of the backlog that may still be sent in this turn."""
         self._rebirth_asked = False
-        """Whether a host has asked for the births; a turn sends them at most once, if there is room."""
+        """True if a host has asked for the births.
+
+        A turn sends them at most once, and only if there is room.
+        """
         self._defined = False
-        """Whether the node's definition includes all current devices."""
+        """True if the node's definition includes all current devices."""
         self._sent = self._received = self._refused = self._missed = 0
 
     @property
     def counters(self) -> tuple[int, ...]:
-        """The counters, in the order of the bridge's."""
+        """The counters, in the same order as the bridge's."""
         waiting = sum(map(len, self._waiting.values()))
         refused, connects = self._refused + self.connection.problems.refused, self.connection.connects
         missed = self._missed + sum(device.missed for device in self._devices.values())
@@ -154,14 +165,14 @@ class Session:
 
     @property
     def problem(self) -> str:
-        """The current problem; empty: none."""
+        """The current problem; empty if there is none."""
         problem = self.connection.problem
         if self._host is not None and self.connection.up and not self._host.online:
             problem = f"the primary host is offline ({self._host.topic}): {self._backlog.count} changes are kept"
         return f"Sparkplug: {problem}" if problem else ""
 
     def new_device(self, feed: Feed) -> Device:
-        """Make the device of a source; may be called from any thread."""
+        """Make the device of a source. You may call this from any thread."""
         return Device(feed.block, feed.command_client, self._globs, elements=self._elements)
 
     def add_device(self, device: Device) -> None:
@@ -175,7 +186,7 @@ class Session:
         self._defined = False
 
     def _define(self) -> None:
-        """Define the node's devices; if the node is born already, publish new births."""
+        """Define the node's devices. If the node is born already, publish new births."""
         self._defined = True
         self.node.define({name: device.parts for name, device in self._devices.items()})
         for name, device in self._devices.items():
@@ -186,7 +197,7 @@ class Session:
             self._birth()
 
     def turn(self) -> float:
-        """Do what is due, and return in how many seconds to call again."""
+        """Do what is due, and return after how many seconds to call this again."""
         if not self._defined:
             self._define()
         if self.connection.problem and not self.connection.up:
@@ -208,14 +219,14 @@ class Session:
             for change in device.poll():
                 self._publish(name, device, change.kind, change.at)
         self._flush()
-        rest_s = self.connection.turn()  # after sending, to know when there is room for the rest
+        rest_s = self.connection.turn()  # after sending: it then returns when there is room for more
         more = self._room <= 0 or self.connection.came_up or any(device.behind for device in self._devices.values())
         now_s = time.monotonic()
         due_s = [due_s for name, due_s in self._due_s.items() if due_s > now_s and self._waiting.get(name)]
         return 0.0 if more else min([rest_s, *(one_s - now_s for one_s in due_s)])
 
     def _wait_for(self, host: PrimaryHost) -> None:
-        """While the host is away: publish the death, and try other brokers."""
+        """While the host is away, publish the death, and try other brokers."""
         if not self.connection.up:
             return
         elsewhere = self._policy.count > 1 and (host.online is False or time.monotonic() >= self._until_s)
@@ -228,9 +239,9 @@ class Session:
     def close(self) -> None:
         """Publish the node's death, and disconnect.
 
-        With MQTT 5 the will is published, too. The specification demands both (5.5,
-        intentional-disconnect-ndeath, and 6.4.25, ndeath-will-message-publisher-disconnect-mqtt50);
-        hosts ignore the second one by its bdSeq.
+        With MQTT 5 the broker also publishes the will. The specification demands both (5.5,
+        intentional-disconnect-ndeath, and 6.4.25, ndeath-will-message-publisher-disconnect-mqtt50).
+        Hosts ignore the second message by its bdSeq.
         """
         alive = self.connection.up and self.node.alive
         if alive:
@@ -270,7 +281,10 @@ class Session:
             self._waiting[name].clear()
 
     def _is_due(self, name: str) -> bool:
-        """Return whether data of a device may be sent now; if so, start its next pause."""
+        """Return whether data of a device may be sent now.
+
+        If so, start the pause before the next data.
+        """
         now_s = time.monotonic()
         if now_s < self._due_s.get(name, 0.0):
             return False
@@ -278,7 +292,7 @@ class Session:
         return True
 
     def _lose(self, _unacknowledged: Sequence[Message]) -> None:
-        """After the connection is lost, keep what waited for it."""
+        """After a lost connection, keep the changes that waited for it."""
         for name, device in self._devices.items():
             waiting = self._waiting[name]
             if waiting and device.alive:
@@ -290,7 +304,7 @@ class Session:
             self._flush_device(name, device)
 
     def _flush_device(self, name: str, device: Device) -> None:
-        """Send a device's changes, then its backlog as historical; only after its birth."""
+        """After a device's birth, send its changes, then its backlog as historical."""
         connection, waiting = self.connection, self._waiting[name]
         if not self.node.is_born(name):
             return
@@ -343,11 +357,11 @@ class Session:
 
     def _refuse(self, why: str) -> None:
         self._refused += 1
-        log.warning("Sparkplug command: %s", shorten(why, 500))  # the topic may be as long as any
+        log.warning("Sparkplug command: %s", shorten(why, 500))  # the topic may be long
 
 
 class _Outcome:
-    """Logs commands that failed: Sparkplug has no answer to a command but the new value."""
+    """Logs commands that failed, because Sparkplug answers a command only by the new value."""
 
     def __init__(self, path: str) -> None:
         self._path = path
