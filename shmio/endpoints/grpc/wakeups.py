@@ -36,7 +36,7 @@ class WakeUp:
         """
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
         self.patient: set[Callback] = set()
-        """Listeners that can wait for a while."""
+        """Listeners that do not need a call at once."""
         self._loop = asyncio.get_running_loop()
         self._relay = Relay(word, name, turn_ns)
         self._resting: asyncio.TimerHandle | None = None
@@ -221,7 +221,7 @@ class BatchReader:
             self._loop.call_soon(self._look_again)
 
     def resume(self) -> None:
-        """Check at each wake-up again."""
+        """End the patience of the reader: it reads at each wake-up again."""
         self._wake_ups.resume(self._block, self.look)
 
     def _look_again(self) -> None:

@@ -77,7 +77,7 @@ class Bridge:
         client_id = settings.client_id or f"shmio-{segment.instance}"
         self._status = BridgeStatusChannel(f"{self.prefix}/status")
         self._channels: dict[str, Channel] = {self._status.topic: self._status}
-        """The channel of every topic that is published now."""
+        """The channels of all topics that are published now, by topic."""
         self._guard = TopicGuard(self)
         self._feeds: dict[str, Feed] = {}
         self._clients: dict[str, CommandClient] = {}

@@ -29,7 +29,7 @@ from shmio.segment.changed_registers import ChangeScan
 log = logging.getLogger("shmio.mqtt")
 
 MAX_FRAMES_PER_TURN: Final = 8
-"""Maximum number of frames that are read in a row, before other work."""
+"""Maximum number of frames that are read before the bridge does other work."""
 CATCH_UP_S: Final = 3.0
 """A bridge that is further behind than this, or than half the ring, skips to the newest frame."""
 

@@ -19,7 +19,7 @@ from shmio.endpoints.mqtt.topics import Channel, Message
 OVERHEAD_BYTES: Final = 200
 """Approximate memory of one message in addition to its payload."""
 TURN_MESSAGES: Final = 500
-"""Maximum number of messages that are sent in a row, before other work."""
+"""Maximum number of messages that are sent before the bridge does other work."""
 MAX_RESULTS: Final = 1024
 """Maximum number of queued results. Beyond it, the oldest are dropped."""
 

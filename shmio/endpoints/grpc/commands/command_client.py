@@ -31,7 +31,7 @@ RETRY_S: Final = 0.25
 """Pause before asking a source again to lift an injection."""
 
 BATCH_EVENTS: Final = 32
-"""Events that are processed in a row, before the event loop serves the streams."""
+"""Maximum number of events that are processed before the event loop serves the streams again."""
 
 log = logging.getLogger("shmio.grpc")
 

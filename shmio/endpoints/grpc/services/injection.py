@@ -402,7 +402,7 @@ class Shadows:
         if holder in holders:
             holders.remove(holder)
             if not holders:
-                injection.end("nobody holds it any more")
+                injection.end("no client uses it any more")
 
     def move(self, sources: Collection[str]) -> None:
         """End the injections on sources whose blocks a reload has replaced."""
@@ -422,7 +422,7 @@ class Shadows:
         for path, kind in kinds.items():
             name = self._topics.name(path)
             if name == str(target):
-                raise ValueRangeError(f"{shorten(path)} is the target: a shadow needs a path of its own")
+                raise ValueRangeError(f"{shorten(path)} is the target: a shadow needs another path")
             shadow = self._named.get(name)
             if name in _MARKS or (shadow and (shadow.injection.target != target or shadow.kind is not kind)):
                 use = f"the shadow of {shadow.injection.target}" if shadow else "served by shmio"

@@ -157,7 +157,7 @@ class Publisher:
         self._shadows = shadows
         self._refusals = Refusals()
         self._waiting: set[asyncio.Task[None]] = set()
-        self._streams: dict[str, set[_PublishCall]] = {}  # of each peer
+        self._streams: dict[str, set[_PublishCall]] = {}  # by peer
         self._arrivals = ReceiveBarrier()
 
     @property

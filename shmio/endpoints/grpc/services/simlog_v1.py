@@ -324,7 +324,7 @@ class SimlogV1:
         self._outboxes = outboxes
         self._injecting = InjectCalls(outboxes, shadows, self._resolve)
         self._stepper = stepper
-        self._streams: dict[Outbox, str] = {}  # with their sources
+        self._streams: dict[Outbox, str] = {}  # the source of each stream
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """Return the handlers of the service's calls."""
@@ -468,7 +468,7 @@ class SimlogV1:
 
         """
         if not topic.path:
-            raise ValueRangeError(f"{topic}: a source; version 1 serves only its registers")
+            raise ValueRangeError(f"{topic} is a whole source; version 1 serves only its registers")
         found = shape(self._topics.layout(topic), topic)
         message_type(found)
         return found

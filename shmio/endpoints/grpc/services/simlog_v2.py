@@ -117,7 +117,7 @@ def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessa
     if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
         raise ValueRangeError(
             f"{shorten(found.path)}: {members} registers with {elements} elements are too many for one value, "
-            f"at most {MAX_MEMBERS} with {MAX_ELEMENTS} are allowed; its members are topics, too"
+            f"at most {MAX_MEMBERS} with {MAX_ELEMENTS} are allowed; use its members as topics"
         )
     head = wire.SimlogMessage(type=value_type(found)).SerializeToString() + b"\x1a"
     serialise = _whole(found.registers[0], layout) if found.whole else _structure(found, layout)
@@ -470,7 +470,7 @@ class Subscribers:
 
         """
         if not uuid:
-            raise ValueRangeError("uuid: this field is needed, because Subscribe names its stream by it")
+            raise ValueRangeError("uuid: this field is needed, because Subscribe uses it to name the stream")
         if max(len(uuid), len(name)) > MAX_NAME:
             raise ValueRangeError(f"name and uuid have at most {MAX_NAME} characters")
         before = self._open.get(uuid)

@@ -44,7 +44,8 @@ class StepsCall:
     async def messages(self, requests: AsyncIterator[wire.StepsRequest]) -> AsyncIterator[bytes]:
         """Yield serialised StepsResponses.
 
-        The steps that are made while one response is sent share the next.
+        The answers to all steps that are made while one response is being sent share the next
+        response.
 
         Raises:
             TimeError: A step failed. The answers to the earlier steps come first.

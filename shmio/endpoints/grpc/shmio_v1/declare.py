@@ -82,7 +82,7 @@ class DeclareCall:
         self._abandoned = False
         self._lifting: asyncio.Task[None] | None = None
         self.over = ""
-        """Why the call has to end before its injections; empty: it does not have to."""
+        """Why the call has to end before its injections; otherwise empty."""
 
     async def open(self) -> bytes:
         """Lay all injections or none; return the first message.
@@ -155,7 +155,7 @@ class DeclareCall:
                 await self._wake.wait()
 
     def tell(self, happening: wire.Happening) -> None:
-        """Send an event of one of the injections."""
+        """Queue an event of one of the injections for the client."""
         if self.over:
             return
         if reason := self._waiting.add(field(_HAPPENINGS, happening.SerializeToString())):
@@ -194,7 +194,7 @@ def _check(
                 matches += max((len(one.layout.registers) for one in looked_at), default=0)
     if matches > MAX_MATCHES:
         raise ValueRangeError(
-            f"targets that are not just a register, times registers of their source, are more than {MAX_MATCHES}: "
+            f"the targets that do not name a register exactly need more than {MAX_MATCHES} comparisons with registers: "
             "declare fewer at once"
         )
     return compile_declarations(declarations, blocks, wanted)

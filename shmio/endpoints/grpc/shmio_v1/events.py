@@ -27,13 +27,13 @@ MAX_CALLS: Final = 256
 """Maximum number of open Events calls."""
 MAX_SOURCES: Final = 256
 BATCH_EVENTS: Final = 32
-"""Events that are explained in a row, before the event loop serves the streams."""
+"""Maximum number of events that are explained before the event loop serves the streams again."""
 BATCH_S: Final = 0.005
-"""Time after which a batch ends: a single event may be about thousands of registers."""
+"""Time after which a batch ends early, because one event may be about thousands of registers."""
 LOG_BYTES: Final = 8 << 20
 """Maximum size of a block's events that wait for clients.
 
-Their number is also limited, to that of the event ring.
+At most as many events wait as the event ring has slots.
 """
 MESSAGE_BYTES: Final = 1 << 18
 """Size at which a message with the events of all sources is complete."""
@@ -45,12 +45,12 @@ _MISSED: Final = wire.Event.DESCRIPTOR.fields_by_name["missed"].number
 class EventLog:
     """The latest events of one block as messages, for all calls that follow the block.
 
-    A call that falls further behind than the log reaches misses the oldest events. Use it only in
-    the event loop's thread.
+    When the log is full, it drops the oldest events. A call that has not read them by then misses
+    them. Use it only in the event loop's thread.
     """
 
     def __init__(self, block: Block, wake_ups: WakeUps, after: int) -> None:
-        """Begin after event ``after``."""
+        """Begin after the event with the number ``after``."""
         self.block = block
         self.began = after
         self.reader = EventReader(block, after=after)
@@ -168,7 +168,7 @@ class _Place:
     """The position of one call in a block's log."""
 
     def __init__(self, log: EventLog, after: int, missed: int = 0) -> None:
-        """Begin after event ``after``.
+        """Begin after the event with the number ``after``.
 
         Args:
             log: The log.
@@ -213,7 +213,7 @@ class EventsCall:
 
         """
         if len(sources) > MAX_SOURCES:
-            raise ValueRangeError(f"{len(sources)} sources, at most {MAX_SOURCES} are allowed: none stands for all")
+            raise ValueRangeError(f"{len(sources)} sources, at most {MAX_SOURCES} are allowed: name none to follow all")
         for source in sources:
             if source not in feeds:
                 raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(feeds)}")
@@ -290,7 +290,7 @@ class EventsCall:
         return b"".join(parts)
 
     def _next(self, source: str) -> bytes | None:
-        """Return the next serialised ``Event`` of a source, or None.
+        """Return the next serialised ``Event`` of a source, or None if there is none yet.
 
         If a reload has removed the source, the last event says so.
         """

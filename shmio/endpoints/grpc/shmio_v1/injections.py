@@ -56,8 +56,9 @@ def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
     """Read the target of an injection.
 
     Raises:
-        PathError: The target is not a part of one source and direction.
-        ValueRangeError: There is no target, or too much of it.
+        PathError: There is no such source, or the target is not in one source and direction.
+        ValueRangeError: There is no target, there are too many patterns or ranges, or the direction
+            is not valid.
 
     """
     if not (lay.patterns or lay.ranges):
@@ -183,7 +184,7 @@ class InjectCall(InjectionFollower):
         """Check the request.
 
         Raises:
-            PathError: The target is not a part of one source and direction.
+            PathError: There is no such source, or the target is not in one source and direction.
             ValueRangeError: An option is not valid, or there is no target.
 
         """
@@ -193,7 +194,10 @@ class InjectCall(InjectionFollower):
         self._wake_ups = wake_ups
         self._lay = lay
         self.over = ""
-        """Why the call has to end: another client lifted the injection, or this one does not read."""
+        """Why the call has to end: another client lifted the injection, or this one does not read.
+
+        Empty if the call need not end.
+        """
         self._lifted = self._ended = False
         self._lifting: asyncio.Task[None] | None = None
         self._target = target_of(topics, lay)
@@ -362,7 +366,12 @@ class InjectCall(InjectionFollower):
     # ---- originals -----------------------------------------------------------------------------
 
     def _original(self) -> bytes | None:
-        """Return an update with the changes of the image that the injection replaces, or None."""
+        """Return an update with the changes of the image that the injection replaces.
+
+        Returns:
+            The serialised update, or None if nothing has changed.
+
+        """
         if not self._originals:
             return None
         block, shown = self._view.block, self._shown
@@ -425,9 +434,9 @@ class InjectCall(InjectionFollower):
         self._wake.set()
 
     def fail(self, reason: str) -> None:
-        """Handle missed events: give up over ``/in``, where writes are missing.
+        """Handle missed events: over ``/in``, end the call, because writes are missing.
 
-        Over ``/out`` the originals come from frames.
+        Over ``/out`` the originals come from frames, so nothing is missing.
         """
         if self._inward and not self._lay.quiet:
             self._give_up(reason)
@@ -471,7 +480,7 @@ class InjectionCalls:
         }
 
     async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
-        """Lay an injection that lasts as long as the stream, or that is kept.
+        """Lay an injection that ends with the stream, unless the client asks to keep it.
 
         The call streams the originals to the client, which streams other values back.
 
@@ -512,7 +521,7 @@ class InjectionCalls:
         """Read the first message.
 
         Raises:
-            PathError: The target is not a part of one source and direction.
+            PathError: There is no such source, or the target is not in one source and direction.
             ValueRangeError: The message does not lay an injection, or an option is not valid.
             EndpointError: There are too many calls.
 
@@ -540,7 +549,9 @@ class InjectionCalls:
             self._open.discard(one)
 
     async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
-        """Lay declared injections, all or none, that last as long as the stream, or that are kept.
+        """Lay declared injections, all or none.
+
+        They end with the stream, unless the client asks to keep them.
 
         The call streams a record of their events.
 
@@ -548,7 +559,7 @@ class InjectionCalls:
             INVALID_ARGUMENT: A declaration is not valid; the message names the key.
             FAILED_PRECONDITION: A source refuses an injection; the message says why.
             RESOURCE_EXHAUSTED: There are too many streams.
-            ABORTED: The client does not read the record, or events are missing in it.
+            ABORTED: The client does not read the record, or the record would have a gap.
         """
         opening: asyncio.Task[bytes] | None = None
         try:

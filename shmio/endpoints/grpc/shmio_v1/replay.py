@@ -71,7 +71,7 @@ def _wanted(request: wire.ReplayRequest) -> ReplayRequest:
     """
     texts = (request.seek, request.until, request.change, request.event, *request.sources)
     if len(request.sources) > MAX_SOURCES or any(len(text) > MAX_TEXT for text in texts):
-        raise ValueRangeError(f"at most {MAX_SOURCES} sources, and {MAX_TEXT} characters of each text, can be given")
+        raise ValueRangeError(f"at most {MAX_SOURCES} sources are allowed, and {MAX_TEXT} characters in each text")
     return ReplayRequest(
         request.paused if request.HasField("paused") else None,
         request.speed if request.HasField("speed") else None,

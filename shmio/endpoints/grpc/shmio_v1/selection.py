@@ -194,7 +194,7 @@ class _Budget:
         self.matches -= registers
         if self.matches < 0:
             raise ValueRangeError(
-                f"patterns with a star times registers are more than {MAX_MATCHES}: use fewer of them, or structures"
+                f"patterns with stars need more than {MAX_MATCHES} comparisons: use fewer of them, or name structures"
             )
 
 

@@ -258,7 +258,7 @@ class SimulateCall:
     @property
     def _link(self) -> ModelChannel:
         if self.block.model_channel is None:
-            raise SegmentError(f"{self.block.source}: its block has no link")
+            raise SegmentError(f"{self.block.source}: its block has no link to a model")
         return self.block.model_channel
 
     async def join(self) -> bytes:
@@ -413,6 +413,6 @@ def _tables(block: Block) -> tuple[Selection, Selection]:
 
 def _taken(block: Block, name: str, who: str) -> str:
     return (
-        f"{block.source}: model {name!r} ({who}) is connected already, and a source has one: end that one first, or "
+        f"{block.source}: model {name!r} ({who}) is connected already, and a source takes only one: end it first, or "
         "name another source"
     )

@@ -106,7 +106,7 @@ async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, obj
     if not values:
         raise ValueRangeError("no value is given")
     if len(sources) > 1:
-        raise ValueRangeError(f"one call is for one source, these values are for {', '.join(sorted(sources))}")
+        raise ValueRangeError(f"one call writes to one source, but these values are for {', '.join(sorted(sources))}")
     return next(iter(sources)), values
 
 
@@ -138,7 +138,7 @@ def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
         if len(slots) != len(part.values):
             raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
         if len(found) + len(slots) > MAX_VALUES:
-            raise ValueRangeError(f"more than {MAX_VALUES} values: send less at once")
+            raise ValueRangeError(f"more than {MAX_VALUES} values: send fewer at once")
         for slot, value in zip(slots, part.values, strict=True):
             found[_path(selection, column, slot)] = value
     return found

@@ -111,7 +111,7 @@ class _ChannelTable(NamedTuple):
 
 
 TURN_FRAMES: Final = 8
-"""Frames that are delivered in a row, before the event loop serves the streams."""
+"""Maximum number of frames that are delivered before the event loop serves the streams again."""
 
 
 class Feed:

@@ -176,7 +176,7 @@ class _Delivery:
             try:
                 feed.release()
             except SegmentError as error:
-                log.warning("time is real again: %s", str(error))
+                log.warning("on the return to real time: %s", str(error))
         for receiver in self.receivers:
             receiver.release()
 

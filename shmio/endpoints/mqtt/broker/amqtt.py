@@ -84,7 +84,7 @@ async def _serve(broker: Broker, reader: StreamReader, writer: StreamWriter) -> 
     except (OSError, TimeoutError, IncompleteReadError):
         pass  # the client is gone, or speaks another protocol
     except Exception as error:  # noqa: BLE001  such as "dictionary changed size" when others subscribe concurrently
-        log.warning("aMQTT ended a connection, for %r; the client has to connect again", error)
+        log.warning("aMQTT ended a connection because of %r; the client has to connect again", error)
     finally:
         writer.close()
 

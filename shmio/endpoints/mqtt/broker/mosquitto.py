@@ -186,7 +186,7 @@ class Mosquitto:
                     probe.connect(str(self._socket))
                 except OSError:
                     if time.monotonic() > until_s:
-                        raise EndpointError(f"mosquitto takes no connections: {self._last}") from None
+                        raise EndpointError(f"mosquitto does not accept connections: {self._last}") from None
                 else:
                     return
             beat()

@@ -85,7 +85,7 @@ class ConnectAttempt:
         """
         self.client: BrokerClient | None = None
         self.socket: socket.socket | None = None
-        """The connected socket, from which nothing was read yet."""
+        """The connected socket. Nothing was read from it yet."""
         self.sent = False
         """True if a broker may have received a CONNECT, with our client id and will."""
         self.problem = ""

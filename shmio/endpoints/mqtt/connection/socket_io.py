@@ -23,7 +23,7 @@ BATCH: Final = 32
 The messages of a batch share TCP segments. The first is sent when the last has been made.
 """
 PACKETS: Final = 4
-"""Maximum number of packets that are read in a row, before other work.
+"""Maximum number of packets that are read before the bridge does other work.
 
 One call of paho may read one for each of our unacknowledged messages, which takes hardly any time.
 """

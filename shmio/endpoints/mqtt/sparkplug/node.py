@@ -149,7 +149,7 @@ class Metric:
         count = self.register.count
         if self.datatype == BOOLEANS:
             if len(data) != _COUNT.size + -(-count // 8) or _COUNT.unpack_from(data)[0] != count:
-                raise ValueRangeError(f"{self.name}: expected {count} bits after their number")
+                raise ValueRangeError(f"{self.name}: expected {count} bits, preceded by their number")
             flat = np.unpackbits(np.frombuffer(data, np.uint8, offset=_COUNT.size), count=count).astype(bool)
         else:
             if len(data) != count * np.dtype(self._element).itemsize:
@@ -345,7 +345,7 @@ class EdgeNode:
                 check(device, metric.register)
                 raise
         if not values:
-            raise ValueRangeError(f"{topic}: there is no metric in it")
+            raise ValueRangeError(f"{topic}: the payload has no metrics")
         return Command(device=device, values=values)
 
     def _metric(self, device: str, found: wire.Metric) -> Metric:

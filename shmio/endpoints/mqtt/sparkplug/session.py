@@ -34,7 +34,7 @@ SAMPLE_BYTES: Final = 96
 ELEMENT_BYTES: Final = 32
 """Approximate memory of a number in a list."""
 TURN_SAMPLES: Final = 2000
-"""Maximum number of samples of the backlog that are sent in a row, before other work."""
+"""Maximum number of samples of the backlog that are sent before the bridge does other work."""
 AHEAD_MS: Final = 86_400_000
 """Maximum by which the clock of a host may be ahead of ours."""
 HOST_S: Final = 10.0
@@ -88,7 +88,7 @@ class PrimaryHost:
             )
             return
         if state.timestamp > time.time() * 1000 + AHEAD_MS:  # no later message would be newer
-            log.warning("%s: the timestamp is more than a day ahead; it is in ms since 1970", self.topic)
+            log.warning("%s: the timestamp is more than a day ahead; it has to be in ms since 1970", self.topic)
         elif state.timestamp >= self._at_ms:
             self.online, self._at_ms = state.online, state.timestamp
 
@@ -219,7 +219,7 @@ class Session:
             for change in device.poll():
                 self._publish(name, device, change.kind, change.at)
         self._flush()
-        rest_s = self.connection.turn()  # after sending: it then returns when there is room for more
+        rest_s = self.connection.turn()  # after sending, because it returns when there is room for more
         more = self._room <= 0 or self.connection.came_up or any(device.behind for device in self._devices.values())
         now_s = time.monotonic()
         due_s = [due_s for name, due_s in self._due_s.items() if due_s > now_s and self._waiting.get(name)]

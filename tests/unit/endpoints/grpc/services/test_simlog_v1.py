@@ -120,7 +120,7 @@ def test_the_shadow_is_a_topic_of_its_own_while_the_injection_stands(segment: Se
         originals.cancel()
         status, text = await refusal(watching.read())
         assert status is Status.NOT_FOUND
-        assert text == f"CELL://{SHADOW}: nobody holds it any more"
+        assert text == f"CELL://{SHADOW}: no client uses it any more"
         assert await code(served.stub.GetTopic(shadow)) is Status.NOT_FOUND
         await lifted(served)
 
@@ -221,7 +221,7 @@ def test_injections_over_each_other_are_a_chain(segment: Segment) -> None:
         ("cell/step/in", "/", Status.INVALID_ARGUMENT, "printable characters"),
         ("cell/step/in", "a\nb", Status.INVALID_ARGUMENT, "printable characters"),
         ("cell/step/in", "a" * 1025, Status.INVALID_ARGUMENT, "printable characters"),
-        ("cell/step/in", "CELL://step/in", Status.INVALID_ARGUMENT, "a path of its own"),
+        ("cell/step/in", "CELL://step/in", Status.INVALID_ARGUMENT, "another path"),
         ("cell/step/in", "SIMLOG://step", Status.ALREADY_EXISTS, "served by shmio"),
         (
             "cell/secret/in",

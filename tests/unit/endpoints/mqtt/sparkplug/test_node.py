@@ -230,7 +230,7 @@ def test_a_command_has_something_once_and_not_too_much_of_it() -> None:
     edge = node()
     topic = "spBv1.0/plant/DCMD/a50/axis"
     one = wire.Metric(name="position", float_value=1)
-    for metrics, message in (([], "no metric in it"), ([one, one], "given twice"), ([one] * (MAX_METRICS + 1), "most")):
+    for metrics, message in (([], "no metrics"), ([one, one], "given twice"), ([one] * (MAX_METRICS + 1), "most")):
         with pytest.raises(ValueRangeError, match=message):
             edge.command(topic, wire.Payload(metrics=metrics).SerializeToString())
     with pytest.raises(ValueRangeError, match="longer than 1048576 bytes"):
