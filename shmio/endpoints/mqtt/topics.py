@@ -63,7 +63,7 @@ class TopicRules:
 
         Returns:
             The path of the structure; empty: the whole source; None: the register has its own
-                topic.
+            topic.
 
         """
         glob, rule = self._first(f"{source}/{path}")

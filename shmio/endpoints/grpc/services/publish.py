@@ -233,7 +233,7 @@ class Publisher:
 
         Returns:
             ``(ACCEPTED, "")``, or the outcome and its reason if the source did not accept the
-                value.
+            value.
 
         Raises:
             PathError: There is no such topic. Nothing was sent, as with the other errors.

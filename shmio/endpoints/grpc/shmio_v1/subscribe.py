@@ -286,8 +286,7 @@ class SubscribeCall:
 
         Returns:
             A future that is done when the marker was sent or the call has ended. Before
-                :meth:`open` has
-            returned, which takes seconds for a large layout, it is done at once.
+            :meth:`open` has returned, which takes seconds for a large layout, it is done at once.
 
         """
         sent = asyncio.get_running_loop().create_future()

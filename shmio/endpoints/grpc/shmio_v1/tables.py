@@ -207,8 +207,7 @@ class Columns:
 
         Returns:
             Indices into ``slots`` of the values that were not encoded: they do not fit, or they
-                need their
-            own encoder.
+            need their own encoder.
 
         """
         data, left = np.frombuffer(image, np.uint8), np.full(len(slots), column is not Column.BOOL)

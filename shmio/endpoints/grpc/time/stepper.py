@@ -20,9 +20,9 @@ from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
 
 BRIEF_NS: Final = 500_000
-"""Time for which the event loop blocks, in case the sources answer at once.
+"""Time for which the event loop itself waits for the sources to answer.
 
-To be woken by a thread takes about as long.
+A wake-up by another thread takes about as long.
 """
 
 
@@ -95,7 +95,7 @@ def _brief(wait: StepWait, rest_ns: int) -> bool:
 
 
 LATE_S: Final = 0.5
-"""Maximum delay that playing catches up with."""
+"""Maximum delay that playing catches up with; it does not catch up with the rest."""
 
 log = logging.getLogger("shmio.grpc")
 

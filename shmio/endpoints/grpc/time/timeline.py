@@ -31,7 +31,7 @@ class TimeStatus(NamedTuple):
     """The state of the instance's time.
 
     ``dt_ns`` is the size of the step that the status reports, otherwise the present step size.
-    ``alive`` is False after a client has ended time, until the next step.
+    ``alive`` is False after a client has called ``stop`` of SimServerAPI, until the next step.
     """
 
     clock_ns: int
@@ -265,7 +265,7 @@ class Timeline:
         self.steered = False
         """True while this process moves time, and delivers its own steps."""
         self.ended = False
-        """True if a client has ended time; the next step resets this."""
+        """True after a client has called ``stop`` of SimServerAPI; the next step resets this."""
         self._clock = segment.clock
         self._slot = slot
         self._open_streams = open_streams

@@ -28,8 +28,7 @@ def find_mosquitto() -> str | None:
 
     Returns:
         The program that ``SHMIO_MOSQUITTO`` names, if it is set; otherwise the one in the PATH or
-            in the
-        usual directories. None: there is none, or ``SHMIO_MOSQUITTO`` is empty.
+        in the usual directories. None: there is none, or ``SHMIO_MOSQUITTO`` is empty.
 
     """
     named = os.environ.get("SHMIO_MOSQUITTO")

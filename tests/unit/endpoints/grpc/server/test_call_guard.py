@@ -102,8 +102,8 @@ def test_one_client_cannot_have_all_calls_and_no_more_than_there_are_are_open(se
         greedy, other, last = clients
         await greedy.open(8)
         assert await greedy.refused() == (
-            "this client has 8 calls open, and the last 4 of 12 are for clients with fewer than 2: version 2 has one "
-            "stream for all topics"
+            "this client has 8 calls open, and the last 4 of 12 are for clients with fewer than 2: use SimlogAPI "
+            "version 2 (one stream for all topics)"
         )
         await other.open(2)
         assert "this client has 2 calls open" in await other.refused()
