@@ -129,7 +129,7 @@ class Player:
 
     @property
     def alive(self) -> bool:
-        """True unless the playing task has ended while time is played."""
+        """False if time is played but the playing task has ended; otherwise True."""
         return self._task is None or not self._task.done()
 
     def begin(self) -> None:
@@ -236,7 +236,7 @@ class Stepper:
 
     @property
     def alive(self) -> bool:
-        """True if time is followed, and unless the playing task has ended while time is played."""
+        """True if time is followed and :attr:`Player.alive` is True."""
         return self.timeline.alive and self._player.alive
 
     async def set_step_size(self, dt_ns: int) -> None:
