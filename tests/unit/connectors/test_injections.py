@@ -1,4 +1,4 @@
-"""Injections through a source's process: laid, fed and lifted by commands, seen in frames and events by everybody."""
+"""Injections in a source's process: laid, fed and lifted by commands, shown by frames and events."""
 
 from __future__ import annotations
 
@@ -14,41 +14,24 @@ from shmio.connectors.base import Connector
 from shmio.connectors.injection_layers import MAX_INJECTIONS, Owner
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import CommandError, PathError
-from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value
-from shmio.local.reading import reading
-from shmio.local.writer import SourceWriter
-from shmio.model.values import OutcomeKind, Reading
-from shmio.segment import (  # fmt: skip
-    Attributes,
-    BlockSpec,
-    Direction,
-    Event,
-    EventKind,
-    Frame,
-    ProcessSpec,
-    Provenance,
-    Quality,
-    Segment,
-    Write,
-)
+from shmio.model.values import OutcomeKind
+from shmio.segment import Direction, Event, EventKind, Frame, Provenance, Quality, Segment, Write
+from tests.unit.connectors.harness import PERIOD_NS, SourceRig, block, source_segment, tag_layout
 
-TABLE = b"""
-[registers]
+LAYOUT = tag_layout("""
 position = { type = "LREAL", initial = 0.5 }
 lamps = { type = "ARRAY[0..9] OF BOOL", initial = [true] }
 speed = "INT"
 "axis/1" = "INT"
 "axis/2" = "INT"
 locked = "INT"
-"""
-LAYOUT = compile_sources([Source("cell.toml", TABLE)]).layouts[0]
+""")
 WRITABLE = ("lamps", "speed", "axis")
-PERIOD_NS = 10_000_000
 
 
 class Device(Connector):
-    """A device whose block can be written; its program counts ``position`` up at each read."""
+    """A device whose block can be written."""
 
     can_write = True
 
@@ -78,20 +61,15 @@ class Device(Connector):
         pass
 
 
-class Rig:
-    """A source's process in threads, and clients of it."""
+class Rig(SourceRig):
+    """A source's process with its loop, run in threads, and its clients."""
 
     def __init__(self, segment: Segment, *, armed: bool = True) -> None:
-        self.segment = segment
-        self.block = segment.blocks["cell"]
+        super().__init__(segment)
         self.device = Device()
-        self.owners = {4: Owner(4, 100), 5: Owner(5, 200)}
         self.asked: list[int] = []
         self.armed = armed
-        self.client = SourceWriter(self.block, 4)
-        self.other = SourceWriter(self.block, 5)
         self.frames = self.block.cursor()
-        self.events = self.block.events.cursor()
         self.start()
 
     def start(self) -> None:
@@ -117,7 +95,7 @@ class Rig:
 
     def until(self, wanted: Callable[[Frame], bool]) -> Frame:
         while (frame := self.frames.next(20)) is None or not wanted(frame):
-            assert frame is not None, "not seen"
+            assert frame is not None, "no such frame"
         return frame
 
     def event(self, kind: EventKind) -> Event:
@@ -125,24 +103,15 @@ class Rig:
             assert event is not None, f"no event {kind}"
         return event
 
-    def value(self, path: str, frame: Frame | None = None) -> Value:
-        return self.reading(path, frame).value
-
-    def reading(self, path: str, frame: Frame | None = None) -> Reading:
-        register = LAYOUT.registers[LAYOUT.by_path[path]]
-        return reading(self.block, register, frame or self.block.latest())
-
     def sees(self, values: Mapping[str, Value]) -> Frame:
-        """Wait until consumers see these."""
+        """Wait until consumers see these values."""
         return self.until(lambda frame: all(self.value(path, frame) == value for path, value in values.items()))
 
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    spec = BlockSpec("cell", LAYOUT, PERIOD_NS, 10**9, 1 << 20, Attributes("device", WRITABLE))
-    with Segment.create(instance, [spec], [ProcessSpec("cell", "source")]) as segment:
+    with source_segment(instance, block(LAYOUT, WRITABLE)) as segment:
         yield segment
-        segment.unlink()
 
 
 @pytest.fixture
@@ -152,7 +121,7 @@ def rig(segment: Segment) -> Iterator[Rig]:
     rig.stop()
 
 
-def test_consumers_hold_the_last_value_until_the_shadow_has_one(rig: Rig) -> None:
+def test_consumers_keep_the_last_value_until_the_shadow_has_one(rig: Rig) -> None:
     rig.client.write({"speed": 7})
     rig.sees({"speed": 7})
     number = rig.client.inject(["speed"], name="test")
@@ -161,14 +130,14 @@ def test_consumers_hold_the_last_value_until_the_shadow_has_one(rig: Rig) -> Non
     assert (rig.value("speed", frame), frame.provenance) == (7, Provenance.LIVE)
     assert [rig.reading(path).provenance for path in ("speed", "lamps")] == ["injected", "live"]
     rig.client.shadow(number, {"speed": -1})
-    assert rig.value("speed") == -1, "it was not seen at once"
+    assert rig.value("speed") == -1, "the value is visible at once"
     rig.client.lift(number)
     last = rig.block.latest()
     assert last is not None
     assert (rig.value("speed", last), last.provenance, last.effective) == (9, Provenance.LIVE, None)
 
 
-def test_events_tell_what_was_done(rig: Rig) -> None:
+def test_events_describe_an_injection(rig: Rig) -> None:
     number = rig.client.inject(["speed"], name="drive test", priority=3)
     laid = rig.event(EventKind.INJECTED)
     assert (laid.injection, laid.command, laid.writer, laid.text) == (number, number, 4, "drive test")
@@ -199,12 +168,12 @@ def test_bits_elements_structures_and_whole_blocks(rig: Rig) -> None:
     rig.client.shadow(everything, {"lamps": [True] * 10, "axis/1": 1, "position": 1.5})
     assert rig.value("position") == 1.5
     assert rig.value("axis/1") == 5, "the higher priority is outermost"
-    assert rig.value("lamps") == [True] * 10, "of equal ones the newest is"
+    assert rig.value("lamps") == [True] * 10, "of equal priorities, the newest is outermost"
     rig.client.lift(everything)
     assert rig.value("lamps") == [place == 3 for place in range(10)]
 
 
-def test_what_is_written_goes_to_the_injection_and_its_values_to_the_device(rig: Rig) -> None:
+def test_writes_go_to_the_injection_and_its_values_to_the_device(rig: Rig) -> None:
     number = rig.client.inject(["lamps/2", "speed"], direction=Direction.IN)
     outcomes = rig.other.write({"speed": 20, "axis/1": 3})
     assert [(outcome.kind, outcome.done) for outcome in outcomes] == [
@@ -223,7 +192,7 @@ def test_what_is_written_goes_to_the_injection_and_its_values_to_the_device(rig:
     assert (accepted.injection, accepted.writer) == (number, 4)
 
 
-def test_of_an_array_only_the_covered_bits_are_diverted(rig: Rig) -> None:
+def test_only_covered_bits_of_an_array_are_diverted(rig: Rig) -> None:
     number = rig.client.inject(["lamps/2"], direction=Direction.IN)
     (outcome,) = rig.other.write({"lamps": [True] * 10})
     assert outcome.kind is OutcomeKind.WRITTEN
@@ -232,7 +201,7 @@ def test_of_an_array_only_the_covered_bits_are_diverted(rig: Rig) -> None:
     rig.sees({"lamps": [place != 2 for place in range(10)]})
 
 
-def test_values_on_their_way_in_pass_the_inner_injections(rig: Rig) -> None:
+def test_values_toward_the_device_pass_through_inner_injections(rig: Rig) -> None:
     inner = rig.client.inject(["speed"], direction=Direction.IN)
     outer = rig.client.inject(["speed"], direction=Direction.IN)
     rig.other.write({"speed": 1})
@@ -245,28 +214,26 @@ def test_values_on_their_way_in_pass_the_inner_injections(rig: Rig) -> None:
     rig.sees({"speed": 3})
 
 
-def test_a_shadow_goes_when_its_client_does_unless_it_is_to_be_kept(rig: Rig) -> None:
+def test_shadow_is_lifted_when_its_client_ends_unless_it_is_kept(rig: Rig) -> None:
     kept = rig.client.inject(["axis/1"], keep=True)
     rig.client.shadow(kept, {"axis/1": 11})
     other = rig.other.inject(["axis/2"])
     rig.other.shadow(other, {"axis/2": 12})
     gone = rig.client.inject(["speed"])
     rig.client.shadow(gone, {"speed": 13})
-    rig.owners[4] = Owner(4, 101)  # another process has the queue by now
+    rig.owners[4] = Owner(4, 101)  # another process owns the queue now
     lifted = rig.event(EventKind.LIFTED)
     assert (lifted.injection, lifted.text) == (gone, "its client is gone")
     rig.sees({"axis/1": 11, "axis/2": 12, "speed": 0})
 
 
-def test_clients_are_looked_after_now_and_then_however_many_commands_come(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clients_are_not_checked_at_every_command(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.connectors.injections.LOOK_NS", 10**15)
     rig.asked.clear()
     number = rig.client.inject(["speed"])
     for value in range(20):
         rig.client.shadow(number, {"speed": value})
-    assert len(rig.asked) <= 2, "when it was laid, and at the first look"
+    assert len(rig.asked) <= 2, "at the injection, and at the first check"
 
 
 def test_injections_outlive_the_sources_process(rig: Rig) -> None:
@@ -282,7 +249,7 @@ def test_injections_outlive_the_sources_process(rig: Rig) -> None:
     rig.sees({"speed": 0})
 
 
-def test_values_beneath_other_injections_outlive_the_sources_process(rig: Rig) -> None:
+def test_values_below_other_injections_outlive_the_sources_process(rig: Rig) -> None:
     inner, outer = (rig.client.inject(["speed"], name=name) for name in ("inner", "outer"))
     more = {"name": "more", "target": "cell/speed", "operation": "offset", "value": 100, "priority": 1}
     rig.client.declare(msgspec.convert(more, Declaration))
@@ -291,12 +258,12 @@ def test_values_beneath_other_injections_outlive_the_sources_process(rig: Rig) -
     rig.sees({"speed": 109})
     rig.stop()
     rig.start()
-    assert rig.value("speed") == 109, "it was added twice"
+    assert rig.value("speed") == 109, "the offset is added once"
     rig.client.lift(outer)
     rig.sees({"speed": 107})
 
 
-def test_what_cannot_be_is_refused(rig: Rig) -> None:
+def test_invalid_requests_are_refused(rig: Rig) -> None:
     with pytest.raises(PathError, match="names no register"):
         rig.client.inject(["speeds"])
     with pytest.raises(CommandError, match="covers registers that are not writable"):
@@ -314,8 +281,8 @@ def test_what_cannot_be_is_refused(rig: Rig) -> None:
         rig.other.inject(["speed"])
 
 
-def test_what_the_segment_has_no_room_for_is_refused(rig: Rig) -> None:
-    name = "\1" * 256  # six characters each in the document that everybody reads
+def test_injections_beyond_the_space_in_the_segment_are_refused(rig: Rig) -> None:
+    name = "\1" * 256  # each takes six characters in the JSON document of all injections
     laid: list[int] = []
     with pytest.raises(CommandError, match="injections of one source are too large"):
         laid.extend(rig.client.inject(["speed"], name=name) for _ in range(MAX_INJECTIONS))
@@ -324,7 +291,7 @@ def test_what_the_segment_has_no_room_for_is_refused(rig: Rig) -> None:
     rig.client.inject(["speed"], name=name)
 
 
-def test_toward_a_device_that_is_not_armed_nothing_is_injected(segment: Segment) -> None:
+def test_injection_toward_an_unarmed_device_is_refused(segment: Segment) -> None:
     rig = Rig(segment, armed=False)
     try:
         with pytest.raises(CommandError, match="needs `armed = true`"):

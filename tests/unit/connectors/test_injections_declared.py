@@ -1,4 +1,4 @@
-"""Declared injections in a source's process: what consumers see, what reaches the device, what is told."""
+"""Declared injections in a source's process: values for consumers, writes to the device, events."""
 
 from __future__ import annotations
 
@@ -17,62 +17,41 @@ from shmio.connectors.injection_layers import MAX_HELD, Owner
 from shmio.connectors.output import Image, Output
 from shmio.errors import CommandError
 from shmio.injection.draw import SeededRandom
-from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value, codec
-from shmio.local.reading import reading
-from shmio.local.writer import CommandSender, SourceWriter
+from shmio.local.writer import CommandSender
 from shmio.model.clock import Clock
 from shmio.model.values import OutcomeKind
-from shmio.segment import (  # fmt: skip
-    Attributes,
-    BlockSpec,
-    CommandKind,
-    Event,
-    EventKind,
-    Frame,
-    ProcessSpec,
-    Provenance,
-    Quality,
-    Segment,
-    Write,
-)
+from shmio.segment import CommandKind, Event, EventKind, Frame, Provenance, Quality, Segment, Write
 from shmio.segment.standing_injections import declared_document
 from shmio.testing.cell import until
+from tests.unit.connectors.harness import SourceRig, block, source_segment, tag_layout
 
-TABLE = b"""
-[registers]
+LAYOUT = tag_layout("""
 position = "LREAL"
 speed = "INT"
 lamps = "ARRAY[0..9] OF BOOL"
 flags = "WORD"
 "axis/1" = "REAL"
 "axis/2" = "REAL"
-"""
-LAYOUT = compile_sources([Source("cell.toml", TABLE)]).layouts[0]
-PERIOD_NS = 10_000_000
+""")
 FIRST: list[Value] = [True, *[False] * 9]
-"""Of the lamps the first is on."""
+"""Lamps of which only the first is on."""
 
 
 def declaration(name: str, target: str | list[str], operation: str, **keys: Any) -> Declaration:
     return msgspec.convert({"name": name, "target": target, "operation": operation, **keys}, Declaration)
 
 
-class Rig:
-    """A source's process without its loop: the test is the device, one cycle after another."""
+class Rig(SourceRig):
+    """A source's process without its loop: the test plays the device, cycle by cycle."""
 
-    def __init__(self, segment: Segment, source: str = "cell", **options: Any) -> None:
-        self.segment = segment
-        self.block = segment.blocks[source]
-        self.owners = {4: Owner(4, 100), 5: Owner(5, 200)}
-        self.client, self.other = SourceWriter(self.block, 4), SourceWriter(self.block, 5)
-        self.events = self.block.events.cursor()
-        self.writer = segment.writer(source)
+    def __init__(self, segment: Segment) -> None:
+        super().__init__(segment)
+        self.writer = segment.writer("cell")
         self.output = Output(self.writer)
         self.processor = CommandProcessor(
-            self.output, ["**"], lambda: 0, armed=True, owner_of=self.owners.get, blocks=lambda: segment.blocks,
-            **options,
-        )  # fmt: skip
+            self.output, ["**"], lambda: 0, armed=True, owner_of=self.owners.get, blocks=lambda: segment.blocks
+        )
         self.processor.open()
         self.cycle = 0
         self.image = bytearray(LAYOUT.size)
@@ -86,12 +65,12 @@ class Rig:
         assert not self._thread.is_alive()
 
     def give(self, values: Mapping[str, Value]) -> None:
-        """What the device has from now on."""
+        """Set values of the device."""
         for path, value in values.items():
             codec(LAYOUT.registers[LAYOUT.by_path[path]], LAYOUT.byte_order).encode_into(value, self.image)
 
     def poll(self, values: Mapping[str, Value] | None = None, quality: Quality = Quality.GOOD) -> Frame:
-        """One cycle, as the loop does it; the frame that consumers see."""
+        """Run one cycle, as the loop does, and return its frame."""
         self.give(values or {})
         self.cycle += 1
         self.writer.cycle = self.cycle
@@ -107,19 +86,16 @@ class Rig:
         self.written += writes
         return [""] * len(writes)
 
-    def sees(self, path: str) -> Value:
-        return reading(self.block, LAYOUT.registers[LAYOUT.by_path[path]], self.block.latest()).value
-
     def follow(self, path: str, values: Sequence[Value], give: str | None = None) -> list[Value]:
-        """What consumers see of a register while the device has one value after another, there or elsewhere."""
+        """Set ``give`` (default: ``path``) to each value in turn; return what consumers see at ``path``."""
         seen = []
         for value in values:
             self.poll({give or path: value})
-            seen.append(self.sees(path))
+            seen.append(self.value(path))
         return seen
 
     def told(self, *kinds: EventKind) -> list[Event]:
-        """The events of these kinds since the last look."""
+        """Return the events of these kinds since the last call."""
         found = []
         while (event := self.events.next(0)) is not None:
             if event.kind in kinds:
@@ -127,37 +103,30 @@ class Rig:
         return found
 
     def write(self, values: Mapping[str, Value]) -> int:
-        """Send, and wait until it is judged; the command's number."""
+        """Send a command, wait until it is judged, and return its number."""
         judged = self.block.events.cursor()
         ticket = self.other.submit(values)
         while (event := judged.next(20)) is not None and event.command != ticket.number:
             pass
-        # Accepted is told before it waits; the next command is judged after both.
+        # The event comes before the command is queued; the next command is judged after both.
         with pytest.raises(CommandError, match="no injection"):
             self.client.lift(1)
         return ticket.number
 
     def settle(self) -> None:
-        """Wait until the commands' thread has done what there was to do."""
+        """Wait until the commands' thread has handled all commands."""
         with pytest.raises(CommandError, match="no injection"):
             self.client.lift(1)
 
 
-def spec(source: str = "cell", *declared: Declaration) -> BlockSpec:
-    attributes = Attributes("device", ("**",), True)
-    return BlockSpec(source, LAYOUT, PERIOD_NS, 10**9, 1 << 20, attributes, declared_document(declared))
-
-
 @pytest.fixture
 def make(instance: str) -> Iterator[Callable[..., Rig]]:
-    """A rig whose configuration declares these."""
+    """Makes a rig whose configuration declares the given injections."""
     with ExitStack() as stack:
 
         def make(*declared: Declaration) -> Rig:
-            specs = [spec("cell", *declared), spec("other")]
-            segment = stack.enter_context(Segment.create(instance, specs, [ProcessSpec("cell", "source")]))
-            stack.callback(segment.unlink)
-            rig = Rig(segment)
+            blocks = [block(LAYOUT, ["**"], "cell", declared), block(LAYOUT, ["**"], "other")]
+            rig = Rig(stack.enter_context(source_segment(instance, *blocks)))
             stack.callback(rig.close)
             return rig
 
@@ -167,7 +136,7 @@ def make(instance: str) -> Iterator[Callable[..., Rig]]:
 RAMP = [10, 20, 30, 40, 50, 60, 70, 80]
 
 
-def test_between_two_times_consumers_see_what_the_operation_makes(make: Callable[..., Rig]) -> None:
+def test_operation_is_visible_between_two_times(make: Callable[..., Rig]) -> None:
     rig = make(declaration("drift", "cell/speed", "offset", value=100, start_s=0.03, end_s=0.05))
     rig.events = rig.block.events.cursor(after=0)
     assert rig.follow("speed", RAMP[:6]) == [10, 20, 130, 140, 50, 60]
@@ -178,17 +147,17 @@ def test_between_two_times_consumers_see_what_the_operation_makes(make: Callable
     assert standing.running is not None
     assert (standing.running.state, standing.configured, standing.active) == ("over", True, False)
     told = {**msgspec.to_builtins(standing.running.declaration), "seed": standing.running.seed}
-    assert json.loads(laid.data) == told, "what was declared is in the record, with the seed that was drawn"
+    assert json.loads(laid.data) == told, "the event has the declaration, with the drawn seed"
 
 
-def test_times_are_the_instances_also_for_a_device_once_time_was_released(make: Callable[..., Rig]) -> None:
+def test_device_uses_the_instance_clock_after_a_release(make: Callable[..., Rig]) -> None:
     rig = make(declaration("drift", "cell/speed", "offset", value=100, start_s=3600.03, end_s=3600.05))
     hour_ns = 3600 * 10**9
     rig.segment.clock.write(Clock(step=7, done=7, resumed_ns=hour_ns, offset_ns=hour_ns))
     assert rig.follow("speed", RAMP[:6]) == [10, 20, 130, 140, 50, 60]
 
 
-def test_frames_are_as_ever_while_nothing_is_active(make: Callable[..., Rig]) -> None:
+def test_frames_are_unchanged_while_nothing_is_active(make: Callable[..., Rig]) -> None:
     rig = make(declaration("drift", "cell/speed", "offset", value=100, start_s=0.03, end_s=0.04))
     assert [rig.poll().effective is None for _ in range(5)] == [True, True, False, True, True]
 
@@ -213,10 +182,10 @@ def test_operations(make: Callable[..., Rig], operation: str, keys: dict[str, An
     assert rig.follow("speed", RAMP[:4]) == seen
     frame = rig.poll({"speed": 5})
     assert frame.effective is not None
-    assert frame.raw[:8] == frame.effective[:8], "the neighbours stay as they are"
+    assert frame.raw[:8] == frame.effective[:8], "the neighbours are unchanged"
 
 
-def test_the_same_seed_gives_the_same_values_and_another_does_not(make: Callable[..., Rig]) -> None:
+def test_each_activation_and_each_seed_has_its_own_values(make: Callable[..., Rig]) -> None:
     noise = {"amplitude": 5, "distribution": "gaussian"}
     rig = make(
         declaration("noise", "cell/axis/1", "noise", seed=7, **noise, when="cell/lamps/0"),
@@ -225,20 +194,20 @@ def test_the_same_seed_gives_the_same_values_and_another_does_not(make: Callable
 
     def run() -> list[tuple[Value, Value]]:
         rig.poll({"lamps": FIRST})
-        seen = [(rig.sees("axis/1"), rig.sees("axis/2"))]
+        seen = [(rig.value("axis/1"), rig.value("axis/2"))]
         for _ in range(5):
             rig.poll()
-            seen.append((rig.sees("axis/1"), rig.sees("axis/2")))
+            seen.append((rig.value("axis/1"), rig.value("axis/2")))
         rig.poll({"lamps": [False] * 10})
         return seen
 
     first, second = run(), run()
     assert len(set(first)) == 6
-    assert first != second, "each activation has its own"
+    assert first != second, "each activation has its own values"
     assert all(one != other for one, other in first)
 
 
-def test_a_frame_between_two_cycles_draws_nothing_new(make: Callable[..., Rig]) -> None:
+def test_frame_between_two_cycles_has_the_same_random_values(make: Callable[..., Rig]) -> None:
     rig = make(
         declaration("noise", "cell/axis/1", "noise", amplitude=5, seed=1),
         declaration("loss", "cell/speed", "drop", probability=0.5, seed=1),
@@ -256,7 +225,7 @@ def test_a_frame_between_two_cycles_draws_nothing_new(make: Callable[..., Rig]) 
         assert between.effective[8:] == before.effective[8:]
 
 
-def test_some_cycles_are_lost(make: Callable[..., Rig]) -> None:
+def test_drop_with_a_probability_loses_some_cycles(make: Callable[..., Rig]) -> None:
     rig = make(declaration("loss", "cell/speed", "drop", probability=0.5, seed=3))
     given = list(range(1, 41))
     seen = rig.follow("speed", given)
@@ -266,7 +235,7 @@ def test_some_cycles_are_lost(make: Callable[..., Rig]) -> None:
         assert shown == max((number for number in kept if number <= given[place]), default=given[0])
 
 
-def test_conditions_over_this_source_and_others(make: Callable[..., Rig]) -> None:
+def test_condition_on_this_source_and_another(make: Callable[..., Rig]) -> None:
     rig = make(declaration("stuck", "cell/speed", "set", value=0, when="cell/flags.%X3 and other/speed > 5"))
     other = rig.segment.writer("other")
     speed = LAYOUT.registers[LAYOUT.by_path["speed"]]
@@ -278,20 +247,20 @@ def test_conditions_over_this_source_and_others(make: Callable[..., Rig]) -> Non
 
     def seen(flags: int) -> Value:
         rig.poll({"speed": 9, "flags": flags})
-        return rig.sees("speed")
+        return rig.value("speed")
 
     assert seen(8) == 9, "the other source has no frame yet"
     publish(6)
     assert [seen(flags) for flags in (8, 7, 8)] == [0, 9, 0]
     publish(6, Quality.BAD)
-    assert seen(8) == 9, "a bad value is none"
+    assert seen(8) == 9, "a bad value does not count"
     publish(6)
     assert seen(8) == 0
     rig.poll(quality=Quality.BAD)
-    assert rig.sees("speed") == 9
+    assert rig.value("speed") == 9
 
 
-def test_a_condition_reads_what_the_device_delivers_not_what_injections_make_of_it(make: Callable[..., Rig]) -> None:
+def test_condition_reads_the_devices_value_not_the_injected_one(make: Callable[..., Rig]) -> None:
     rig = make(declaration("limit", "cell/speed", "set", value=0, when="cell/speed > 50"))
     assert rig.follow("speed", RAMP) == [10, 20, 30, 40, 50, 0, 0, 0]
 
@@ -305,7 +274,7 @@ def test_on_a_condition_for_a_limited_time(make: Callable[..., Rig]) -> None:
     assert turns == [(2, 1), (4, 1), (7, 2), (9, 2)]
 
 
-def test_the_highest_priority_is_outermost_whoever_laid_it(make: Callable[..., Rig]) -> None:
+def test_priority_orders_declared_injections_and_those_of_clients(make: Callable[..., Rig]) -> None:
     rig = make(
         declaration("outer", "cell/speed", "offset", value=1, priority=5),
         declaration("inner", "cell/speed", "scale", value=2),
@@ -314,12 +283,11 @@ def test_the_highest_priority_is_outermost_whoever_laid_it(make: Callable[..., R
     number = rig.client.inject(["speed"], priority=3)
     rig.client.shadow(number, {"speed": 100})
     rig.poll()
-    assert rig.sees("speed") == 101, "between the two"
+    assert rig.value("speed") == 101, "the client's injection is between the declared ones"
     rig.client.lift(number)
     rig.poll()
-    assert rig.sees("speed") == 21
-    paths = {reg.path: reading(rig.block, reg, rig.block.latest()).provenance for reg in LAYOUT.registers}
-    assert (paths["speed"], paths["flags"]) == ("injected", "live")
+    assert rig.value("speed") == 21
+    assert [rig.reading(path).provenance for path in ("speed", "flags")] == ["injected", "live"]
 
 
 def test_bits_elements_ranges_structures_and_whole_blocks(make: Callable[..., Rig]) -> None:
@@ -330,19 +298,19 @@ def test_bits_elements_ranges_structures_and_whole_blocks(make: Callable[..., Ri
         declaration("axes", "cell/axis", "offset", value=1.5),
     )
     rig.poll({"flags": 1, "axis/1": 1, "axis/2": 2})
-    assert rig.sees("flags") == 0x5505
-    assert rig.sees("lamps") == [place in (2, 3, 4, 9) for place in range(10)]
-    assert (rig.sees("axis/1"), rig.sees("axis/2")) == (2.5, 3.5)
+    assert rig.value("flags") == 0x5505
+    assert rig.value("lamps") == [place in (2, 3, 4, 9) for place in range(10)]
+    assert (rig.value("axis/1"), rig.value("axis/2")) == (2.5, 3.5)
     everything = declaration("all", "cell", "freeze", priority=9)
     rig.client.declare(everything)
     held = rig.poll().effective
     assert rig.poll({"position": 7, "flags": 0, "speed": 3}).effective == held
 
 
-# -- over /in ----------------------------------------------------------------------------------------------------------
+# -- toward the device -------------------------------------------------------------------------------------------------
 
 
-def test_what_is_written_reaches_the_device_altered(make: Callable[..., Rig]) -> None:
+def test_write_reaches_the_device_altered(make: Callable[..., Rig]) -> None:
     rig = make(declaration("gain", "cell/speed/in", "scale", value=2, start_s=0.02, end_s=0.04))
     rig.poll()
     rig.poll()
@@ -362,10 +330,10 @@ def test_what_is_written_reaches_the_device_altered(make: Callable[..., Rig]) ->
     rig.poll()
     rig.write({"speed": 21})
     rig.poll()
-    assert rig.written[-1] == Write(8, 0, b"\x15\0"), "it is over"
+    assert rig.written[-1] == Write(8, 0, b"\x15\0"), "the injection is over"
 
 
-def test_a_black_hole_takes_what_is_written(make: Callable[..., Rig]) -> None:
+def test_drop_takes_what_is_written(make: Callable[..., Rig]) -> None:
     rig = make(declaration("hole", "cell/lamps/3/in", "drop"))
     rig.poll()
     assert rig.other.write({"lamps/3": True})[0].kind is OutcomeKind.TAKEN
@@ -386,7 +354,9 @@ def test_a_delayed_write_is_sent_later(make: Callable[..., Rig]) -> None:
     for _ in range(4):
         rig.poll()
         sent.append(list(rig.written))
-    assert sent == [[], [], [Write(8, 0, b"\x0f\0")], [Write(8, 0, b"\x0f\0")]], "and met what is further in"
+    assert sent == [[], [], [Write(8, 0, b"\x0f\0")], [Write(8, 0, b"\x0f\0")]], (
+        "sent later, through the inner injection"
+    )
     rig.events = rig.block.events.cursor(after=0)
     told = (EventKind.DIVERTED, EventKind.TAKEN, EventKind.ACCEPTED, EventKind.WRITTEN)
     kinds = [event.kind for event in rig.told(*told)]
@@ -396,7 +366,7 @@ def test_a_delayed_write_is_sent_later(make: Callable[..., Rig]) -> None:
 
 
 @pytest.mark.parametrize("by", ["lift", "disconnect"])
-def test_what_a_delay_held_is_not_sent_when_it_is_lifted_or_the_device_is_gone(
+def test_delayed_write_expires_when_its_injection_is_lifted_or_the_device_disconnects(
     make: Callable[..., Rig], by: str
 ) -> None:
     rig = make()
@@ -416,7 +386,7 @@ def test_what_a_delay_held_is_not_sent_when_it_is_lifted_or_the_device_is_gone(
     assert rig.written == []
 
 
-def test_a_delay_that_is_full_rejects_what_comes(make: Callable[..., Rig]) -> None:
+def test_full_delay_rejects_writes(make: Callable[..., Rig]) -> None:
     rig = make(declaration("late", "cell/speed/in", "delay", delay_cycles=2))
     rig.poll()
     for value in range(MAX_HELD):
@@ -429,10 +399,10 @@ def test_a_delay_that_is_full_rejects_what_comes(make: Callable[..., Rig]) -> No
     rig.write({"speed": 1})
 
 
-# -- by command, and from process to process ---------------------------------------------------------------------------
+# -- declared by clients, and kept over processes ----------------------------------------------------------------------
 
 
-def test_one_that_a_client_declares_goes_when_it_is_over_or_its_client_is_gone(make: Callable[..., Rig]) -> None:
+def test_clients_declaration_is_lifted_when_it_is_over_or_the_client_ends(make: Callable[..., Rig]) -> None:
     rig = make()
     over = rig.client.declare(declaration("short", "cell/speed", "set", value=1, end_s=0.02))
     gone = rig.other.declare(declaration("left", "cell/flags", "set", value=1))
@@ -450,13 +420,13 @@ def test_one_that_a_client_declares_goes_when_it_is_over_or_its_client_is_gone(m
     assert [standing.number for standing in rig.block.standing.read()] == [kept]
 
 
-def test_one_of_the_configuration_that_somebody_lifts_stays_lifted(make: Callable[..., Rig]) -> None:
+def test_lifted_injection_of_the_configuration_stays_lifted(make: Callable[..., Rig]) -> None:
     rig = make(declaration("stuck", "cell/speed", "set", value=-1))
     rig.poll({"speed": 5})
     (standing,) = rig.block.standing.read()
     rig.client.lift(standing.number)
     rig.poll()
-    assert rig.sees("speed") == 5
+    assert rig.value("speed") == 5
     assert [one.lifted for one in rig.block.standing.read()] == [True]
     with pytest.raises(CommandError, match="the injection stuck was lifted already"):
         rig.client.lift(standing.number)
@@ -464,12 +434,12 @@ def test_one_of_the_configuration_that_somebody_lifts_stays_lifted(make: Callabl
     again = Rig(rig.segment)
     try:
         again.poll({"speed": 6})
-        assert again.sees("speed") == 6
+        assert again.value("speed") == 6
     finally:
         again.close()
 
 
-def test_a_process_goes_on_where_the_one_before_it_ended(make: Callable[..., Rig]) -> None:
+def test_successor_process_continues_active_injections(make: Callable[..., Rig]) -> None:
     rig = make(
         declaration("held", "cell/speed", "freeze", when="cell/lamps/0"),
         declaration("noise", "cell/axis/1", "noise", amplitude=5, when="cell/lamps/0"),
@@ -486,11 +456,11 @@ def test_a_process_goes_on_where_the_one_before_it_ended(make: Callable[..., Rig
         seen = []
         for _ in range(3):
             again.poll({"speed": 9})
-            seen.append((again.sees("speed"), again.sees("axis/1"), again.sees("flags")))
+            seen.append((again.value("speed"), again.value("axis/1"), again.value("flags")))
         assert [speed for speed, _, _ in seen] == [3, 3, 3]
         assert [noise for _, noise, _ in seen] == pytest.approx(expected[1:], rel=1e-6)
         assert [flags for _, _, flags in seen] == [77, 77, 0]
-        assert again.told(EventKind.INJECTED) == [], "nobody laid it anew"
+        assert again.told(EventKind.INJECTED) == [], "the successor lays no injection again"
     finally:
         again.close()
 
@@ -507,9 +477,12 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     ]
     rig.block.declared.write(declared_document(changed))
     rig.block.commands.wake()
-    until(lambda: "new" in {standing.name for standing in rig.block.standing.read()}, "laid, the last thing it does")
+    until(
+        lambda: "new" in {standing.name for standing in rig.block.standing.read()},
+        "the new injection, which is laid last",
+    )
     rig.poll({"axis/1": 2})
-    assert (rig.sees("axis/1"), rig.sees("flags"), rig.sees("speed")) == (1, 0, 2)
+    assert (rig.value("axis/1"), rig.value("flags"), rig.value("speed")) == (1, 0, 2)
     after = {standing.name: standing.number for standing in rig.block.standing.read()}
     assert set(after) == {"stay", "turn", "new"}
     assert before["stay"] == after["stay"]
@@ -526,7 +499,7 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
         (declaration("x", "cell/speed", "freeze", when="cell/speed >"), "when: at character 13: expected a register"),
     ],
 )
-def test_what_cannot_be_is_refused_by_the_source(make: Callable[..., Rig], wrong: Declaration, reason: str) -> None:
+def test_faulty_declaration_is_refused_by_the_source(make: Callable[..., Rig], wrong: Declaration, reason: str) -> None:
     rig = make()
     with pytest.raises(CommandError) as refused:
         rig.client.declare(wrong)
@@ -546,7 +519,7 @@ def test_garbage_in_place_of_a_declaration_is_refused(make: Callable[..., Rig]) 
 
 
 @pytest.mark.parametrize(("operation", "keys"), [("set", {"value": "NaN"}), ("flip", {"bits": list(range(23, 31))})])
-def test_what_an_injection_makes_no_number_of_does_not_reach_the_device(
+def test_nan_from_an_injection_does_not_reach_the_device(
     make: Callable[..., Rig], operation: str, keys: dict[str, Any]
 ) -> None:
     rig = make(declaration("mad", "cell/axis/1/in", operation, **keys))

@@ -1,4 +1,4 @@
-"""What goes to injections, and what programs see of it: chains of them, and the stream of what was diverted."""
+"""Values diverted to injections: through chains of injections, and as a stream for programs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.unit.connectors.test_injections import LAYOUT, Rig
 
 segment = test_injector.segment
 GUEST = 0
-"""The command queue of the only program from outside."""
+"""The command queue of the only guest."""
 
 
 @pytest.fixture
@@ -38,8 +38,8 @@ def local(rig: Rig) -> Iterator[Attachment]:
         yield local
 
 
-def beneath(rig: Rig, number: int, until: EventKind) -> list[tuple[int, bytes]]:
-    """(offset, data) of all that is diverted to an injection until an event of this kind."""
+def diverted_to(rig: Rig, number: int, until: EventKind) -> list[tuple[int, bytes]]:
+    """Return (offset, data) of what is diverted to an injection before the next event of a kind."""
     found = []
     while (event := rig.events.next(20)) is None or event.kind != until:
         assert event is not None
@@ -51,40 +51,42 @@ def beneath(rig: Rig, number: int, until: EventKind) -> list[tuple[int, bytes]]:
 SPEED = LAYOUT.registers[LAYOUT.by_path["speed"]].offset
 
 
-def test_what_an_inner_injection_gives_goes_to_the_one_further_out(rig: Rig) -> None:
+def test_values_of_an_inner_injection_go_to_the_outer_one(rig: Rig) -> None:
     inner = rig.client.inject(["speed", "axis"])
     rig.client.shadow(inner, {"speed": 5})
     outer = rig.other.inject(["speed", "position"])
-    assert beneath(rig, inner, EventKind.INJECTED) == []
-    assert beneath(rig, outer, EventKind.INJECTED) == [(SPEED, b"\5\0")], "what it finds there"
+    assert diverted_to(rig, inner, EventKind.INJECTED) == []
+    assert diverted_to(rig, outer, EventKind.INJECTED) == [(SPEED, b"\5\0")], "the value at the time of the injection"
     rig.client.shadow(inner, {"speed": 6, "axis/1": 7})
-    assert beneath(rig, outer, EventKind.SHADOWED) == [(SPEED, b"\6\0")]
-    assert (rig.value("speed"), rig.value("axis/1")) == (5, 7), "consumers hold the outer one's value"
+    assert diverted_to(rig, outer, EventKind.SHADOWED) == [(SPEED, b"\6\0")]
+    assert (rig.value("speed"), rig.value("axis/1")) == (5, 7), "consumers see the outer injection's value"
     rig.other.shadow(outer, {"speed": 8})
     assert rig.value("speed") == 8
     rig.other.lift(outer)
     assert rig.value("speed") == 6
 
 
-def test_one_that_is_laid_beneath_another_finds_what_is_there(rig: Rig) -> None:
+def test_injection_below_another_starts_with_the_current_value(rig: Rig) -> None:
     rig.client.write({"speed": 3})
     rig.sees({"speed": 3})
     outer = rig.client.inject(["speed"], priority=1)
     rig.client.shadow(outer, {"speed": 100})
     inner = rig.other.inject(["speed"])
-    assert beneath(rig, outer, EventKind.INJECTED) == []
-    assert beneath(rig, outer, EventKind.INJECTED) == [(SPEED, b"\3\0")], "not the outer one's own value"
+    assert diverted_to(rig, outer, EventKind.INJECTED) == []
+    assert diverted_to(rig, outer, EventKind.INJECTED) == [(SPEED, b"\3\0")], (
+        "the value below, not the outer injection's own"
+    )
     innermost = rig.other.inject(["speed"], priority=-1)
     rig.other.shadow(innermost, {"speed": 4})
     rig.other.lift(inner)
-    found = beneath(rig, outer, EventKind.LIFTED)
+    found = diverted_to(rig, outer, EventKind.LIFTED)
     assert found[-1] == (SPEED, b"\4\0")
     rig.other.lift(innermost)
-    assert beneath(rig, outer, EventKind.LIFTED) == [], "it is the device's again"
+    assert diverted_to(rig, outer, EventKind.LIFTED) == [], "the value below comes from the device again"
     assert rig.value("speed") == 100
 
 
-def test_what_a_declared_one_computes_goes_to_the_one_further_out(rig: Rig, local: Attachment) -> None:
+def test_values_of_a_declared_injection_go_to_the_outer_one(rig: Rig, local: Attachment) -> None:
     rig.client.write({"speed": 3})
     rig.sees({"speed": 3})
     with local.inject("cell/speed", "cell/position", priority=1) as outer:
@@ -93,17 +95,17 @@ def test_what_a_declared_one_computes_goes_to_the_one_further_out(rig: Rig, loca
             {"name": "drift", "target": "cell/speed", "operation": "offset", "value": 100}, Declaration
         )
         declared = rig.client.declare(drift)
-        assert next(stream).values == {"speed": 103}, "from the cycle on in which it is active"
+        assert next(stream).values == {"speed": 103}, "from its first active cycle on"
         rig.client.write({"speed": 4})
         assert next(stream).values == {"speed": 104}
         inner = rig.other.inject(["speed"], priority=-1)
         rig.other.shadow(inner, {"speed": 7})
-        assert any(one.values == {"speed": 107} for one in stream), "what it makes of what an inner one gives"
+        assert any(one.values == {"speed": 107} for one in stream), "the value of the inner injection plus the offset"
         rig.client.lift(declared)
         assert any(one.values == {"speed": 7} for one in stream)
 
 
-def test_what_a_declared_one_computes_is_told_again_when_it_is_declared_again(rig: Rig, local: Attachment) -> None:
+def test_values_of_a_redeclared_injection_are_diverted_again(rig: Rig, local: Attachment) -> None:
     rig.client.write({"speed": 3})
     rig.sees({"speed": 3})
     with local.inject("cell/speed", priority=1) as outer:
@@ -118,7 +120,7 @@ def test_what_a_declared_one_computes_is_told_again_when_it_is_declared_again(ri
             rig.event(EventKind.LIFTED)
 
 
-def test_what_others_give_is_told_when_a_declared_one_between_becomes_inactive(rig: Rig, local: Attachment) -> None:
+def test_inner_value_is_diverted_when_a_declared_injection_becomes_inactive(rig: Rig, local: Attachment) -> None:
     drift = {"name": "drift", "target": "cell/speed", "operation": "offset", "value": 100, "when": "cell/axis/1 > 0"}
     rig.client.declare(msgspec.convert(drift, Declaration))
     inner = rig.other.inject(["speed"], priority=-1)
@@ -132,7 +134,7 @@ def test_what_others_give_is_told_when_a_declared_one_between_becomes_inactive(r
         assert next(stream).values == {"speed": 7}
 
 
-def test_a_program_gets_what_others_write_command_by_command(rig: Rig, local: Attachment) -> None:
+def test_program_gets_diverted_writes_command_by_command(rig: Rig, local: Attachment) -> None:
     with local.inject("cell/speed/in", "cell/axis/in", "cell/lamps/2/in") as shadow:
         lamps = [place in (2, 3) for place in range(10)]
         rig.client.write({"speed": 20})
@@ -148,10 +150,10 @@ def test_a_program_gets_what_others_write_command_by_command(rig: Rig, local: At
         assert (one.values, one.writer, one.missed) == ({"speed": 22}, 4, 0)
         assert one.clock_ns > 0
         assert list(shadow.diverted(timeout_s=0.01)) == []
-    assert list(shadow.diverted()) == [], "it has an end when the shadow is lifted"
+    assert list(shadow.diverted()) == [], "the stream ends when the shadow is lifted"
 
 
-def test_whole_arrays_and_what_is_longer_than_an_event(rig: Rig, local: Attachment) -> None:
+def test_whole_arrays_and_single_elements_are_diverted(rig: Rig, local: Attachment) -> None:
     with local.inject("cell/lamps/in") as shadow:
         rig.client.write({"lamps": [True] * 10})
         rig.client.write({"lamps/0": False})
@@ -160,21 +162,21 @@ def test_whole_arrays_and_what_is_longer_than_an_event(rig: Rig, local: Attachme
         assert next(stream).values == {"lamps/0": False}
 
 
-def test_a_program_is_told_how_much_it_missed(rig: Rig, local: Attachment) -> None:
+def test_stream_of_diverted_values_counts_missed_events(rig: Rig, local: Attachment) -> None:
     with local.inject("cell/speed/in") as shadow:
         stream = shadow.diverted(timeout_s=20)
         rig.client.write({"speed": 1})
         assert next(stream).missed == 0
         head = rig.block.events.head()
         while rig.block.events.head() < head + rig.block.events.ring.slot_count:
-            rig.client.shadow(1, {"speed": 1})  # there is no such injection
+            rig.client.shadow(1, {"speed": 1})  # refused: there is no such injection
         rig.client.write({"speed": 2})
         one = next(stream)
         assert one.values == {"speed": 2}
         assert one.missed > 0
 
 
-def test_all_injections_are_lifted_at_once_whoever_laid_them(rig: Rig, local: Attachment) -> None:
+def test_lift_all_lifts_the_injections_of_all_clients(rig: Rig, local: Attachment) -> None:
     numbers = {rig.client.inject(["speed"]), rig.other.inject(["axis"], keep=True)}
     kept = local.inject("cell/lamps", keep=True)
     lifted = local.lift_all()
@@ -184,36 +186,36 @@ def test_all_injections_are_lifted_at_once_whoever_laid_them(rig: Rig, local: At
     assert local.lift_all() == []
 
 
-def test_a_campaign_ends_although_its_reader_has_missed_the_end(rig: Rig, local: Attachment) -> None:
+def test_campaign_ends_even_if_its_reader_missed_the_end(rig: Rig, local: Attachment) -> None:
     with local.declare([{"name": "stuck", "target": "cell/speed", "operation": "set", "value": 5}]) as campaign:
         local.lift_all()
         head = rig.block.events.head()
         while rig.block.events.head() <= head + rig.block.events.ring.slot_count:
-            rig.client.shadow(9999, {"speed": 1})  # there is no such injection
-        waiting = threading.Timer(20, campaign.end)  # so that a failure does not wait for ever
+            rig.client.shadow(9999, {"speed": 1})  # refused: there is no such injection
+        waiting = threading.Timer(20, campaign.end)  # so that a failing test ends
         waiting.start()
         happened = list(campaign)
-        assert waiting.is_alive(), "it has ended by itself"
+        assert waiting.is_alive(), "the campaign has ended by itself"
         waiting.cancel()
         waiting.join()
     assert happened == []
 
 
-def test_what_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
+def test_injection_that_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
     one = StandingInjection(5, "out", 0, keep=True, name="", writer=0, pid=0, ranges=())
-    rig.block.standing.write(encode([msgspec.json.encode(one)]))  # of which the source knows nothing
+    rig.block.standing.write(encode([msgspec.json.encode(one)]))  # the source does not know this injection
     with pytest.raises(CommandError, match="1 of 1 injections were not lifted: cell: there is no injection 5"):
         local.lift_all()
     rig.block.standing.write(encode([]))
 
 
-def test_a_program_follows_what_is_written_toward_a_source(rig: Rig, local: Attachment) -> None:
+def test_program_follows_writes_toward_a_source(rig: Rig, local: Attachment) -> None:
     stream = local.written("cell/speed", "cell/lamps/2/in", timeout_s=20)
     rig.client.write({"speed": 20, "axis/1": 1})
     rig.client.write({"axis/1": 2})
     rig.other.write({"lamps": [True] * 10})
     with local.inject("cell/speed/in") as shadow:
-        rig.client.write({"speed": 30})  # it does not get that far
+        rig.client.write({"speed": 30})  # the injection takes it
         shadow.set({"cell/speed": 31})
     rig.client.write({"speed": 20})
     found = [next(stream) for _ in range(4)]
@@ -222,7 +224,7 @@ def test_a_program_follows_what_is_written_toward_a_source(rig: Rig, local: Atta
     assert list(local.written("cell", timeout_s=0.01)) == []
 
 
-def test_what_cannot_be_followed(rig: Rig, local: Attachment) -> None:
+def test_following_an_invalid_path_is_refused(rig: Rig, local: Attachment) -> None:
     for wrong in ("cell/nothing", "cell/speed/out", "nobody/x"):
         with pytest.raises(PathError):
             local.written(wrong)

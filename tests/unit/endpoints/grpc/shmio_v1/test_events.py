@@ -186,13 +186,19 @@ def test_more_events_than_the_ring_holds_are_counted(segment: Segment) -> None:
     serve(segment, test)
 
 
+async def stream_over_a_reload(served: Endpoint, layout: Layout | None) -> Stream:
+    """Begin a stream, publish the note "last words", and reload; nothing of it is read yet."""
+    served.writer.event(NOTE)
+    stream = Stream(served)
+    await stream.begin()
+    served.writer.event(NOTE._replace(text="last words"))
+    reload(served, layout)
+    return stream
+
+
 def test_a_reload_goes_on_with_the_new_block(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        served.writer.event(NOTE)
-        stream = Stream(served)
-        await stream.begin()
-        served.writer.event(NOTE._replace(text="last words"))
-        reload(served, OTHER)
+        stream = await stream_over_a_reload(served, OTHER)
         served.writer.event(Record(Recorded.ACCEPTED, "", 4, 1, 0, 1, 0, 0, 4, (7).to_bytes(4, "big")))
         assert (await stream.next()).text == "last words"
         started, accepted = await stream.next(), await stream.next()
@@ -246,11 +252,7 @@ def test_a_call_that_began_with_the_new_block_stays_there(segment: Segment) -> N
 
 def test_a_source_that_a_reload_removes_is_told_once(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        served.writer.event(NOTE)
-        stream = Stream(served)
-        await stream.begin()
-        served.writer.event(NOTE._replace(text="last words"))
-        reload(served, None)
+        stream = await stream_over_a_reload(served, None)
         assert (await stream.next()).text == "last words"
         gone = event_from_wire(await stream.next())
         assert (gone.kind, gone.source, gone.quality) == (EventKind.REMOVED, "cell", Quality.BAD)
