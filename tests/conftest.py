@@ -41,7 +41,7 @@ ONE_AFTER_THE_OTHER = (
     # the ports of the README
     (
         "tests/system/test_docs.py",
-        "tests/unit/cli/test_supervisor_cell.py::test_what_init_writes_for_a_block",
+        "tests/unit/cli/test_supervisor_cell.py::test_configuration_from_init_runs",
     ),
     # an instance that all of a module use
     ("tests/system/test_inject.py",),
@@ -57,7 +57,7 @@ START_PROCESSES = (
     "tests/native/",
     "tests/system/",
     "tests/unit/cli/test_completion.py",
-    "tests/unit/cli/test_supervisor.py::test_a_fault_that_a_detached_one_finds_is_told_here",
+    "tests/unit/cli/test_supervisor.py::test_up_detach_reports_faults",
     "tests/unit/client/test_generated.py",
     "tests/unit/endpoints/mqtt/broker/",
     "tests/unit/plan/test_sources_models.py",
@@ -75,7 +75,7 @@ SLOW = (
     "tests/unit/cli/test_dump_rewriting.py::test_recover_of_a_file_cut_off_at_every_byte",
     "tests/unit/cli/test_run_signals.py",
     "tests/unit/config/test_faults.py::test_hostile_files",
-    "tests/unit/connectors/replay/test_recording.py::test_a_damaged_place_is_bad",
+    "tests/unit/connectors/replay/test_recording.py::test_damaged_chunk_is_bad",
     "tests/unit/connectors/s7/test_connector.py::test_references_wrap_around",
     "tests/unit/endpoints/grpc/services/test_publish.py::test_many_streams",
     "tests/unit/endpoints/grpc/services/test_publish.py::test_ten_thousand",

@@ -1,4 +1,4 @@
-"""A command on a terminal."""
+"""A command on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import termios
 
 
 class Terminal:
-    """A command on a terminal of 80 times 6 characters."""
+    """Runs a command on a pseudo-terminal of 80 columns and 6 lines."""
 
     def __init__(self, *words: str, **environment: str) -> None:
         self._master, slave = pty.openpty()
@@ -23,17 +23,17 @@ class Terminal:
         self._data = b""
 
     def until(self, pattern: str) -> str:
-        """What it shows up to there; all of it if it never shows that."""
+        """Return the output up to the pattern; fail if the pattern never comes."""
         while not (found := re.search(pattern, text := self._data.decode(errors="ignore"), re.DOTALL)):
             try:
                 self._data += os.read(self._master, 65536)
-            except OSError:  # it has ended
+            except OSError:  # the command has ended
                 raise AssertionError(f"no {pattern!r} in {text!r}") from None
         self._data = text[found.end() :].encode()
         return text[: found.end()]
 
     def type(self, keys: str) -> None:
-        """As from its keyboard."""
+        """Send keys as if typed on the keyboard."""
         os.write(self._master, keys.encode())
 
     def __enter__(self) -> Terminal:

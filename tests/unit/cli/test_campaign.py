@@ -1,4 +1,7 @@
-"""``shmio inject --file``: what it refuses before anything is laid; the whole is in tests/system/test_campaign.py."""
+"""``shmio inject --file``: files that it refuses before it injects anything.
+
+Whole campaigns are in tests/system/test_campaign.py.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,7 @@ def segment(instance: str) -> Iterator[Segment]:
         (GOOD + "for = 1\n", "injection[0].for: unknown key; did you mean for_s?"),
     ],
 )
-def test_a_file_with_a_fault_lays_nothing(
+def test_faulty_file_injects_nothing(
     segment: Segment, tmp_path: Path, text: str | None, error: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "c.toml"
@@ -57,7 +60,7 @@ def test_a_file_with_a_fault_lays_nothing(
 
 
 class Still:
-    """An instance whose time stands, and in which everything is over at once."""
+    """An instance whose time is paused, and whose campaigns are over at once."""
 
     clock = Clock(ClockMode.VIRTUAL, time_ns=3_000_000_000)
     declared = ()
@@ -72,7 +75,7 @@ class Still:
 
 @pytest.mark.parametrize("clock", [Still.clock, Still.clock._replace(playing=True), Clock()])
 @pytest.mark.parametrize("from_now", [True, False])
-def test_where_time_stands_a_campaign_by_time_says_who_moves_it(
+def test_campaign_by_time_notes_that_time_is_paused(
     tmp_path: Path, clock: Clock, from_now: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (file := tmp_path / "c.toml").write_text(GOOD)
@@ -84,13 +87,13 @@ def test_where_time_stands_a_campaign_by_time_says_who_moves_it(
     assert capsys.readouterr().err == (stands if clock is Still.clock and from_now else "")
 
 
-def test_a_file_and_values_do_not_go_together(segment: Segment, capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_and_values_exclude_each_other(segment: Segment, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inject", "--instance", segment.instance, "--file", "c.toml", "cell/a", "1"]) == 1
     assert capsys.readouterr().err == "give --file, or PATH VALUE, not both\n"
 
 
 @pytest.mark.parametrize("seed", ["-1", "x", str(2**63)])
-def test_a_seed_is_a_whole_number(seed: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_seed_is_wrong_usage(seed: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["inject", "--file", "c.toml", "--seed", seed])
     assert ended.value.code == 2

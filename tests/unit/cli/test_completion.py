@@ -1,4 +1,4 @@
-"""Completion of command lines, by the shells themselves."""
+"""Completion of command lines, tested in real shells."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def fish(line: str) -> str:
 
 
 def interactive(words: list[str], begin: str) -> Callable[[str], str]:
-    """A shell that is asked by the Tab key."""
+    """Return a function that completes a line in an interactive shell by the Tab key."""
 
     def complete(line: str) -> str:
         with Terminal(*words, PATH=PATH, HOME=str(Path.cwd())) as terminal:
@@ -96,7 +96,7 @@ def test_shells_complete(shell: str, line: str, completed: str, instance: str) -
 
 
 def candidates(line: str) -> list[str]:
-    """As every shell is answered."""
+    """Return the candidates that every shell gets for a line."""
     program = line.split(maxsplit=1)[0]
     answer = Path("answer")
     variables = {
@@ -126,7 +126,7 @@ def candidates(line: str) -> list[str]:
         ("shmio completion ", ["bash", "fish", "zsh"]),
     ],
 )
-def test_what_may_come_next(line: str, there_are: list[str], instance: str) -> None:
+def test_candidates_after_a_line(line: str, there_are: list[str], instance: str) -> None:
     assert candidates(line.format(instance)) == there_are
 
 

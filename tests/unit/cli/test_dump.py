@@ -52,7 +52,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> Output:
 
 @pytest.fixture
 def file(segment: Segment, tmp_path: Path) -> str:
-    """A recording: good, bad, a command, a change of layout, a gap."""
+    """A recording of good and bad frames, a command, a change of layout and a gap."""
     work = recorder(segment, tmp_path / "dumps")
     cell = segment.writer("cell")
     for value in (7, 7, 8):
@@ -74,7 +74,7 @@ def objects(lines: list[str]) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines]
 
 
-def test_info_tells_what_is_in_a_file(file: str, segment: Segment, said: Output) -> None:
+def test_info_describes_a_file(file: str, segment: Segment, said: Output) -> None:
     assert main(["info", "--json", file]) == 0
     out, err = said()
     found = json.loads("\n".join(out))
@@ -98,7 +98,7 @@ def test_info_tells_what_is_in_a_file(file: str, segment: Segment, said: Output)
     assert any(f"{gap['count']} frames, 1 to {gap['last']}: overtaken" in line for line in out)
 
 
-def test_what_recorded_nothing_says_so(segment: Segment, tmp_path: Path, said: Output) -> None:
+def test_info_on_an_empty_recording(segment: Segment, tmp_path: Path, said: Output) -> None:
     work = recorder(segment, tmp_path)
     work.close()
     assert main(["info", str(work.output.path)]) == 0
@@ -106,7 +106,7 @@ def test_what_recorded_nothing_says_so(segment: Segment, tmp_path: Path, said: O
 
 
 def test_info_folds_equal_lines(segment: Segment, tmp_path: Path, said: Output) -> None:
-    """As of a source that reloads have given one block after the other."""
+    """Each reload gives the source another block with the same contents."""
     work = recorder(segment, tmp_path / "dumps")
     for turn in range(3):
         publish(segment.writer("cell"), 1, first=turn)
@@ -158,17 +158,17 @@ def test_cat_prints_json_lines(file: str, said: Output) -> None:
     assert (events[1]["after_frame"], events[1]["command"], events[1]["size"]) == (3, 99, 2)
 
 
-def test_cat_tells_gaps_where_they_are(file: str, said: Output) -> None:
+def test_cat_prints_gaps_in_place(file: str, said: Output) -> None:
     assert main(["cat", "--json", file, "press/count"]) == 0
     found = objects(said()[0])
     where = next(index for index, line in enumerate(found) if "missed" in line)
     assert found[where]["missed"] == found[where]["last"]
     assert found[where + 1]["frame"] == found[where]["last"] + 1
     assert main(["cat", file]) == 0
-    assert any("frames missed, 1 to" in line for line in said()[0]), "and without a pattern, all of it"
+    assert any("frames missed, 1 to" in line for line in said()[0]), "also without a pattern"
 
 
-def test_cat_keeps_to_the_time_asked_for(file: str, said: Output) -> None:
+def test_cat_limits_its_output_to_the_time_range(file: str, said: Output) -> None:
     with Reader(Path(file)) as reader:
         times = [message.log_ns for message in reader.messages() if message.channel.source]
     assert main(["cat", "--json", file, "--from", "1e6"]) == 0
@@ -187,7 +187,7 @@ def test_cat_keeps_to_the_time_asked_for(file: str, said: Output) -> None:
 
 
 @pytest.mark.parametrize("time", ["yesterday", "nan", "1e400", "2026-13-01"])
-def test_what_is_no_time_is_refused(file: str, time: str, said: Output) -> None:
+def test_invalid_time_is_refused(file: str, time: str, said: Output) -> None:
     assert main(["cat", file, f"--from={time}"]) == 1
     out, [line] = said()
     assert line.startswith(f"--from: {time!r} is neither a time such as")
@@ -203,17 +203,17 @@ def test_an_end_before_its_beginning_is_refused(file: str, verb: list[str], said
     assert not Path("new").exists()
 
 
-def test_a_path_that_names_nothing_is_refused(file: str, said: Output) -> None:
+def test_path_without_a_register_is_refused(file: str, said: Output) -> None:
     assert main(["cat", file, "cell/cout"]) == 1
     assert said() == ([], ["cell/cout: no such register in DB1; near: count"])
     assert main(["cat", file, "cell/x*"]) == 1
     assert said()[1] == ["cell/x*: no register of this recording has such a path"]
-    assert main(["cat", file, "cell/speed"]) == 0, "it is in the second layout only"
+    assert main(["cat", file, "cell/speed"]) == 0, "only the second layout has speed"
     assert main(["cat", file, "count"]) == 1
     assert said()[1] == ["count: 'count' is not one of the 2 sources: write cell/… or press/…"]
 
 
-def test_cat_of_several_files_says_how(file: str, said: Output) -> None:
+def test_cat_of_several_files_refers_to_merge(file: str, said: Output) -> None:
     assert main(["cat", file, file]) == 1
     assert said() == (
         [],
@@ -224,7 +224,9 @@ def test_cat_of_several_files_says_how(file: str, said: Output) -> None:
 @pytest.mark.parametrize(
     "verb", [["info"], ["cat"], ["verify"], ["recover"], ["cut", "-o", "x"], ["campaign", "-o", "x"]]
 )
-def test_what_is_no_recording_is_told(verb: list[str], file: str, tmp_path: Path, said: Output) -> None:
+def test_file_that_is_no_recording_is_refused_in_one_line(
+    verb: list[str], file: str, tmp_path: Path, said: Output
+) -> None:
     data = Path(file).read_bytes()
     contents = {"short": data[:5], "magic": data[:8], "header": data[:40], "text": b"some text", "empty": b""}
     for name, content in contents.items():
@@ -245,7 +247,7 @@ def test_what_is_no_recording_is_told(verb: list[str], file: str, tmp_path: Path
     assert said() == ([], ["no.mem: No such file or directory"])
 
 
-def test_a_recording_of_nothing_is_whole(segment: Segment, tmp_path: Path, said: Output) -> None:
+def test_empty_recording_is_undamaged(segment: Segment, tmp_path: Path, said: Output) -> None:
     work = recorder(segment, tmp_path, selection=Selection(["nobody"]))
     work.close()
     path = work.output.path
@@ -255,7 +257,7 @@ def test_a_recording_of_nothing_is_whole(segment: Segment, tmp_path: Path, said:
     assert said() == ([], [f"{path}: nothing is recorded in it"])
 
 
-def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, said: Output) -> None:
+def test_unclosed_recording_is_read_and_reported(file: str, said: Output) -> None:
     data = Path(file).read_bytes()
     Path("cut.mem").write_bytes(data[:-600])
     assert main(["info", "--json", "cut.mem"]) == 0
@@ -265,7 +267,7 @@ def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, sai
     told = said()[0][0].partition(" MB, ")[2]
     assert re.fullmatch(r"not closed \(it ends within .*\): still being written, or its recorder was killed", told)
     assert main(["verify", "cut.mem"]) == 0
-    assert said()[0][0].startswith(f"cut.mem: {told}; "), "all in the same words"
+    assert said()[0][0].startswith(f"cut.mem: {told}; "), "the same words as info"
     assert main(["cat", "cut.mem", "cell"]) == 0
     out, [line] = said()
     assert len(out) == 10
@@ -274,7 +276,7 @@ def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, sai
 
 @pytest.fixture
 def damaged(segment: Segment, tmp_path: Path, file: str) -> tuple[str, str]:
-    """A recording of 30 frames of cell in three chunks, and the same with a byte changed within the second."""
+    """Recordings of 30 frames of press in three chunks: undamaged, and damaged in the second."""
     work = recorder(segment, tmp_path / "steady", selection=Selection(["press"]), start=StartPositions(first=False))
     for turn in range(3):
         publish(segment.writer("press"), 10, first=10 * turn)
@@ -293,7 +295,7 @@ TIME = r"[-\d]+ [:\d]+\.\d{3}"
 WHERE = rf"lost after {TIME}, before {TIME} \(bytes \d+ to \d+\): bad\.mem: the chunk at byte \d+ is damaged: .*"
 
 
-def test_verify_tells_what_is_damaged_and_where(damaged: tuple[str, str], said: Output) -> None:
+def test_verify_locates_damage(damaged: tuple[str, str], said: Output) -> None:
     file, bad = damaged
     assert main(["verify", file]) == 0
     assert said() == ([f"{file}: closed; 3 chunks and 33 messages are whole, no damage"], [])
@@ -304,7 +306,7 @@ def test_verify_tells_what_is_damaged_and_where(damaged: tuple[str, str], said: 
     first = 3 * RING + 11
     assert frames == f"  damage: press, block 1: frames {first} to {first + 9} are missing, and in no gap"
     assert events.startswith("  damage: press, block 1: events ")
-    assert out[-1].endswith("no damage"), "the other is told too"
+    assert out[-1].endswith("no damage"), "the undamaged file is reported, too"
     assert err == []
     assert main(["verify", "--json", bad]) == 1
     found = json.loads("\n".join(said()[0]))
@@ -327,14 +329,14 @@ def test_cat_as_csv(file: str, said: Output) -> None:
         ["cell", "frame", "3", "good", "", "8", ""],
         ["cell", "frame", "4", "bad", "cable out", "8", ""],
         ["cell", "frame", "1", "good", "", "5", "2.5"],
-    ], "the last of the layout that came with a reload"
+    ], "the last frame has the layout of the reload"
     assert ["cell", "quality", "bad", "cable out"] in [row[1:3] + row[4:6] for row in rows]
     assert {len(row) for row in rows} == {8}
     with pytest.raises(SystemExit):
         main(["cat", "--csv", "--json", file])
 
 
-def test_cat_goes_on_behind_a_damaged_chunk_and_says_what_is_lost(damaged: tuple[str, str], said: Output) -> None:
+def test_cat_continues_after_a_damaged_chunk_and_reports_the_loss(damaged: tuple[str, str], said: Output) -> None:
     file, bad = damaged
     assert main(["cat", "--json", file]) == 0
     whole = objects(said()[0])
@@ -344,10 +346,8 @@ def test_cat_goes_on_behind_a_damaged_chunk_and_says_what_is_lost(damaged: tuple
     assert re.fullmatch(rf"bad\.mem: {WHERE}", line)
 
 
-def test_a_channel_whose_two_descriptions_are_damaged_costs_no_other(
-    segment: Segment, tmp_path: Path, said: Output
-) -> None:
-    """The chunks that describe channels, and of the index that repeats it the first of several."""
+def test_damaged_channel_description_affects_no_other_channel(segment: Segment, tmp_path: Path, said: Output) -> None:
+    """Damaged are all chunks that describe channels, and the first of their copies in the index."""
     work = recorder(segment, tmp_path / "two")
     for turn in range(3):
         for source in ("cell", "press"):
@@ -390,7 +390,7 @@ def test_a_channel_whose_two_descriptions_are_damaged_costs_no_other(
     assert any("which has no description" in line for line in err)
 
 
-def test_a_block_without_its_layout_is_told_and_the_others_are_printed(file: str, said: Output) -> None:
+def test_cat_reports_a_damaged_layout_and_prints_the_other_blocks(file: str, said: Output) -> None:
     data = Path(file).read_bytes()
     assert data.count(b'"path":"speed"') == 1
     Path("bad.mem").write_bytes(data.replace(b'"path":"speed"', b'"path":"spred"'))
@@ -400,19 +400,7 @@ def test_a_block_without_its_layout_is_told_and_the_others_are_printed(file: str
     assert line == "bad.mem: the layout of cell/frames is damaged"
 
 
-@pytest.mark.parametrize("verb", ["info", "cat"])
-def test_what_is_no_recording_is_told_in_one_line(verb: str, said: Output) -> None:
-    Path("empty.mem").touch()
-    Path("text.mem").write_text("hello\n")
-    for name, message in (("empty.mem", "is empty"), ("text.mem", "is not a recording"), ("none.mem", "No such file")):
-        assert main([verb, name]) == 1
-        out, [line] = said()
-        assert out == []
-        assert line.startswith(name)
-        assert message in line
-
-
-def test_record_ends_when_the_time_is_over(segment: Segment, said: Output) -> None:
+def test_record_ends_after_its_duration(segment: Segment, said: Output) -> None:
     assert main(["record", "--instance", segment.instance, "-o", "mine", "--for", "0.01", "--source", "press"]) == 0
     out, err = said()
     [file] = Path("mine").iterdir()
@@ -426,7 +414,7 @@ def test_record_ends_when_the_time_is_over(segment: Segment, said: Output) -> No
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
-def test_several_record_at_once_and_ctrl_c_closes_the_file(segment: Segment, sign: signal.Signals) -> None:
+def test_signal_closes_the_files_of_concurrent_recorders(segment: Segment, sign: signal.Signals) -> None:
     command = [sys.executable, "-m", "shmio.cli.dump", "record", "--instance", segment.instance]
     recorders = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     try:
@@ -471,19 +459,21 @@ def test_the_end_of_the_instance_ends_a_recording(segment: Segment) -> None:
         (["-o", "text"], "cannot make a recording in text: File exists"),
     ],
 )
-def test_what_cannot_be_recorded_is_told(segment: Segment, arguments: list[str], message: str, said: Output) -> None:
+def test_unknown_source_or_unusable_folder_is_refused(
+    segment: Segment, arguments: list[str], message: str, said: Output
+) -> None:
     Path("text").touch()
     assert main(["record", "--instance", segment.instance, *arguments]) == 1
     assert said()[1][-1] == message
 
 
-def test_nothing_runs(said: Output) -> None:
+def test_record_without_a_running_instance_is_refused(said: Output) -> None:
     assert main(["record", "--instance", "test-none"]) == 1
     assert "no instance 'test-none' is running" in said()[1][0]
 
 
 @pytest.mark.parametrize("option", ["--before", "--after"])
-def test_seconds_around_a_condition_need_one(option: str, said: Output) -> None:
+def test_before_and_after_need_when(option: str, said: Output) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["record", option, "3"])
     assert "--before and --after need --when" in said()[1][-1]

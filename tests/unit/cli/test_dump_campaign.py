@@ -1,4 +1,4 @@
-"""``shmio-dump campaign``: what was injected, as a file that does it again."""
+"""``shmio-dump campaign``: writes the recorded injections to a campaign file that repeats them."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ Derive = Callable[..., list[dict[str, Any]]]
 
 @pytest.fixture
 def derive(capsys: pytest.CaptureFixture[str]) -> Derive:
-    """What the file of a recording with these events, each behind a frame, declares; nothing is said."""
+    """Record events after the given frames; return the declarations of the derived campaign."""
 
     def derive(*told: tuple[int, Record], options: tuple[str, ...] = (), said: str = "") -> list[dict[str, Any]]:
         for file in ("a.mem", "campaign.toml"):
@@ -72,12 +72,12 @@ def _tell(work: Build, number: int, told: tuple[tuple[int, Record], ...]) -> Non
             work.tell(record, after=number)
 
 
-def test_what_was_declared_before_it_began_is_declared_the_same(derive: Derive) -> None:
+def test_declaration_before_its_start_is_unchanged(derive: Derive) -> None:
     [one] = derive((10, declared(5, DRIFT)), (60, lifted(5, "over")))
     assert one == DRIFT
 
 
-def test_when_it_was_laid_and_lifted_counts(derive: Derive) -> None:
+def test_start_and_end_come_from_the_recorded_events(derive: Derive) -> None:
     """A period is 20 ms."""
     keys = {name: DRIFT[name] for name in ("name", "target", "operation", "value", "seed")}
     [one] = derive((10, declared(5, keys)), (60, lifted(5)))
@@ -85,7 +85,7 @@ def test_when_it_was_laid_and_lifted_counts(derive: Derive) -> None:
     [one] = derive((10, declared(5, keys)), (60, lifted(5)), options=("--from-zero",))
     assert one == keys | {"end_s": 1.0}
     [one] = derive((30, declared(5, DRIFT)))
-    assert one == DRIFT | {"start_s": 0.600000001}, "it came too late for its beginning"
+    assert one == DRIFT | {"start_s": 0.600000001}, "declared after its start time"
 
 
 def test_texts_lists_and_names(derive: Derive) -> None:
@@ -93,10 +93,10 @@ def test_texts_lists_and_names(derive: Derive) -> None:
     again = keys | {"value": "16#FF", "target": "cell/count"}
     later = {"name": "later", "target": "cell/count", "operation": "freeze", "start_s": 0.6}
     found = derive((10, declared(7, later)), (10, declared(5, keys)), (20, declared(6, again)), (40, lifted(7)))
-    assert found == [later | {"end_s": 0.800000001}, keys, again | {"name": "drift-2"}], "as they were laid"
+    assert found == [later | {"end_s": 0.800000001}, keys, again | {"name": "drift-2"}], "in the order of the events"
 
 
-def test_what_a_client_gave_consumers_is_set_from_value_to_value(derive: Derive) -> None:
+def test_values_of_a_client_become_set_operations(derive: Derive) -> None:
     found = derive(
         (10, laid(5, "out", (0, 2, 255), name="hand")),
         (10, given(5, 7)),
@@ -111,7 +111,7 @@ def test_what_a_client_gave_consumers_is_set_from_value_to_value(derive: Derive)
     ]
 
 
-def test_what_cannot_be_declared_is_told(derive: Derive, capsys: pytest.CaptureFixture[str]) -> None:
+def test_injections_that_cannot_be_declared_are_reported(derive: Derive, capsys: pytest.CaptureFixture[str]) -> None:
     blind = declared(7, DRIFT | {"name": "blind"})._replace(writer=NO_WRITER)
     again = "no client laid it, but the configuration or a replayed recording"
     limit = laid(5, "in", (0, 2, 255), name="limit")

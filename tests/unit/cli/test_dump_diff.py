@@ -1,4 +1,4 @@
-"""``shmio-dump diff``."""
+"""``shmio-dump diff``: compares two recordings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def diff(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, dict[str, Any]]]:
-    """Status, and what --json says of the source cell."""
+    """Compare a.mem with b.mem; return the exit status and the result for the source cell."""
 
     def call(*arguments: str) -> tuple[int, dict[str, Any]]:
         status = main(["diff", "a.mem", "b.mem", "--json", *arguments])
@@ -41,7 +41,7 @@ Diff = Callable[..., tuple[int, dict[str, Any]]]
 
 
 def counting(file: str, change: Callable[[Build, int], bool] = lambda _work, _number: False, last: int = 50) -> None:
-    """50 frames; ``change`` may write one itself."""
+    """Record a counter; ``change`` may write a frame itself and then returns True."""
     with build(Path(file)) as work:
         work.block("cell")
         for number in range(1, last + 1):
@@ -49,11 +49,11 @@ def counting(file: str, change: Callable[[Build, int], bool] = lambda _work, _nu
                 work.frame(number, image(number, number / 4))
 
 
-def test_what_can_be_ignored_is_what_the_command_says() -> None:
+def test_command_and_library_agree_on_what_can_be_ignored() -> None:
     assert compare.IGNORABLE == IGNORABLE
 
 
-def test_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+def test_equal_recordings(capsys: pytest.CaptureFixture[str]) -> None:
     varied(Path("a.mem"))
     varied(Path("b.mem"))
     assert main(["diff", "a.mem", "b.mem"]) == 0
@@ -65,7 +65,7 @@ def test_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     ]
 
 
-def test_where_it_comes_from_is_no_difference(diff: Diff) -> None:
+def test_replayed_frames_are_no_difference(diff: Diff) -> None:
     counting("a.mem")
 
     def replayed(work: Build, number: int) -> bool:
@@ -77,7 +77,7 @@ def test_where_it_comes_from_is_no_difference(diff: Diff) -> None:
     assert diff()[0] == 0
 
 
-def test_values_quality_and_times(diff: Diff) -> None:
+def test_differing_values_quality_and_times(diff: Diff) -> None:
     counting("a.mem")
 
     def change(work: Build, number: int) -> bool:
@@ -111,7 +111,7 @@ def test_values_quality_and_times(diff: Diff) -> None:
     assert diff("--only", "speed", "--relative", "0.2")[1]["registers"]["speed"]["count"] == 1
 
 
-def test_the_tolerance_is_for_floating_point_alone(diff: Diff) -> None:
+def test_tolerance_applies_to_floating_point_only(diff: Diff) -> None:
     counting("a.mem")
 
     def change(work: Build, number: int) -> bool:
@@ -123,7 +123,7 @@ def test_the_tolerance_is_for_floating_point_alone(diff: Diff) -> None:
     assert set(diff("--tolerance", "5")[1]["registers"]) == {"count", "row/3"}
 
 
-def test_frames_that_one_does_not_have(diff: Diff) -> None:
+def test_frames_missing_in_one_recording(diff: Diff) -> None:
     counting("a.mem")
 
     def fewer(work: Build, number: int) -> bool:
@@ -139,10 +139,10 @@ def test_frames_that_one_does_not_have(diff: Diff) -> None:
     frames = diff("--ignore", "ends")[1]["frames"]
     assert (frames["only_first"], frames["first"]["numbers"]) == (3, [10, None])
     frames = diff("--ignore", "times", "cycle")[1]["frames"]
-    assert (frames["compared"], frames["only_first"]) == (40, 10), "one by one, in their order"
+    assert (frames["compared"], frames["only_first"]) == (40, 10), "compared one by one, in their order"
 
 
-def test_a_source_that_one_does_not_have(diff: Diff) -> None:
+def test_source_missing_in_one_recording(diff: Diff) -> None:
     varied(Path("a.mem"))
     with build(Path("b.mem")) as work:
         work.block("press", section=2)
@@ -151,7 +151,7 @@ def test_a_source_that_one_does_not_have(diff: Diff) -> None:
     assert main(["diff", "a.mem", "b.mem", "--source", "other"]) == 1
 
 
-def test_events(diff: Diff) -> None:
+def test_differing_events(diff: Diff) -> None:
     for file, text in (("a.mem", "one"), ("b.mem", "other")):
         with build(Path(file)) as work:
             work.block("cell")
@@ -163,7 +163,7 @@ def test_events(diff: Diff) -> None:
 
 
 def telling(file: str, told: list[tuple[int, str]], first: int = 1, last: int = 40) -> None:
-    """Frames, and events behind some of them."""
+    """Record frames, and events after some of them."""
     with build(Path(file), first=first) as work:
         work.block("cell")
         for number in range(first, last + 1):
@@ -172,7 +172,7 @@ def telling(file: str, told: list[tuple[int, str]], first: int = 1, last: int = 
                 work.event(work.events["cell"] + 1, number, text)
 
 
-def test_recordings_of_one_run_that_did_not_begin_at_once_have_the_same_events(diff: Diff) -> None:
+def test_events_match_though_recordings_begin_at_different_times(diff: Diff) -> None:
     told = [(2, "early"), (10, "one"), (10, "two"), (20, "three")]
     telling("a.mem", told)
     telling("b.mem", told, first=5)
@@ -182,7 +182,7 @@ def test_recordings_of_one_run_that_did_not_begin_at_once_have_the_same_events(d
     assert (status, events["compared"], events["differing"], events["only_first"]) == (1, 3, 0, 1)
 
 
-def test_an_event_more_is_one_event_more(diff: Diff) -> None:
+def test_additional_event_is_one_difference(diff: Diff) -> None:
     telling("a.mem", [(at, f"event {at}") for at in range(1, 40)])
     more = [(at, f"event {at}") for at in range(1, 40)]
     telling("b.mem", [*more[:9], (10, "another"), *more[9:]])
@@ -193,7 +193,7 @@ def test_an_event_more_is_one_event_more(diff: Diff) -> None:
         assert events["first"]["numbers"] == [None, 10]
 
 
-def test_events_of_one_cycle_are_told_apart_by_what_they_say(diff: Diff) -> None:
+def test_events_of_one_cycle_are_matched_by_content(diff: Diff) -> None:
     telling("a.mem", [(5, "one"), (5, "two")])
     telling("b.mem", [(5, "two"), (5, "one")])
     assert diff()[0] == 0
@@ -202,8 +202,8 @@ def test_events_of_one_cycle_are_told_apart_by_what_they_say(diff: Diff) -> None
     assert (events["compared"], events["differing"], events["first"]["what"]) == (2, 1, ["text: one -> three"])
 
 
-def test_ends_are_what_lies_outside_of_both(diff: Diff) -> None:
-    """An event that only one has while both were recording is no end, though no other event is there."""
+def test_only_the_overlap_counts_when_ends_are_ignored(diff: Diff) -> None:
+    """An event in only one recording is a difference if both were recording at that time."""
     telling("a.mem", [(3, "before b"), (20, "within both")], last=30)
     telling("b.mem", [(35, "behind a")], first=10)
     status, found = diff("--ignore", "ends")
@@ -216,10 +216,10 @@ def test_ends_are_what_lies_outside_of_both(diff: Diff) -> None:
 
 
 def test_recordings_may_begin_and_end_within_a_cycle(diff: Diff) -> None:
-    """While time stands still, several frames and events have the same cycle and time."""
+    """While time is paused, several frames and events have the same cycle and time."""
 
     def recorded(file: str, first: int, last: int) -> None:
-        """Three frames of each cycle, and an event behind each."""
+        """Record three frames of each cycle, and an event after each frame."""
         with build(Path(file), first=first) as work:
             work.block("cell", after_event=first - 1)
             for number in range(first, last + 1):
@@ -239,9 +239,9 @@ def test_recordings_may_begin_and_end_within_a_cycle(diff: Diff) -> None:
 @pytest.mark.parametrize(
     ("first", "second", "compared"),
     [
-        ((1, 10), (1, 5), 5),  # both begin with the cycle, and one ends within it
+        ((1, 10), (1, 5), 5),  # both begin with the cycle; one ends within it
         ((1, 10), (3, 7), 5),
-        ((1, 150), (11, 160), 140),  # more than fit in what is searched for the beginning
+        ((1, 150), (11, 160), 140),  # more frames than are searched for the common beginning
     ],
 )
 def test_recordings_of_a_paused_instance_are_compared_where_they_overlap(
@@ -256,7 +256,7 @@ def test_recordings_of_a_paused_instance_are_compared_where_they_overlap(
     assert (status, found["frames"]["compared"]) == (0, compared)
 
 
-def test_elements_that_differ_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_differing_elements_are_named(capsys: pytest.CaptureFixture[str]) -> None:
     counting("a.mem")
 
     def change(work: Build, number: int) -> bool:
@@ -271,8 +271,8 @@ def test_elements_that_differ_are_named(capsys: pytest.CaptureFixture[str]) -> N
     assert "[1, 2" not in out
 
 
-def test_layouts_that_differ(diff: Diff) -> None:
-    """What both have by name and type is compared wherever it lies; the rest is told."""
+def test_differing_layouts(diff: Diff) -> None:
+    """Registers with the same name and type are compared at any offset; the others are reported."""
     other = Layout("DB1", 1, 8, False, (
         Register("speed", "REAL", (), 0, None, 4, 1),
         Register("count", "DINT", (), 4, None, 4, 1),

@@ -1,4 +1,4 @@
-"""What ``shmio-dump`` says of recorded events: which registers, values, direction, and who."""
+"""Recorded events in the output of ``shmio-dump``: registers, values, direction and sender."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ def recorded(*records: Record) -> str:
 
 
 def told(capsys: pytest.CaptureFixture[str], *records: Record) -> list[dict[str, Any]]:
-    """What ``cat --json`` says of these."""
+    """Record the events and return them as ``cat --json`` prints them."""
     assert main(["cat", "--json", recorded(*records)]) == 0
     return [found for line in capsys.readouterr().out.splitlines() if "event" in (found := json.loads(line))]
 
 
-def test_a_command_is_told_with_registers_values_direction_and_who(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_has_registers_values_direction_and_sender(capsys: pytest.CaptureFixture[str]) -> None:
     first, second = Write(0, 0, b"\0\5"), Write(8, 0, b"\0\6\0\7")
     ended = Record(EventKind.WRITTEN, "", GRPC, 99, 0, 2, 0, 0, 2)
     found = told(capsys, accepted(first), accepted(second, 1), ended)
     assert [event["values"] for event in found] == [{"cell/count": 5}, {"cell/row/1..2": [6, 7]}, {}]
-    assert found[2]["paths"] == ["cell/count", "cell/row/1..2"], "of all of its items"
+    assert found[2]["paths"] == ["cell/count", "cell/row/1..2"], "the paths of all items"
     assert {(event["by"], event["direction"]) for event in found} == {("grpc", "in")}
     main(["cat", "a.mem"])
     lines = [line.partition(": ")[2] for line in capsys.readouterr().out.splitlines() if "event" in line]
@@ -62,13 +62,13 @@ def test_a_command_is_told_with_registers_values_direction_and_who(capsys: pytes
 
 
 @pytest.mark.parametrize(("place", "path"), BITS)
-def test_bits_have_names(place: tuple[int, int], path: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bits_have_paths(place: tuple[int, int], path: str, capsys: pytest.CaptureFixture[str]) -> None:
     offset, mask = place
     [event] = told(capsys, accepted(Write(offset, mask, bytes([mask]))))
     assert event["values"] == {path: True}
 
 
-def test_what_has_no_name_is_told_by_its_bytes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bytes_without_a_path_are_printed_as_bytes(capsys: pytest.CaptureFixture[str]) -> None:
     part = accepted(Write(2, 0, b"\1\2"), writer=PROGRAM, kind=EventKind.SHADOWED)
     padding, beyond = accepted(Write(7, 0, b"\1")), accepted(Write(15, 0, b"\1\2\3"))
     found = told(capsys, part, padding, beyond, accepted(Write(0, 0, b"\1"), kind=EventKind.DIVERTED))
@@ -84,7 +84,7 @@ def test_what_has_no_name_is_told_by_its_bytes(capsys: pytest.CaptureFixture[str
     assert "accepted 1 bytes at 7 by grpc" in capsys.readouterr().out
 
 
-def test_an_injection_is_told_as_it_was_laid(capsys: pytest.CaptureFixture[str]) -> None:
+def test_injection_is_printed_with_its_definition(capsys: pytest.CaptureFixture[str]) -> None:
     how = {"direction": "out", "priority": 3, "keep": False, "ranges": [[0, 2, 255], [6, 1, 8]]}
     drift = {"name": "drift", "target": "cell/speed/in", "operation": "offset", "value": 2.5, "note": "x" * 300}
     document = msgspec.json.encode(drift)
@@ -99,7 +99,7 @@ def test_an_injection_is_told_as_it_was_laid(capsys: pytest.CaptureFixture[str])
     found = told(capsys, laid, *parts, Record(EventKind.ACTIVATED, "drift", injection=8), lifted, old)
     assert (found[0]["paths"], found[0]["direction"]) == (["cell/count", "cell/on"], "out")
     assert found[0]["laid"] == {name: how[name] for name in ("direction", "priority", "keep")}
-    assert [event["laid"] for event in found[1:3]] == [None, drift], "with the last of its parts"
+    assert [event["laid"] for event in found[1:3]] == [None, drift], "the last part has the definition"
     assert found[3]["direction"] == "in"
     assert (found[4]["paths"], found[4]["direction"]) == (["cell/count", "cell/on"], "out")
     assert (found[5]["paths"], found[5]["laid"]) == ([], None)
@@ -110,7 +110,7 @@ def test_an_injection_is_told_as_it_was_laid(capsys: pytest.CaptureFixture[str])
     assert document[:8].hex() not in out
 
 
-def test_the_export_for_viewers_has_all_of_an_event(capsys: pytest.CaptureFixture[str]) -> None:
+def test_mcap_export_has_all_fields_of_an_event(capsys: pytest.CaptureFixture[str]) -> None:
     told(capsys, accepted(Write(0, 0, b"\0\5")), accepted(Write(7, 0, b"\1"), 1))
     assert main(["export", "a.mem", "-o", "a.mcap"]) == 0
     with Path("a.mcap").open("rb") as stream:
@@ -154,8 +154,8 @@ def test_a_table_of_events(form: str, capsys: pytest.CaptureFixture[str]) -> Non
     assert "--events makes one table" in capsys.readouterr().err
 
 
-def test_names_are_those_of_what_was_recorded(capsys: pytest.CaptureFixture[str]) -> None:
-    """A reload gives the source another block, whose events have its names."""
+def test_events_have_the_paths_of_their_own_block(capsys: pytest.CaptureFixture[str]) -> None:
+    """A reload gives the source another block with other registers."""
     with build(Path("a.mem")) as work:
         work.block("cell")
         work.tell(accepted(Write(0, 0, b"\0\5")))

@@ -1,4 +1,4 @@
-"""``shmio-dump export``: what other programs read."""
+"""``shmio-dump export``: files for other programs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,10 @@ VALUES: dict[str, Any] = {
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """With a recording of all kinds: a good frame, one that never had an image, one of NaN and no clock."""
+    """A folder with a recording of three frames of many types.
+
+    The first frame is good, the second has no image, the third has a NaN and an invalid time of day.
+    """
     monkeypatch.chdir(tmp_path)
     data = bytearray(KINDS.size)
     for register in KINDS.registers:
@@ -127,8 +130,8 @@ def test_mcap_for_viewers(capsys: pytest.CaptureFixture[str]) -> None:
     assert (last["Robot"]["speed"], last["clock"]) == (None, None)
 
 
-def test_registers_that_have_the_names_of_other_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """None takes the place of a frame's own time, number or quality, nor goes without a column."""
+def test_registers_named_like_other_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each has a column of its own, and replaces none of a frame's own columns."""
     names = ("time", "source_time", "number", "cycle", "quality", "provenance", "what", "frame/number")
     layout = Layout("DB2", 2, 16, False, tuple(Register(n, "INT", (), 2 * i, None, 2, 1) for i, n in enumerate(names)))
     with build(tmp_path / "names.mem") as work:
@@ -159,7 +162,9 @@ def test_registers_that_have_the_names_of_other_columns(tmp_path: Path, capsys: 
     assert len(set(heading)) == len(heading)
 
 
-def test_time_sources_registers_and_originals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_selection_by_time_source_and_register_and_raw_values(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     varied(tmp_path / "a.mem")
     some = ["--from", "0.1", "--to", "0.3", "--only", "cell/count", "press/row"]
     assert main(["export", "a.mem", "-o", "out", *some]) == 0
@@ -174,7 +179,7 @@ def test_time_sources_registers_and_originals(tmp_path: Path, capsys: pytest.Cap
     assert (topics.count("/cell"), topics.count("/cell/events"), len(topics)) == (57, 4, 61)
 
 
-def test_a_block_a_file(tmp_path: Path) -> None:
+def test_each_block_has_its_own_file(tmp_path: Path) -> None:
     other = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
     with build(tmp_path / "a.mem") as work:
         work.block("cell")
@@ -186,7 +191,7 @@ def test_a_block_a_file(tmp_path: Path) -> None:
     assert parquet.read_table("out/cell-2.parquet")["count"].to_pylist() == [7]
 
 
-def test_what_is_refused_leaves_nothing(
+def test_refused_export_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["export", "kinds.mem", "-o", "out", "--from", "100"]) == 1
@@ -207,7 +212,7 @@ def test_what_is_refused_leaves_nothing(
 
 @pytest.mark.parametrize("output", ["new/deep", "there", "new.csv", "new.mcap"])
 def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str) -> None:
-    """It comes when some of the frames are written."""
+    """The signal comes after some of the frames are written."""
     varied(tmp_path / "a.mem")
     Path("there").mkdir()
     before = sorted(tmp_path.rglob("*"))
@@ -223,8 +228,8 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_the_format_is_as_the_name_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A table with such a name is one file; else the name is that of a folder."""
+def test_suffix_chooses_the_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An output with a known suffix is one file; any other output is a folder."""
     for name in ("x.mcap", "x.csv", "X.Parquet", "x.d"):
         assert main(["export", "kinds.mem", "-o", name]) == 0
     assert capsys.readouterr().out.splitlines() == [
@@ -243,7 +248,7 @@ def test_the_format_is_as_the_name_ends(tmp_path: Path, capsys: pytest.CaptureFi
     assert Path("there.csv/cell.csv").is_file()
 
 
-def test_a_name_that_fits_not_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unsuitable_output_name_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "kinds.mem", "-o", "x.csv", "--format", "parquet"]) == 1
     message = "x.csv: as its name ends it is not --format parquet; leave out one of them\n"
     assert capsys.readouterr().err == message
@@ -264,7 +269,7 @@ def test_a_name_that_fits_not_is_refused(tmp_path: Path, capsys: pytest.CaptureF
     ],
 )
 @pytest.mark.parametrize("asked", [(), ("--format", "csv")])
-def test_what_ends_as_other_formats_do_is_refused(
+def test_unsupported_suffix_is_refused_with_a_remedy(
     name: str, remedy: str, asked: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", "kinds.mem", "-o", name, *asked]) == 1
@@ -286,8 +291,8 @@ def test_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads(capsys.readouterr().out) == {"error": "no.mem: No such file or directory"}
 
 
-def test_a_file_is_of_the_one_block_that_has_frames_then(capsys: pytest.CaptureFixture[str]) -> None:
-    """What another has told then is no row of a table."""
+def test_single_file_needs_one_block_with_frames_in_the_time_range(capsys: pytest.CaptureFixture[str]) -> None:
+    """A block with events but no frames in that range does not count."""
     with build(Path("a.mem")) as work:
         work.block("cell")
         work.block("press", section=2)
@@ -300,8 +305,8 @@ def test_a_file_is_of_the_one_block_that_has_frames_then(capsys: pytest.CaptureF
     assert capsys.readouterr().out == "x.csv: 11 rows\n"
 
 
-def test_a_damaged_chunk_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What is whole is exported, and the status says that something is missing."""
+def test_damaged_chunk_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Undamaged frames are exported, and the exit status is 1."""
     file = varied(tmp_path / "a.mem")
     data = bytearray(file.read_bytes())
     with shmio.open_dump(file) as dump:

@@ -1,4 +1,4 @@
-"""Files that are damaged, cut off or made up: every verb reads what is whole, or says what is wrong in one line."""
+"""Damaged and truncated files: each verb reads what is intact, or reports the fault in one line."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def run(verb: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     status = main(verb)
     said = capsys.readouterr()
     assert status in (0, 1), verb
-    assert status == 0 or said.err or verb[0] in ("diff", "verify", "info"), f"{verb} says why"
+    assert status == 0 or said.err or verb[0] in ("diff", "verify", "info"), f"{verb} gives a reason"
     assert "Traceback" not in said.err
     if Path("out.mem").exists() and verb[0] != "export":
-        assert main(["verify", "out.mem"]) == 0, f"what {verb} makes is whole"
+        assert main(["verify", "out.mem"]) == 0, f"{verb} makes an undamaged file"
         capsys.readouterr()
 
 
-def test_a_flipped_bit_anywhere(original: tuple[bytes, set[bytes]], capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbs_survive_a_flipped_bit(original: tuple[bytes, set[bytes]], capsys: pytest.CaptureFixture[str]) -> None:
     data, _ = original
     Path("good.mem").write_bytes(data)
     choice = random.Random(11)
@@ -73,7 +73,7 @@ def test_a_flipped_bit_anywhere(original: tuple[bytes, set[bytes]], capsys: pyte
         run(choice.choice(VERBS), capsys)
 
 
-def test_cut_off_anywhere(original: tuple[bytes, set[bytes]], capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbs_survive_a_truncated_file(original: tuple[bytes, set[bytes]], capsys: pytest.CaptureFixture[str]) -> None:
     data, _ = original
     Path("good.mem").write_bytes(data)
     choice = random.Random(12)
@@ -83,7 +83,7 @@ def test_cut_off_anywhere(original: tuple[bytes, set[bytes]], capsys: pytest.Cap
 
 
 def read_all(file: Path, images: set[bytes], *, strict: bool) -> int:
-    """Everything that a dump gives; nothing of it is made up. How many frames."""
+    """Read all of a recording; check that its images are known, and return the number of frames."""
     told: list[object] = []
     with shmio.open_dump(file, None if strict else lambda *damage: told.append(damage)) as dump:
         count = 0
@@ -103,7 +103,7 @@ def read_all(file: Path, images: set[bytes], *, strict: bool) -> int:
 
 @any_input
 @given(data=st.data(), strict=st.booleans())
-def test_a_dump_of_changed_bytes_makes_nothing_up(
+def test_changed_bytes_yield_only_original_images(
     original: tuple[bytes, set[bytes]], tmp_path: Path, data: st.DataObject, strict: bool
 ) -> None:
     content, images = original
@@ -117,7 +117,7 @@ def test_a_dump_of_changed_bytes_makes_nothing_up(
         assert "\n" not in str(error)  # noqa: PT017  one line, whichever it is
 
 
-def test_cut_off_at_every_byte_of_its_last_chunk_the_others_are_read(
+def test_truncation_within_the_last_chunk_loses_only_that_chunk(
     original: tuple[bytes, set[bytes]], tmp_path: Path
 ) -> None:
     content, images = original

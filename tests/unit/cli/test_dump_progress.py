@@ -1,4 +1,4 @@
-"""How far long work is, on a terminal and elsewhere."""
+"""Progress of long work, on a terminal and elsewhere."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_is_told_and_left_clean(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_shown_on_a_terminal_and_erased(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal, now_s = Terminal(), [0.0]
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     with common.Progress("reading a\x1bb") as work:
         work.total = 200
         work.at(10)
-        assert terminal.getvalue() == "", "what is soon done says nothing"
+        assert terminal.getvalue() == "", "short work shows no progress"
         for now_s[0], done in ((1.5, 50), (1.6, 60), (2.0, 150), (3.0, 500)):
             work.at(done)
     shown = terminal.getvalue().split("\r")
@@ -35,7 +35,7 @@ def test_a_terminal_is_told_and_left_clean(monkeypatch: pytest.MonkeyPatch) -> N
     assert shown[-1] == "\x1b[K"
 
 
-def test_a_file_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_progress_is_written_to_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     file = io.StringIO()
     monkeypatch.setattr(sys, "stderr", file)
     monkeypatch.setattr(common, "FIRST_S", -1.0)
@@ -46,7 +46,7 @@ def test_a_file_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("to_a_terminal", [False, True])
-def test_who_prints_to_a_file_sees_how_far_it_is(
+def test_progress_is_shown_only_if_the_output_goes_to_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to_a_terminal: bool
 ) -> None:
     file = plain(tmp_path / "a.mem", 1, 50)

@@ -1,4 +1,4 @@
-"""``shmio-dump recover``, ``cut`` and ``merge``: new recordings out of others."""
+"""``shmio-dump recover``, ``cut`` and ``merge``: new recordings from others."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def contents(*files: Path) -> list[tuple[int, str, object]]:
-    """Everything in recorded order, gaps without the number that their block has in its file."""
+    """Return everything in recorded order; gaps without their block's number, which differs by file."""
     with shmio.open_dump(files) as dump:
         return [
             (
@@ -50,7 +50,7 @@ def contents(*files: Path) -> list[tuple[int, str, object]]:
 
 
 def whole(file: Path) -> None:
-    """By our own check, and for any reader of MCAP."""
+    """Assert that shmio and the MCAP library find a file undamaged."""
     with Reader(file) as reader:
         assert check(reader).whole
         assert reader.records.closed
@@ -107,7 +107,7 @@ def test_cut_by_source_and_register(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert main(["cut", "few.mem", "-o", "fewer.mem", "--only", "cell/row"]) == 0
     assert main(["recover", "fewer.mem", "-o", "again.mem"]) == 0
     with shmio.open_dump("again.mem") as fewer, shmio.open_dump(file) as all_of_it:
-        assert fewer.blocks[0].of == all_of_it.blocks[0].layout_hash, "of the whole, however often it was cut"
+        assert fewer.blocks[0].of == all_of_it.blocks[0].layout_hash, "the hash of the original layout, after two cuts"
     assert main(["cut", str(file), "-o", "no.mem", "--only", "cell/nothing"]) == 1
     assert "no such register" in capsys.readouterr().err
 
@@ -134,7 +134,7 @@ def test_merge_of_files_of_different_sources(tmp_path: Path) -> None:
     assert [time_ns for time_ns, _, _ in found] == sorted(time_ns for time_ns, _, _ in found)
 
 
-def test_a_block_of_which_nothing_but_gaps_is_there(tmp_path: Path) -> None:
+def test_merge_of_a_block_with_nothing_but_gaps(tmp_path: Path) -> None:
     with build(tmp_path / "a.mem") as work:
         work.block("cell")
         work.block("press", section=2)
@@ -145,7 +145,7 @@ def test_a_block_of_which_nothing_but_gaps_is_there(tmp_path: Path) -> None:
     assert contents(Path("b.mem")) == contents(Path("a.mem"))
 
 
-def test_merge_of_what_does_not_belong_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_merge_of_different_runs_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with build(tmp_path / "b.mem", epoch="11" * 8) as work:
         work.block("cell")
         work.frame(1, image(1))
@@ -153,7 +153,7 @@ def test_merge_of_what_does_not_belong_together(tmp_path: Path, capsys: pytest.C
     assert "come from different runs" in capsys.readouterr().err
 
 
-def test_recover_gives_back_every_whole_chunk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recover_keeps_every_undamaged_chunk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = varied(tmp_path / "a.mem")
     original = file.read_bytes()
     with Reader(file) as reader:
@@ -164,7 +164,7 @@ def test_recover_gives_back_every_whole_chunk(tmp_path: Path, capsys: pytest.Cap
     assert main(["recover", str(file)]) == 0
     out = capsys.readouterr().out.splitlines()
     recovered = tmp_path / "a-recovered.mem"
-    assert file.read_bytes() == damaged, "never touched"
+    assert file.read_bytes() == damaged, "recover does not change its input"
     assert any(line.startswith("  lost after ") for line in out)
     whole(recovered)
     file.write_bytes(original)
@@ -203,7 +203,7 @@ def test_recover_of_a_file_cut_off_at_every_byte_of_its_last_chunk(
     assert max(sizes) == len(before)
 
 
-def test_recover_of_what_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recover_of_a_file_that_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with build(Path("x.mem")):
         pass
     assert main(["recover", "x.mem"]) == 1
@@ -215,10 +215,10 @@ def test_recover_of_what_is_no_recording(tmp_path: Path, capsys: pytest.CaptureF
         assert not Path("x-recovered.mem").exists()
 
 
-def test_a_flipped_bit_anywhere_is_told_and_costs_one_chunk_at_most(
+def test_a_flipped_bit_anywhere_is_found_and_costs_one_chunk_at_most(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By ``verify``; what ``recover`` gives back is whole, and nothing in it is made up."""
+    """``verify`` finds the damage; ``recover`` makes an undamaged file of original content."""
     file = varied(tmp_path / "a.mem")
     data = file.read_bytes()
     before = contents(file)
@@ -250,12 +250,12 @@ NEW = [("cut", "new.mem"), ("merge", "new.mem"), ("recover", "new.mem"), ("expor
 
 
 def options(verb: str, output: str) -> list[str]:
-    """What ``export`` is told more, to make one file."""
+    """Return the further options that ``export`` needs to make one file."""
     return ["--format", "mcap" if output == "new.mcap" else "csv", "--source", "cell"] if verb == "export" else []
 
 
 @pytest.mark.parametrize(("verb", "output"), NEW)
-def test_a_full_disk_is_told_with_the_file_and_leaves_none(
+def test_full_disk_is_reported_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str, output: str
 ) -> None:
     def full(_: int) -> None:
@@ -270,8 +270,8 @@ def test_a_full_disk_is_told_with_the_file_and_leaves_none(
 
 
 @contextmanager
-def heeded(sign: signal.Signals, handler: Any) -> Iterator[None]:
-    """Have a signal do something else meanwhile."""
+def signal_handler(sign: signal.Signals, handler: Any) -> Iterator[None]:
+    """Handle a signal by another handler within the context."""
     before = signal.signal(sign, handler)
     try:
         yield
@@ -281,10 +281,10 @@ def heeded(sign: signal.Signals, handler: Any) -> Iterator[None]:
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize(("verb", "output"), NEW)
-def test_what_is_told_to_end_leaves_nothing(
+def test_signal_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str, output: str, sign: signal.Signals
 ) -> None:
-    """It is told when some of the frames are written, and while it removes them once more."""
+    """The signal comes after some frames are written, and again while the file is removed."""
     file = varied(tmp_path / "a.mem")
     made: list[Path] = []
     unlink = Path.unlink
@@ -300,7 +300,7 @@ def test_what_is_told_to_end_leaves_nothing(
 
     monkeypatch.setattr(Progress, "at", tell)
     monkeypatch.setattr(Path, "unlink", unlink_late)
-    with heeded(sign, signal.default_int_handler if sign == signal.SIGINT else lambda *_: None):
+    with signal_handler(sign, signal.default_int_handler if sign == signal.SIGINT else lambda *_: None):
         try:
             status: object = main([verb, str(file), "-o", str(tmp_path / output), *options(verb, output)])
         except SystemExit as end:
@@ -309,10 +309,10 @@ def test_what_is_told_to_end_leaves_nothing(
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_what_is_to_go_on_without_its_terminal_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As nohup has it."""
+def test_ignored_hang_up_does_not_end_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """nohup ignores SIGHUP."""
     file = varied(tmp_path / "a.mem")
     monkeypatch.setattr(Progress, "at", lambda *_: signal.raise_signal(signal.SIGHUP))
-    with heeded(signal.SIGHUP, signal.SIG_IGN):
+    with signal_handler(signal.SIGHUP, signal.SIG_IGN):
         assert main(["cut", str(file), "-o", "new.mem"]) == 0
     whole(Path("new.mem"))

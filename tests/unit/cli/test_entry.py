@@ -27,17 +27,17 @@ NAMES = ("shmio", "shmio_dump", "shmio_layout", "shmio_supervisor")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_script_is_its_command(name: str) -> None:
+def test_each_script_starts_its_command(name: str) -> None:
     program = f"import sys; from shmio.cli import entry; sys.argv[1:] = ['--version']; sys.exit(entry.{name}())"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, f"shmio {__version__}\n", "")
 
 
 @pytest.mark.parametrize("place", ["before", "after"])
-def test_ctrl_c_before_and_after_its_command_is_no_traceback(place: str) -> None:
-    """While the script that is installed imports us, and while the interpreter ends: it dies as shells expect."""
+def test_ctrl_c_before_or_after_the_command_prints_no_traceback(place: str) -> None:
+    """Ctrl-C comes during the first imports or at the interpreter's exit; the signal ends the process."""
     program = ["import atexit, os, signal", "interrupt = lambda: os.kill(os.getpid(), signal.SIGINT)"]
-    program += ["signal.signal(signal.SIGINT, signal.default_int_handler)"]  # a test may run with it ignored
+    program += ["signal.signal(signal.SIGINT, signal.default_int_handler)"]  # the test run may ignore it
     program += ["from shmio.cli import entry", "import sys; sys.argv[1:] = ['--version']"]
     program += ["interrupt()"] if place == "before" else ["atexit.register(interrupt)"]
     program += ["try: entry.shmio()", "except SystemExit: pass"]
@@ -46,7 +46,7 @@ def test_ctrl_c_before_and_after_its_command_is_no_traceback(place: str) -> None
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_ctrl_c_while_it_loads_is_no_traceback(name: str) -> None:
+def test_ctrl_c_during_imports_prints_no_traceback(name: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", INTERRUPTED.format(name=name)], capture_output=True, text=True, check=False
     )
@@ -55,7 +55,7 @@ def test_ctrl_c_while_it_loads_is_no_traceback(name: str) -> None:
 
 SWALLOWED = """
 import importlib.abc, os, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a test may run with it ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)  # the test run may ignore it
 class Interrupting(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path, target=None):
         if name == {library!r}:
@@ -81,15 +81,15 @@ sys.exit(entry.{name}())
         ("shmio_supervisor", ["up", "-c", "no.toml"], "shmio.cli.instance.up"),
     ],
 )
-def test_ctrl_c_leaves_no_half_of_a_library(name: str, words: list[str], library: str) -> None:
-    """C code may swallow the exception that it would be, and go on with what it has not got."""
+def test_ctrl_c_that_an_import_swallows_still_ends_the_command(name: str, words: list[str], library: str) -> None:
+    """C code may swallow KeyboardInterrupt and continue with a half-imported library."""
     program = SWALLOWED.format(name=name, words=words, library=library)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
 
 
 @pytest.mark.parametrize("words", [["get"], ["get", "--json"], ["watch", "-n", "1"]])
-def test_ctrl_c_leaves_no_half_of_what_prints_a_real(instance: str, words: list[str]) -> None:
+def test_ctrl_c_that_the_import_of_numpy_swallows_still_ends_the_command(instance: str, words: list[str]) -> None:
     layout = Layout("DB1", 1, 4, False, (Register("a", "REAL", (), 0, None, 4, 1),))
     with Segment.create(instance, [BlockSpec("cell", layout, 20_000_000, 3600 * 10**9, 1 << 16)], []) as segment:
         segment.writer("cell").publish(bytes(4), cycle=1, source_ns=1)
@@ -99,7 +99,7 @@ def test_ctrl_c_leaves_no_half_of_what_prints_a_real(instance: str, words: list[
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
 
 
-def test_a_command_to_another_host_does_not_wait_for_grpc_s_threads() -> None:
+def test_command_to_another_host_does_not_wait_for_the_threads_of_grpc() -> None:
     program = ["import atexit, sys; from shmio.cli import entry", "atexit.register(print, 'waited')"]
     program += ["sys.argv[1:] = ['get', '--host', 'unix:no.sock', 'cell/a']", "sys.exit(entry.shmio())"]
     done = subprocess.run([sys.executable, "-c", "\n".join(program)], capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""What other users of the host may do to an instance is said in one line."""
+"""The line that says what other users of the host may do to an instance."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def host_of(monkeypatch: pytest.MonkeyPatch, *users: pwd.struct_passwd) -> None:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # there is some program
+    monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # any program will do
     Path("cell.toml").write_text('[registers]\nMode = "INT"\n')
 
 
@@ -63,7 +63,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("", '["**"]', None),
     ],
 )
-def test_ways_in_that_ask_nobody_who_it_is(
+def test_addresses_without_login_are_reported(
     sections: str, writable: str, said: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     host_of(monkeypatch, user("ada", 1001 + os.geteuid()))
@@ -78,7 +78,7 @@ def test_ways_in_that_ask_nobody_who_it_is(
         assert said in line
 
 
-def test_amqtt_lets_everybody_publish_values(
+def test_check_notes_that_amqtt_lets_everybody_publish_values(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     host_of(monkeypatch, user("ada", 1001 + os.geteuid()))
@@ -90,7 +90,7 @@ def test_amqtt_lets_everybody_publish_values(
     assert "ada) may publish everything, values too, by MQTT at 127.0.0.1:1883" in capsys.readouterr().out
 
 
-def test_who_else_can_log_in(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_users_who_can_log_in(monkeypatch: pytest.MonkeyPatch) -> None:
     own = user("own", os.geteuid())
     system = user("postgres", 101), user("nobody", 65534), user("backup", 5000, "/usr/sbin/nologin"), user("root", 0)
     host_of(monkeypatch, own, *system)
@@ -99,7 +99,7 @@ def test_who_else_can_log_in(monkeypatch: pytest.MonkeyPatch) -> None:
     assert other_users() == ["eve", "mallory"]
 
 
-def test_check_says_it_and_does_not_count_it(
+def test_check_notes_the_exposure_without_counting_it_as_a_fault(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     host_of(monkeypatch, *(user(name, 70_000) for name in ("a", "b", "c", "d", "e")))
@@ -114,7 +114,7 @@ def test_check_says_it_and_does_not_count_it(
 @pytest.mark.parametrize(
     ("option", "roles"), [([], ["read"]), (["--emulated"], ["read", "write", "inject", "control"])]
 )
-def test_init_writes_what_each_address_allows(option: list[str], roles: list[str]) -> None:
+def test_init_writes_the_roles_of_each_address(option: list[str], roles: list[str]) -> None:
     Path("cell.db").write_text("DATA_BLOCK DB7\nSTRUCT\nx : Int;\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n")
     assert main(["init", *option, "cell.db"]) == 0
     grpc = load(Path("supervisor.toml")).grpc

@@ -30,7 +30,7 @@ Test = Callable[[Output, Output, Plant], None]
 
 
 def both(segment: Segment, capsys: pytest.CaptureFixture[str], test: Test) -> None:
-    """Run a test with verbs by ``--host``, and by attaching."""
+    """Run a test with two functions that call a verb: by ``--host`` and locally."""
 
     async def run(served: Endpoint, device: Plant) -> None:
         def verb(*words: str) -> tuple[int, str, str]:
@@ -88,7 +88,7 @@ def test_the_output_is_the_same(segment: Segment, capsys: pytest.CaptureFixture[
             return status, re.sub(r'"age_s": [0-9.e-]+|"age_s": null', '"age_s": 0', out), err
 
         there, here = comparable(remote(*words)), comparable(local(*words))
-        if words[0] == "watch":  # of one frame the order is that of what changed
+        if words[0] == "watch":  # the order of the lines of one frame may differ
             assert sorted(there[1].splitlines()) == sorted(here[1].splitlines())
         else:
             assert there == here
@@ -137,18 +137,18 @@ start_s = 1e6
 
 
 @pytest.fixture
-def unstopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody presses Ctrl-C: verbs run in a thread here, which hears of no signals."""
+def without_signals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let verbs run without signal handlers, which only the main thread may set."""
     monkeypatch.setattr("shmio.cli.inject.stop_on_signals", lambda: nullcontext(threading.Event()))
 
 
 def lines(out: str) -> list[tuple[str, ...]]:
-    """Without what differs from run to run."""
+    """Return the words of each line without what differs from run to run."""
     return [tuple(re.sub(r"^.*?(?=\w+: )", "", line).split()) for line in out.splitlines()]
 
 
-@pytest.mark.usefixtures("unstopped")
-def test_a_file_of_declared_ones(segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_signals")
+def test_campaign_file(segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     file = tmp_path / "campaign.toml"
     file.write_text(CAMPAIGN)
     words = ("inject", "--seed", "7", "--file", str(file))
@@ -174,8 +174,10 @@ def test_a_file_of_declared_ones(segment: Segment, capsys: pytest.CaptureFixture
     both(segment, capsys, test)
 
 
-@pytest.mark.usefixtures("unstopped")
-def test_it_ends_when_all_of_it_is_over(segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_signals")
+def test_inject_ends_when_the_campaign_is_over(
+    segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     file = tmp_path / "campaign.toml"
     file.write_text(CAMPAIGN.partition('\n[[injection]]\nname = "noise"')[0])
 
@@ -202,8 +204,8 @@ def test_it_ends_when_all_of_it_is_over(segment: Segment, capsys: pytest.Capture
     both(segment, capsys, test)
 
 
-@pytest.mark.usefixtures("unstopped")
-def test_a_file_with_a_fault_lays_nothing(segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+@pytest.mark.usefixtures("without_signals")
+def test_faulty_file_injects_nothing(segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     file = tmp_path / "campaign.toml"
     file.write_text(CAMPAIGN.replace("cell/step", "cell/stop"))
 
@@ -216,7 +218,7 @@ def test_a_file_with_a_fault_lays_nothing(segment: Segment, capsys: pytest.Captu
     both(segment, capsys, test)
 
 
-def test_what_is_wrong_with_the_host(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_unusable_host_is_reported(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["get", "--host", "127.0.0.1:1", "cell"]) == 1
     assert capsys.readouterr().err == (
         "127.0.0.1:1: no instance serves there, or it has ended: nothing listens on that port\n"
@@ -229,7 +231,7 @@ def test_what_is_wrong_with_the_host(capsys: pytest.CaptureFixture[str], tmp_pat
     assert capsys.readouterr().err == f"{tmp_path / 'none'}: No such file or directory\n"
 
 
-def test_the_example(segment: Segment) -> None:
+def test_example_for_remote_access(segment: Segment) -> None:
     async def run(served: Endpoint, device: Plant) -> None:
         device.memory[13] = 7
         command = [sys.executable, str(EXAMPLES / "remote.py"), f"127.0.0.1:{served.port}", "cell/step", "--count", "1"]
@@ -250,7 +252,7 @@ def test_the_example(segment: Segment) -> None:
         ),
     ],
 )
-def test_an_endpoint_that_stops_is_told(segment: Segment, words: tuple[str, ...], told: str) -> None:
+def test_stopped_endpoint_is_reported(segment: Segment, words: tuple[str, ...], told: str) -> None:
     async def run(served: Endpoint, _: Plant) -> None:
         address = f"127.0.0.1:{served.port}"
         command = [word.format(address) for word in words]
@@ -277,19 +279,19 @@ def test_step(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     simulate(instance, run)
 
 
-def test_step_asks_where_a_source_has_a_device(segment: Segment, capsys: pytest.CaptureFixture[str]) -> None:
+def test_step_needs_consent_if_a_source_has_a_device(segment: Segment, capsys: pytest.CaptureFixture[str]) -> None:
     def test(remote: Output, local: Output, _: Plant) -> None:
         refused = remote("step")
         assert refused == local("step")
         assert (refused[0], "cell goes on in real time; --yes steps anyway" in refused[2]) == (1, True)
         assert remote("step", "--pause", "--yes")[0] == 0
-        assert remote("step", "--pause")[0] == 0, "it is not asked for again"
+        assert remote("step", "--pause")[0] == 0, "consent is needed only once"
 
-    with Segment.open(segment.instance, writable=True) as opened:  # as another process, which sees who supervises
+    with Segment.open(segment.instance, writable=True) as opened:  # a mapping of its own, as another process has
         both(opened, capsys, test)
 
 
-def test_step_here(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_step_without_host(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     with stepped_segment(instance, "sim") as segment:
         model = Model(segment, "sim")
         try:

@@ -19,7 +19,7 @@ END_DATA_BLOCK
 """
 
 
-def test_a_configuration_with_an_emulated_controller_can_be_used_as_it_is(tmp_path: Path) -> None:
+def test_configuration_with_an_emulated_controller_is_complete(tmp_path: Path) -> None:
     source, file = tmp_path / "cell.db", tmp_path / "supervisor.toml"
     source.write_text(DB)
     text, missing, warnings = new_config(file, [source], emulated=True)
@@ -30,7 +30,7 @@ def test_a_configuration_with_an_emulated_controller_can_be_used_as_it_is(tmp_pa
     assert vacant_name(config.instance.name, tmp_path / "other.toml") == f"{config.instance.name}-2"
 
 
-def test_of_a_real_controller_the_keys_that_nobody_knows_are_named(tmp_path: Path) -> None:
+def test_missing_keys_of_a_real_controller_are_named(tmp_path: Path) -> None:
     source, file = tmp_path / "cell.db", tmp_path / "supervisor.toml"
     source.write_text(DB)
     assert new_config(file, [source]).missing == {file: ["host", "dbNumber"]}

@@ -1,4 +1,4 @@
-"""With ``--json`` every command tells its failure on standard output, too, as one object."""
+"""With ``--json``, every command also reports its failure as one object on standard output."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ FAILING: dict[Main, dict[str, list[str]]] = {
         "logs": NOT_THERE,
     },
 }
-"""Words with which each verb that has ``--json`` fails; ``list`` of instances never does."""
+"""Arguments with which each verb that has ``--json`` fails; ``list`` of instances never fails."""
 
 
 def verbs_with_json(parser: argparse.ArgumentParser) -> Iterator[str]:
@@ -50,7 +50,7 @@ def verbs_with_json(parser: argparse.ArgumentParser) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("module", [user, dump, supervisor])
-def test_each_verb_with_json_is_tried(module: object) -> None:
+def test_every_verb_with_json_is_covered(module: object) -> None:
     parser: argparse.ArgumentParser = module._parser()  # type: ignore[attr-defined]
     main: Main = module.main  # type: ignore[attr-defined]
     assert set(verbs_with_json(parser)) == set(FAILING[main])
@@ -65,7 +65,7 @@ def test_each_verb_with_json_is_tried(module: object) -> None:
     ],
     ids=lambda value: " ".join(value[:2]) if isinstance(value, list) else "",
 )
-def test_a_failure_is_an_object(
+def test_failure_is_one_object(
     main: Main, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -75,7 +75,7 @@ def test_a_failure_is_an_object(
     assert json.loads(out) == {"error": err.rstrip("\n")}
 
 
-def test_of_several_files_each_has_its_place(
+def test_each_of_several_files_has_its_own_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

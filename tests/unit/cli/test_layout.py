@@ -71,7 +71,7 @@ def test_many_initial_values_that_cannot_be_read_are_counted(
     assert (len(lines), lines[-1]) == (21, "b: warning: 5 more initial values cannot be read")
 
 
-def test_table_hides_control_characters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_escapes_control_characters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.db").write_text('DATA_BLOCK "b" STRUCT a : Int; // \x1b[2J\u202e\nEND_STRUCT; BEGIN END_DATA_BLOCK')
     assert main([str(tmp_path / "a.db")]) == 0
     out = capsys.readouterr().out
@@ -79,7 +79,7 @@ def test_table_hides_control_characters(tmp_path: Path, capsys: pytest.CaptureFi
     assert "\\x1b[2J\\u202e" in out
 
 
-def test_errors_name_their_place(files: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_name_file_line_and_column(files: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([files[0], "--json"]) == 1
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"error": captured.err.rstrip()}
@@ -120,7 +120,7 @@ def test_terminals_that_are_not_utf8(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert text in out.read()
 
 
-def test_a_reader_that_leaves_early(tmp_path: Path) -> None:
+def test_closed_pipe_ends_the_command_silently(tmp_path: Path) -> None:
     members = "".join(f"a{i} : Int;\n" for i in range(20_000))
     (tmp_path / "a.db").write_text(f'DATA_BLOCK "b" STRUCT {members} END_STRUCT; BEGIN END_DATA_BLOCK')
     command = [sys.executable, "-m", "shmio.cli.layout", str(tmp_path / "a.db")]
@@ -130,10 +130,10 @@ def test_a_reader_that_leaves_early(tmp_path: Path) -> None:
         assert process.stdout.readline().startswith(b"b: 40000 bytes")
         process.stdout.close()
         assert process.stderr.read() == b""
-        assert process.wait() == 141  # as of a program that the signal ended
+        assert process.wait() == 141  # 128 + SIGPIPE
 
 
-def test_it_tells_its_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["--version"])
     assert stop.value.code == 0
@@ -159,7 +159,7 @@ def test_one_block_of_several(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("size", ["TON_TIME", "=1", "TON_TIME=0", "TON_TIME=9999999", "TON_TIME=x"])
-def test_a_size_that_is_none_is_wrong_usage(size: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_type_size_is_wrong_usage(size: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["a.db", "--type-bytes", size])
     assert "expected a type and its bytes" in capsys.readouterr().err

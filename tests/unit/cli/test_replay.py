@@ -1,4 +1,4 @@
-"""``shmio replay``: what it prints, and what it takes."""
+"""``shmio replay``: its output and its arguments."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ def replay(instance: str, *words: str) -> int:
     return main(["replay", "--instance", instance, *words])
 
 
-def test_it_tells_how_they_play(playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_is_printed_after_each_command(
+    playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert replay(instance) == 0
     line = capsys.readouterr().out
     assert line.startswith("cell: playing at 0.000 s of 0.400 s (1970-01-01 ")
@@ -56,7 +58,7 @@ def test_it_tells_how_they_play(playing: Playing, instance: str, capsys: pytest.
         (["rewind"], "invalid choice"),
     ],
 )
-def test_wrong_usage_is_told(
+def test_wrong_usage(
     playing: Playing, instance: str, words: list[str], error: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -65,7 +67,9 @@ def test_wrong_usage_is_told(
     assert error in capsys.readouterr().err
 
 
-def test_what_cannot_be_is_one_line(playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_impossible_requests_are_refused_in_one_line(
+    playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert replay(instance, "seek", "900") == 1
     assert capsys.readouterr().err == "900 is outside the played part, which is 0.400 s long\n"
     assert replay(instance, "status", "--source", "none") == 1
@@ -79,7 +83,7 @@ def test_what_cannot_be_is_one_line(playing: Playing, instance: str, capsys: pyt
     assert capsys.readouterr().err == "there is no event accepted between here and the end of the played part\n"
 
 
-def test_a_step_tells_of_a_replay_that_stands(
+def test_step_notes_a_replay_that_is_paused_or_over(
     playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def step(*words: str) -> str:
@@ -92,13 +96,11 @@ def test_a_step_tells_of_a_replay_that_stands(
     assert replay(instance, "pause") == 0
     assert step("--count", "2", "--dt-ms", "20").endswith("of 20 ms, step size 50 ms" + stands.format("paused"))
     assert replay(instance, "play") == 0
-    assert step("--dt-ms", "1000").endswith(" of 1000 ms, step size 50 ms\n"), "it moved, to the end"
+    assert step("--dt-ms", "1000").endswith(" of 1000 ms, step size 50 ms\n"), "this step moved the replay to its end"
     assert json.loads(step("--json"))["note"] == stands.format("over")[2:-1]
 
 
-def test_until_stays_when_it_pauses_and_plays_on(
-    playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_until_survives_pause_and_play(playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     def told(*words: str) -> str:
         capsys.readouterr()
         assert replay(instance, *words) == 0
@@ -108,7 +110,7 @@ def test_until_stays_when_it_pauses_and_plays_on(
     assert told("pause") == told("play") == "speed 1, until 0.300 s\n"
     assert told("play", "--speed", "2") == "speed 2, until 0.300 s\n"
     assert main(["step", "--instance", instance, "--dt-ms", "1000"]) == 0
-    assert [told(), told("play")] == ["speed 2\n", "speed 2\n"], "it has been there"
+    assert [told(), told("play")] == ["speed 2\n", "speed 2\n"], "the replay has passed that time"
     assert told("until", "0.35") == "speed 2, until 0.350 s\n"
     assert told("until", "0.4") == "speed 2\n"
     assert told("until", "0.35") == "speed 2, until 0.350 s\n"

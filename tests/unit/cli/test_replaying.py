@@ -1,4 +1,4 @@
-"""``--mode replay``: what becomes of the configuration."""
+"""``--mode replay``: how it changes the configuration."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def file(tmp_path: Path, instance: str) -> Path:
     return found
 
 
-def test_its_sources_take_the_places_of_the_configurations(file: Path) -> None:
+def test_recorded_sources_replace_the_configured_ones(file: Path) -> None:
     prepared = prepare(file.with_name("supervisor.toml"), "replay", {"file": [str(file)], "loop": True})
     plan = prepared.plan
     assert [(job.name, job.kind) for job in plan.jobs] == [("cell", "source"), ("arm", "source"), ("grpc", "grpc")]
@@ -75,7 +75,7 @@ def test_its_sources_take_the_places_of_the_configurations(file: Path) -> None:
     assert "grpc.default_source is left out" in notices
 
 
-def test_frames_of_a_source_that_is_left_out_need_not_be_published(file: Path) -> None:
+def test_topics_of_left_out_sources_are_left_out(file: Path) -> None:
     config = file.with_name("supervisor.toml")
     mqtt = '[mqtt]\nlisten = "127.0.0.1:1883"\nprefix = "shmio/test"\n[[mqtt.account]]\nroles = ["read", "write"]\n'
     config.write_text(f"""{CONFIG}{mqtt}
@@ -96,7 +96,7 @@ payload = "frames"
         prepare(config, "replay", {"file": [str(file)]})
 
 
-def test_a_recorder_of_none_of_its_sources_is_refused(file: Path) -> None:
+def test_recorder_without_any_replayed_source_is_refused(file: Path) -> None:
     config = file.with_name("supervisor.toml")
     config.write_text(f'{CONFIG}sources = ["panel"]\n')
     with pytest.raises(ConfigError, match=r"replay.record: nothing would be recorded: the recording has cell, arm"):
@@ -104,7 +104,7 @@ def test_a_recorder_of_none_of_its_sources_is_refused(file: Path) -> None:
     assert prepare(config, "replay", {"file": [str(file)]}).plan.jobs
 
 
-def test_what_is_asked_for_is_there(file: Path) -> None:
+def test_options_add_the_recorder_and_the_configured_injections(file: Path) -> None:
     keys = {"file": [str(file)], "injections": "leave out", "record": True}
     prepared = prepare(file.with_name("supervisor.toml"), "replay", keys)
     plan = prepared.plan
@@ -113,7 +113,7 @@ def test_what_is_asked_for_is_there(file: Path) -> None:
     assert plan.blocks[0].declared != b"[]"
 
 
-def test_the_section_says_it_too_and_the_command_line_goes_before(file: Path) -> None:
+def test_command_line_overrides_the_replay_section(file: Path) -> None:
     config = file.with_name("supervisor.toml")
     config.write_text(f'{CONFIG}[replay]\nfile = "{file.name}"\nspeed = 2.0\nstart = 0.5\n')
     plan = prepare(config, "replay", {"speed": 3.0}).plan
@@ -122,7 +122,7 @@ def test_the_section_says_it_too_and_the_command_line_goes_before(file: Path) ->
     assert prepare(config, "replay").plan.jobs[0].config["options"]["speed"] == 2.0
 
 
-def test_a_replay_beside_others_has_the_recordings_registers(
+def test_replay_source_has_the_registers_of_the_recording(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(file.parent)
@@ -151,7 +151,7 @@ def test_a_replay_beside_others_has_the_recordings_registers(
         assert f"{Path(name).absolute()}{error}" in line
 
 
-def test_check_looks_at_the_section_too(
+def test_check_covers_the_replay_section(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(file.parent)
@@ -167,7 +167,7 @@ def test_check_looks_at_the_section_too(
     assert out.endswith("usable, with 1 warning\n")
     config.write_text(text + "speed = 2.0\n")
     assert main(["check"]) == 0
-    assert capsys.readouterr().out.endswith("no faults found\n"), "--from says what"
+    assert capsys.readouterr().out.endswith("no faults found\n"), "--from may name the file"
     for keys, error in (
         ('file = "none.mem"', f"replay.file: {Path('none.mem').absolute()}: No such file"),
         ('file = "panel.toml"', "replay.file: "),
@@ -191,18 +191,18 @@ def test_check_looks_at_the_section_too(
         ({"speed": -1.0}, "replay.speed: "),
     ],
 )
-def test_what_cannot_be_is_named(file: Path, keys: dict[str, object], error: str) -> None:
+def test_invalid_options_are_refused_by_key(file: Path, keys: dict[str, object], error: str) -> None:
     keys = {"file": [str(file)], **keys} if keys else {}
     with pytest.raises(ConfigError, match=rf"supervisor\.toml(:[0-9]+)?: {error}"):
         prepare(file.with_name("supervisor.toml"), "replay", keys)
 
 
-def test_a_detached_supervisor_is_told_the_same() -> None:
+def test_detached_supervisor_gets_the_same_options() -> None:
     keys = {"file": ["/a.mem", "/b.mem"], "start": 1.5, "injections": "leave out", "loop": True}
     assert replay_words(keys) == ["--from", "/a.mem", "/b.mem", "--start=1.5", "--injections=leave out", "--loop"]
 
 
-def test_a_recorded_name_is_not_trusted(tmp_path: Path, instance: str) -> None:
+def test_recorded_source_with_a_reserved_name_is_refused(tmp_path: Path, instance: str) -> None:
     with recorded(tmp_path, instance, "grpc") as [one]:
         one.frame(BEGIN_NS, image(1))
     [found] = tmp_path.glob("*.mem")

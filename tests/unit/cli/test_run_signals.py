@@ -1,4 +1,4 @@
-"""What ends the commands that run until they are told to stop."""
+"""Signals that stop commands without an end of their own."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from shmio.cli.run import stop_on_signals
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_them(sign: signal.Signals) -> None:
+def test_signal_stops_the_command(sign: signal.Signals) -> None:
     with stop_on_signals() as stopping:
         signal.raise_signal(sign)
         assert stopping.wait(20)
 
 
-def test_under_nohup_a_closed_terminal_does_not() -> None:
+def test_ignored_hang_up_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with stop_on_signals():

@@ -1,4 +1,4 @@
-"""``shmio set``: what values it takes, and what it says of their end."""
+"""``shmio set``: the values that it accepts, and the outcomes that it prints."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ WRITABLE = ("count", "run", "speed", "name", "wait", "row", "its place")
 
 
 class Device:
-    """A source whose cycles come as soon as there is something to do."""
+    """A source that runs a cycle as soon as a command is waiting."""
 
     def __init__(self, writer: BlockWriter) -> None:
         self.memory = bytearray(LAYOUT.size)
@@ -173,13 +173,13 @@ def test_a_value_is_json_or_a_literal(path: str, text: str, value: object) -> No
         ("row", "[" * 20_000, "found"),
     ],
 )
-def test_what_is_no_value_is_refused(path: str, text: str, message: str) -> None:
+def test_invalid_value_is_refused(path: str, text: str, message: str) -> None:
     with pytest.raises(ValueRangeError, match=message) as caught:
         read_value(text, register(path))
     assert len(str(caught.value)) < 300
 
 
-def test_values_are_written_and_each_end_is_printed(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+def test_values_are_written_and_each_outcome_is_printed(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     assert (
         main(["set", "cell/count", "16#0203", "cell/run/in", "TRUE", "CELL://row/2", "-0", "cell/its place", "1"]) == 0
     )
@@ -192,7 +192,7 @@ def test_values_are_written_and_each_end_is_printed(device: Device, capsys: pyte
     ]
 
 
-def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_output_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.refusals = {0: "locked"}
     assert main(["set", "--json", "cell/count", "1", "cell/run", "true"]) == 1
     out, err = capsys.readouterr()
@@ -227,7 +227,7 @@ def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture
         (["cell", "1"], "names a source, not a register"),
     ],
 )
-def test_what_cannot_be_sent_is_one_line_and_nothing_is_written(
+def test_invalid_argument_is_refused_in_one_line_and_nothing_is_written(
     device: Device, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert main(["set", "cell/run", "true", *arguments]) == 1
@@ -238,7 +238,7 @@ def test_what_cannot_be_sent_is_one_line_and_nothing_is_written(
     assert device.memory == bytes(LAYOUT.size)
 
 
-def test_a_source_without_its_device_says_so(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+def test_source_without_its_device_rejects_the_values(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.processor.close("no answer from 10.0.0.1")
     assert main(["set", "cell/count", "1", "cell/run", "true"]) == 1
     out, err = capsys.readouterr()
@@ -249,7 +249,7 @@ def test_a_source_without_its_device_says_so(device: Device, capsys: pytest.Capt
     )
 
 
-def test_a_source_that_is_replaced_before_it_took_it_is_to_be_asked_again(
+def test_command_for_a_restarted_source_can_be_repeated(
     device: Device, instance: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with Segment.open(instance, writable=True) as segment, ExitStack() as stack:
@@ -257,7 +257,7 @@ def test_a_source_that_is_replaced_before_it_took_it_is_to_be_asked_again(
         seen = queues.bell()
 
         def replace() -> None:
-            queues.wait(seen, 20 * 10**9)  # the command is there
+            queues.wait(seen, 20 * 10**9)  # until the command has come
             stack.callback(Device(segment.writer("other")).stop)
 
         replacing = threading.Thread(target=replace)
@@ -271,9 +271,7 @@ def test_a_source_that_is_replaced_before_it_took_it_is_to_be_asked_again(
         assert main(["set", "other/count", "1"]) == 0, "the remedy works"
 
 
-def test_a_reason_that_is_not_that_of_the_error_stands_beside_its_value(
-    device: Device, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_further_refusals_are_printed_with_their_reason(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.refusals = {0: "locked", 4: "worn out"}
     assert main(["set", "cell/count", "1", "cell/speed", "2", "cell/run", "true"]) == 1
     out, err = capsys.readouterr()
@@ -281,7 +279,7 @@ def test_a_reason_that_is_not_that_of_the_error_stands_beside_its_value(
     assert err == "cell/count: the source refused it: locked (and 1 more)\n"
 
 
-def test_what_nobody_knows_is_said_with_what_to_do(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_outcome_is_reported_with_a_remedy(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.lost = True
     assert main(["set", "cell/its place", "1"]) == 1
     _, err = capsys.readouterr()
@@ -289,13 +287,13 @@ def test_what_nobody_knows_is_said_with_what_to_do(device: Device, capsys: pytes
     assert "look with shmio get 'cell/its place' before writing it again" in err
 
 
-def test_it_waits_no_longer_than_told(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+def test_timeout_limits_the_wait(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.idle = True
     assert main(["set", "--timeout", "0.2", "cell/count", "1"]) == 1
     assert "no cycle began before its deadline" in capsys.readouterr().err
 
 
-def test_sources_have_a_command_each_and_what_was_written_is_told(
+def test_each_source_gets_its_own_command_and_partial_success_is_printed(
     device: Device, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["set", "--timeout", "0.2", "cell/count", "5", "other/count", "6"]) == 1
@@ -316,7 +314,7 @@ def test_sources_have_a_command_each_and_what_was_written_is_told(
         ["--timeout", "x", "cell/count", "1"],
     ],
 )
-def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
+def test_wrong_usage(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["set", *arguments])
     assert stop.value.code == 2
@@ -333,15 +331,15 @@ def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str], arguments: list[st
     ],
 )
 @pytest.mark.parametrize("before", [[], ["--"], ["--timeout", "60"]])
-def test_a_negative_number_is_no_option(device: Device, path: str, text: str, value: float, before: list[str]) -> None:
+def test_negative_number_is_a_value_not_an_option(
+    device: Device, path: str, text: str, value: float, before: list[str]
+) -> None:
     assert main(["set", *before, path, text]) == 0
     at, form = (0, ">h") if path == "cell/count" else (4, ">f")
     assert struct.unpack_from(form, device.memory, at)[0] == value
 
 
-def test_what_a_negative_number_has_to_be_is_said_without_the_help_of_a_space(
-    device: Device, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_message_quotes_a_negative_number_as_it_was_typed(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, said in (
         (["--timeout", "-1e3", "cell/speed", "1"], "'-1e3' is not a number of seconds above 0"),
         (["cell/speed", "1", "-1e3"], "'-1e3' has no value"),
@@ -351,7 +349,9 @@ def test_what_a_negative_number_has_to_be_is_said_without_the_help_of_a_space(
         assert said in capsys.readouterr().err
 
 
-def test_ctrl_c_while_waiting_is_clean(device: Device, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_while_waiting_frees_the_command_queue(
+    device: Device, instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     device.idle = True
 
     def interrupt() -> None:
@@ -363,5 +363,5 @@ def test_ctrl_c_while_waiting_is_clean(device: Device, instance: str, monkeypatc
     assert main(["set", "--timeout", "600", "cell/count", "1"]) == 130
     thread.join()
     device.idle = False
-    with shmio.attach(instance, writable=True) as cell:  # the place is free again
+    with shmio.attach(instance, writable=True) as cell:  # the queue of the ended command is free again
         assert cell.write({"cell/count": 2})[0].done

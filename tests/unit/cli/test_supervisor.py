@@ -31,12 +31,12 @@ Edit = Callable[[str, str], None]
 
 
 def unplaced(text: str) -> str:
-    """What is told, without the lines of the file."""
+    """Return messages without their line numbers."""
     return re.sub(r"^(\w+\.toml):[0-9]+: ", r"\1: ", text, flags=re.MULTILINE)
 
 
 def block(name: str, kind: str) -> str:
-    """The source of a data block with one register of a type."""
+    """Return the source of a data block with one register of a type."""
     return f"DATA_BLOCK {name}\nSTRUCT\nx : {kind};\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
 
 
@@ -48,7 +48,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def example(capsys: pytest.CaptureFixture[str]) -> Edit:
-    """The A50 example in this folder; replaces one text in it by another."""
+    """Writes the A50 example to this folder; a call replaces one text in it by another."""
     assert main(["init"]) == 0
     capsys.readouterr()
     file = Path("supervisor.toml")
@@ -61,7 +61,7 @@ def example(capsys: pytest.CaptureFixture[str]) -> Edit:
     return edit
 
 
-def test_the_example_is_the_one_at_the_root(capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_writes_the_example_of_the_repository(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init"]) == 0
     assert capsys.readouterr().out.splitlines()[:2] == ["wrote supervisor.toml", "wrote db201.db"]
     for name in ("supervisor.toml", "db201.db"):
@@ -77,7 +77,7 @@ def test_init_never_overwrites(name: str, capsys: pytest.CaptureFixture[str]) ->
     assert Path(name).read_text() == "mine"
 
 
-def test_init_says_so_before_it_complains_about_the_files(capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_configuration_is_the_only_reported_fault(capsys: pytest.CaptureFixture[str]) -> None:
     Path("supervisor.toml").write_text("mine")
     assert main(["init", str(SEED)]) == 1
     assert capsys.readouterr().err.count("\n") == 1
@@ -103,7 +103,7 @@ def test_init_from_the_files_of_the_java_version(capsys: pytest.CaptureFixture[s
     output = capsys.readouterr().out
     assert "source cell at 10.76.0.12:102: DB201, 22 registers, 2180 bytes" in output
     assert "optimized access" in output
-    assert output.count("has spaces") == 1, "names that are odd alike share a line"
+    assert output.count("has spaces") == 1, "names with the same warning share a line"
     assert "; likewise '" in output
     assert output.count("'Axs4 Pos'") == 1
 
@@ -120,7 +120,7 @@ def test_init_from_a_layout_alone_leaves_the_address_to_fill_in(capsys: pytest.C
 
 
 @pytest.mark.parametrize("order", [["cell.db", "types.udt"], ["types.udt", "plc.ini", "cell.db"]])
-def test_a_block_whose_types_are_in_files_of_their_own(order: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_block_with_types_in_other_files(order: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     Path("plc.ini").write_text("host=10.76.0.12\n")
     Path("types.udt").write_text(TYPE)
     Path("cell.db").write_text(block("DB7", '"Axis"'))
@@ -135,7 +135,7 @@ def test_a_block_whose_types_are_in_files_of_their_own(order: list[str], capsys:
 
 
 def test_a_block_without_a_number_in_its_name(capsys: pytest.CaptureFixture[str]) -> None:
-    """TIA Portal's default: the name is the user's, the number is elsewhere."""
+    """TIA Portal's default: the source has the name of the block, but not its number."""
     Path("cell.db").write_text(block('"Cell"', "Int"))
     Path("plc.ini").write_text("host=10.76.0.12\ndbNumber=7\n")
     assert main(["init", "cell.db", "-c", "bare.toml"]) == 0
@@ -160,7 +160,7 @@ def test_a_block_without_a_number_in_its_name(capsys: pytest.CaptureFixture[str]
         (["--block", "DB9", "by.ini", "two.db"], 9),
     ],
 )
-def test_init_with_an_emulated_controller_can_be_started_as_it_is(
+def test_init_with_an_emulated_controller_is_complete(
     files: list[str], number: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("cell.db").write_text(block('"Cell"', "Int"))
@@ -179,7 +179,7 @@ def test_init_with_an_emulated_controller_can_be_started_as_it_is(
     assert source.writable == ["**"]
 
 
-def test_an_emulator_plays_a_block_without_a_number(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_emulated_block_without_a_number_needs_dbnumber(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     Path("db201.db").write_text(Path("db201.db").read_text().replace("DATA_BLOCK DB201", 'DATA_BLOCK "Cell"'))
     example("port = 1102", "port = 1102\ndbNumber = 7")
     assert main(["check"]) == 1
@@ -189,7 +189,7 @@ def test_an_emulator_plays_a_block_without_a_number(example: Edit, capsys: pytes
 
 
 def test_an_idle_emulator_plays_all_blocks_of_its_files(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
-    """And so several sources can read it, each its own."""
+    """So several sources can read one emulator, each its own block."""
     Path("two.db").write_text(block("DB7", "Int") + Path("db201.db").read_text())
     example('layout = "db201.db"\nprogram = "a50"', 'layout = "two.db"')
     assert main(["check"]) == 0
@@ -219,8 +219,8 @@ def test_an_idle_emulator_needs_a_number_for_each_block(example: Edit, capsys: p
     assert main(["check"]) == 0
 
 
-def test_init_takes_a_name_that_is_free(instance: str) -> None:
-    """No instance has it, and no configuration in the same folder, beside it, or above."""
+def test_init_proposes_an_unused_name(instance: str) -> None:
+    """No running instance has the name, and no configuration in this or a neighbouring folder."""
     file = Path("plants/new/supervisor.toml")
     for folder in (file.parent, Path("plants/old")):
         folder.mkdir(parents=True)
@@ -244,14 +244,14 @@ def test_init_takes_a_name_that_is_free(instance: str) -> None:
         segment.unlink()
 
 
-def test_init_of_the_example_says_whose_name_it_has(capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_of_the_example_notes_a_name_in_use(capsys: pytest.CaptureFixture[str]) -> None:
     Path("new").mkdir()
     assert main(["init"]) == 0
     assert main(["init", "-c", "new/supervisor.toml"]) == 0
     assert "is called a50, too: to run both, call this one a50-" in capsys.readouterr().out
 
 
-def test_init_of_several_blocks_takes_the_one_of_the_number(capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_chooses_the_block_with_the_number_in_the_properties(capsys: pytest.CaptureFixture[str]) -> None:
     Path("two.db").write_text(block('"One"', "Int") + block("DB7", "DInt"))
     Path("plc.ini").write_text("host=10.76.0.12\ndbNumber=7\n")
     assert main(["init", "two.db", "plc.ini"]) == 0
@@ -260,7 +260,7 @@ def test_init_of_several_blocks_takes_the_one_of_the_number(capsys: pytest.Captu
     assert "DB7, 1 registers, 4 bytes" in capsys.readouterr().out
 
 
-def test_init_says_what_belongs_into_the_properties_file(capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_names_the_missing_keys_of_the_properties_file(capsys: pytest.CaptureFixture[str]) -> None:
     Path("cell.db").write_text(block('"Größe 1é"', "Int"))
     Path("plc.ini").write_text("slot=1\n")
     assert main(["init", "plc.ini", "cell.db"]) == 0
@@ -329,7 +329,7 @@ def test_init_asks_which_of_many_blocks(choice: list[str], capsys: pytest.Captur
 
 
 @pytest.mark.parametrize("name", ["cell.xml", "cell.db", "plc.ini"])
-def test_init_says_what_to_do_with_xml(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_refuses_xml_with_a_remedy(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path(name).write_text('<?xml version="1.0"?>\n<Document></Document>\n')
     Path("good.db").write_text(block("DB1", "Int"))
     assert main(["init", name, "good.db"]) == 1
@@ -338,7 +338,7 @@ def test_init_says_what_to_do_with_xml(name: str, capsys: pytest.CaptureFixture[
     assert error.count("\n") == 1
 
 
-def test_what_is_wrong_with_other_blocks_does_not_count(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_faults_of_other_blocks_are_ignored(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     both = Path("db201.db").read_text() + block('"Timers"', "TON_TIME")
     Path("db201.db").write_text(both)
     example('layout = "db201.db"\nhost', 'layout = "db201.db"\nblock = "DB201"\nhost')
@@ -360,13 +360,13 @@ def test_what_is_wrong_with_other_blocks_does_not_count(example: Edit, capsys: p
 
 
 @pytest.mark.parametrize("files", [["plc.ini"], ["a.db", "b.db"], ["plc.ini", "x.ini", "a.db"], ["no.db"]])
-def test_init_of_other_files_is_refused(files: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_refuses_unsuitable_files(files: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", *files]) == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert not Path("supervisor.toml").exists()
 
 
-def test_warnings_are_shown_besides_faults_elsewhere(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_are_shown_with_faults(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     example('"Outputs", ', '"Nothing", ')
     example('kind = "s7"', 'kind = "s8"')
     assert main(["check"]) == 1
@@ -375,7 +375,9 @@ def test_warnings_are_shown_besides_faults_elsewhere(example: Edit, capsys: pyte
     assert warning == "supervisor.toml: warning: source[0].writable: 'Nothing' names nothing in DB201"
 
 
-def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_processes_sources_and_sizes(
+    example: Edit, instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     example('name = "a50"', f'name = "{instance}"')
     assert main(["check"]) == 0
     output = capsys.readouterr().out
@@ -386,9 +388,7 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
     assert instance not in instances()
 
 
-def test_a_source_that_reads_beside_its_emulator_is_pointed_out(
-    example: Edit, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_points_out_a_source_that_misses_its_emulator(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     example("port = 1102", "port = 1103")
     assert main(["check"]) == 0
     said = (
@@ -397,7 +397,7 @@ def test_a_source_that_reads_beside_its_emulator_is_pointed_out(
     assert said in capsys.readouterr().out
     example('host = "127.0.0.1" ', 'host = "10.76.0.12" ')
     assert main(["check"]) == 0
-    assert "where no [[emulator]]" not in capsys.readouterr().out, "it is a real one"
+    assert "where no [[emulator]]" not in capsys.readouterr().out, "the source reads a real controller"
 
 
 def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -415,7 +415,7 @@ def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixtu
     }  # fmt: skip
     [warning] = found.pop("warnings")
     assert "'Outpts' names nothing" in warning
-    found.pop("notes")  # they are of the host: its other users, ports that are taken
+    found.pop("notes")  # they depend on the host: its users and the ports in use
     assert found == {
         "config": "supervisor.toml", "instance": instance, "injections": [], "replay": [],
         "processes": ["plc", "cell", "grpc", "broker", "mqtt", "recorder"], "segment": f"shmio-{instance}",
@@ -427,7 +427,7 @@ def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixtu
     assert json.loads(out) == {"error": err.rstrip("\n")}
 
 
-def test_check_says_that_a_priority_is_not_allowed(
+def test_check_reports_a_priority_that_is_not_allowed(
     example: Edit, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refuse(*_: object) -> None:
@@ -495,7 +495,9 @@ TAKEN = "is the port of emulator[0].listen (127.0.0.1:1102) already; choose anot
         ("period_ms = 20", "period_ms = 20\nproperties = 'none.ini'", "source[0].properties: "),
     ],
 )
-def test_faults_are_named(example: Edit, old: str, new: str, error: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_faults_are_reported_by_check_and_up(
+    example: Edit, old: str, new: str, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     example(old, new)
     for verb in ("check", "up"):
         assert main([verb]) == 1
@@ -504,7 +506,7 @@ def test_faults_are_named(example: Edit, old: str, new: str, error: str, capsys:
         assert output.err.count("\n") == 1
 
 
-def test_a_fault_that_a_detached_one_finds_is_told_here(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_up_detach_reports_faults(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     example("period_ms = 20", "perid_ms = 20")
     assert main(["up", "--detach"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -523,7 +525,7 @@ def test_other_addresses_may_have_the_same_port(
     assert main(["check"]) == 0, capsys.readouterr().err
 
 
-def test_faults_of_a_layout_have_their_place(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_faults_of_a_layout_have_line_and_column(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     Path("db201.db").write_text("DATA_BLOCK x\nSTRUCT\na : Reel;\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n")
     assert main(["check"]) == 1
     assert re.search(r"db201\.db:3:\d+: error: ", capsys.readouterr().err)
@@ -547,7 +549,7 @@ RECORDED = (
 
 
 @pytest.mark.parametrize(
-    ("key", "pattern", "odd"),
+    ("key", "pattern", "warned"),
     [
         (WRITABLE, "Outpts", True),
         (WRITABLE, "Robot_9*/*", True),
@@ -565,41 +567,41 @@ RECORDED = (
         (RECORDED, "cell/Inputs/5", False),
     ],
 )
-def test_a_pattern_that_names_nothing_is_odd(
-    example: Edit, key: tuple[str, str, str], pattern: str, odd: bool, capsys: pytest.CaptureFixture[str]
+def test_pattern_without_a_match_is_a_warning(
+    example: Edit, key: tuple[str, str, str], pattern: str, warned: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old, new, warning = key
     example(old, new.format(pattern))
     assert main(["check"]) == 0
     output = capsys.readouterr().out
-    assert (f"warning: {warning.format(pattern)}" in output) is odd
-    assert ("usable, with 1 warning\n" in output) is odd
+    assert (f"warning: {warning.format(pattern)}" in output) is warned
+    assert ("usable, with 1 warning\n" in output) is warned
 
 
-def test_all_patterns_that_name_no_part_are_told_at_once(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_invalid_patterns_are_reported_together(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     example('"Outputs"', '"Inputs.%X0", "NCAchse1_Pos.%X0"')
     assert main(["check"]) == 1
     told = capsys.readouterr().err.splitlines()
     assert ["Inputs.%X0" in told[0], "NCAchse1_Pos.%X0" in told[1], len(told)] == [True, True, 2]
 
 
-@pytest.mark.parametrize(("roles", "odd"), [('["read", "write"]', True), ('["read"]', False)])
-def test_a_broker_that_lets_everybody_write_is_odd(
+@pytest.mark.parametrize(("roles", "warned"), [('["read", "write"]', True), ('["read"]', False)])
+def test_broker_that_lets_everybody_write_is_a_warning(
     example: Edit,
     roles: str,
-    odd: bool,
+    warned: bool,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # there is some program
+    monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # any program will do
     (tmp_path / "accounts").write_text("anna:secret\n")
     (tmp_path / "accounts").chmod(0o600)
     example('listen = "127.0.0.1:1883"', 'listen = "0.0.0.0:1883"\ninsecure = true\npassword_file = "accounts"')
     example('roles = ["read", "write"]', f"roles = {roles}")
     assert main(["check"]) == 0
     output = capsys.readouterr().out
-    assert ("anyone who reaches 0.0.0.0:1883 may publish commands without an account" in output) is odd
+    assert ("anyone who reaches 0.0.0.0:1883 may publish commands without an account" in output) is warned
     assert "mqtt.password_file: anna may only read" in output
 
 
@@ -628,7 +630,7 @@ def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys
     assert ": DB7, 1 registers, 2 bytes" in capsys.readouterr().out
 
 
-def test_help_tells_what_init_takes_and_which_modes_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_the_arguments_of_init_and_the_modes(capsys: pytest.CaptureFixture[str]) -> None:
     for verb, said in (
         ("init", "init [-h] [-c FILE] [--emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"),
         ("up", "replay: play a recording in place of the sources"),
@@ -647,7 +649,7 @@ def test_help_tells_what_init_takes_and_which_modes_there_are(capsys: pytest.Cap
         (["--mode", "replay", "--from", "none.mem", "--speed", "0"], "replay.speed: expected a number >= 0.01"),
     ],
 )
-def test_a_replay_that_cannot_be_is_refused(
+def test_impossible_replay_is_refused(
     example: Edit, options: list[str], error: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["up", *options]) == 1
@@ -655,12 +657,12 @@ def test_a_replay_that_cannot_be_is_refused(
     assert unplaced(line).startswith(f"supervisor.toml: {error}")
 
 
-def test_what_is_for_a_replay_goes_with_no_other_mode(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_for_replay_are_refused_in_other_modes(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["up", "--paused"]) == 1
     assert capsys.readouterr().err == "--paused goes with --mode replay only\n"
 
 
-def test_nothing_is_logged_without_a_recorder(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_log_mode_needs_a_recorder_section(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     Path("supervisor.toml").write_text(Path("supervisor.toml").read_text().partition("\n[recorder]")[0])
     assert main(["up", "--mode", "log"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -668,7 +670,7 @@ def test_nothing_is_logged_without_a_recorder(example: Edit, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["up", "--mode", "dead"], ["restart"], ["logs", "-n", "-1"]])
-def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     assert stop.value.code == 2
@@ -683,7 +685,7 @@ def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[st
         (["status"], "{}: stopped; it is not running"),
     ],
 )
-def test_with_nothing_running_verbs_say_so(
+def test_verbs_report_that_no_instance_is_running(
     verb: list[str], said: str, instance: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*verb, "--instance", instance]) == 1
@@ -692,13 +694,13 @@ def test_with_nothing_running_verbs_say_so(
     assert error.count("\n") == 1
 
 
-def test_nothing_to_stop_is_not_a_reason_to_start(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_down_without_an_instance_does_not_suggest_up(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["down", "--instance", instance]) == 1
     assert capsys.readouterr().err == f"no instance {instance!r} is running: there is nothing to stop\n"
 
 
 @pytest.mark.parametrize("verb", [["down"], ["restart", "cell"], ["logs"]])
-def test_a_supervisor_that_does_not_answer(
+def test_silent_supervisor_is_reported(
     verb: list[str],
     instance: str,
     folder: Path,
@@ -722,7 +724,7 @@ def test_a_folder_is_no_configuration(folder: Path, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err == f"{folder}: Is a directory; name the file, such as {folder}/supervisor.toml\n"
 
 
-def test_a_full_disk_is_the_programs_failure() -> None:
+def test_output_to_a_full_disk_fails_in_one_line() -> None:
     command = [sys.executable, "-m", "shmio.cli.layout", str(ROOT / "db201.db")]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
@@ -740,7 +742,7 @@ def test_a_full_disk_is_the_programs_failure() -> None:
         ("no answer", "disk full", "bad: no answer; cycle 3, - Hz, 1 overrun; disk full"),
     ],
 )
-def test_status_says_why_once(
+def test_status_prints_the_reason_once(
     instance: str, reason: str, note: str, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     layout = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
@@ -758,7 +760,7 @@ def test_status_says_why_once(
 
 
 @pytest.mark.parametrize(("missed", "shown"), [(0, "0 s"), (1, "; 1 frame missed"), (7, "; 7 frames missed")])
-def test_status_says_what_the_bridge_has_missed(
+def test_status_prints_how_many_frames_the_bridge_missed(
     instance: str, missed: int, shown: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with Segment.create(instance, [], [ProcessSpec("mqtt", "mqtt")]) as segment:
@@ -773,7 +775,7 @@ def test_status_says_what_the_bridge_has_missed(
         segment.unlink()
 
 
-def test_status_of_nothing_is_an_object(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_of_a_stopped_instance_as_json(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["status", "--json", "--instance", instance]) == 1
     output = capsys.readouterr()
     found = json.loads(output.out)
@@ -782,12 +784,12 @@ def test_status_of_nothing_is_an_object(instance: str, capsys: pytest.CaptureFix
 
 
 def documented(page: str, heading: str) -> list[str]:
-    """The names that the table under a line of the reference page has in its first column, in their order."""
+    """Return the names in the first column of the table below a line of the reference page."""
     table = page.partition(f"\n{heading}\n\n")[2].partition("\n\n")[0]
     return [name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split(" | ")[0])]
 
 
-def test_status_has_the_keys_of_the_reference_in_its_order(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_has_the_documented_keys_in_order(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     page = (ROOT / "docs/reference/cli-supervisor.md").read_text()
     layout = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
     blocks = [BlockSpec("cell", layout, 20_000_000, 3600 * 10**9, 1 << 16)]
@@ -807,14 +809,14 @@ def test_status_has_the_keys_of_the_reference_in_its_order(instance: str, capsys
 
 
 class TestTarget:
-    """Which instance a verb acts on."""
+    """The choice of the instance that a verb acts on."""
 
-    def test_the_one_of_the_file_here(self, example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_file_in_the_current_folder(self, example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
         example('name = "a50"', f'name = "{instance}"')
         assert main(["down"]) == 1
         assert f"no instance {instance!r} is running" in capsys.readouterr().err
 
-    def test_a_spoilt_file_still_names_its_instance(self, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_faulty_file_still_names_its_instance(self, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
         Path("spoilt.toml").write_text(f'wings = 2\n[instance]\nname = "{instance}"\nnmae = 3\n')
         assert main(["down", "-c", "spoilt.toml"]) == 1
         assert f"no instance {instance!r} is running" in capsys.readouterr().err
@@ -826,11 +828,11 @@ class TestTarget:
         assert capsys.readouterr().err.startswith("spoilt.toml: ")
 
     @pytest.mark.parametrize("name", ["../../etc/passwd", "", "a" * 41, "a b"])
-    def test_what_is_no_name_is_refused(self, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_invalid_name_is_refused(self, name: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["status", "--instance", name]) == 1
         assert "is not a name" in capsys.readouterr().err
 
-    def test_the_only_one_or_none_or_a_choice(
+    def test_only_running_instance_without_a_file(
         self, instance: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
         running: list[str] = []
@@ -847,7 +849,7 @@ class TestTarget:
             segment.unlink()
 
 
-def test_looking_needs_no_heavy_imports() -> None:
+def test_status_needs_no_heavy_imports() -> None:
     """``status`` must answer at once."""
     heavy = {"numpy", "grpc", "snap7", "asyncio", "shmio.local.attach"}
     code = (
@@ -859,9 +861,7 @@ def test_looking_needs_no_heavy_imports() -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"0123456789", bytes(8192)])
-def test_down_clears_a_segment_that_was_never_finished(
-    instance: str, content: bytes, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_down_removes_an_incomplete_segment(instance: str, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
     left = Path(f"/dev/shm/shmio-{instance}")
     left.write_bytes(content)
     assert main(["down", "--instance", instance]) == 0
@@ -869,7 +869,7 @@ def test_down_clears_a_segment_that_was_never_finished(
     assert not left.exists()
 
 
-def test_hints_name_the_configuration_as_it_has_to_be_typed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hints_quote_the_configuration_for_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "my plc.toml"
     file.write_text('[instance]\nname = "nobody-runs-this"\n')
     assert main(["status", "-c", str(file)]) == 1
@@ -878,7 +878,7 @@ def test_hints_name_the_configuration_as_it_has_to_be_typed(tmp_path: Path, caps
     assert capsys.readouterr().err.endswith("start it with shmio-supervisor up -c FILE\n")
 
 
-def test_what_an_emulator_cannot_serve_is_odd(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_warns_of_what_an_emulator_cannot_serve(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "my.db").write_text(block("DB7", "Int").replace("x : Int", "Enable : Int := NOWHERE"))
     (folder / "supervisor.toml").write_text(
         '[instance]\nname = "press"\n'
@@ -904,7 +904,7 @@ value = 7
 """
 
 
-def test_check_tells_what_is_declared(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_declared_injections(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     example("[grpc]\n", INJECTION)
     assert main(["check"]) == 0
     assert "  injection one: set over source cell /out\n" in capsys.readouterr().out
@@ -932,7 +932,9 @@ def test_faults_of_declared_injections_are_named(
     assert told.endswith('(injection "one")\n')
 
 
-def test_what_is_declared_over_in_must_be_writable_and_armed(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_injection_toward_the_device_needs_armed_and_writable(
+    example: Edit, capsys: pytest.CaptureFixture[str]
+) -> None:
     example("[grpc]\n", INJECTION)
     example("armed = false ", "armed = true ")
     example("Outputs/100", "Outputs/100/in")
@@ -946,14 +948,14 @@ def test_what_is_declared_over_in_must_be_writable_and_armed(example: Edit, caps
     )
 
 
-def test_what_is_declared_for_a_source_has_a_bound(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_number_of_declared_injections_is_bounded(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     tables = "".join(INJECTION.replace("one", f"n{place}").replace("[grpc]\n", "") for place in range(65))
     example("[grpc]\n", f"{tables}[grpc]\n")
     assert main(["check"]) == 1
     assert "injection: source 'cell' has 65: at most 64 are allowed" in capsys.readouterr().err
 
 
-def test_all_that_is_missing_is_told_in_one_round(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_faults_are_reported_together(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     Path("big.db").write_text(block('"Cell"', "Array[0..99] of Int") + block('"Timers"', "TON_TIME"))
     example('layout = "db201.db"\nhost = "127.0.0.1"', 'layout = "big.db"\nblock = "Cell"\n#')
     example("port = 1102", "port = 1102\nslott = 2")
@@ -979,7 +981,7 @@ def test_all_that_is_missing_is_told_in_one_round(example: Edit, capsys: pytest.
     assert "did you mean s7?" in err[4]
 
 
-def test_faults_of_keys_and_of_the_connector_are_told_together(
+def test_faults_of_keys_connector_and_layout_are_reported_together(
     example: Edit, capsys: pytest.CaptureFixture[str]
 ) -> None:
     example("period_ms = 20", 'period_ms = "20"')

@@ -34,7 +34,7 @@ def free_port() -> int:
 
 
 class Cell:
-    """The example in a folder of its own, with an instance name and ports of its own."""
+    """The example in a temporary folder, with a unique instance name and free ports."""
 
     def __init__(self, folder: Path, instance: str, runtime: Path) -> None:
         self.folder = folder
@@ -69,7 +69,7 @@ class Cell:
         return found
 
     def look(self) -> InstanceStatus:
-        """The same without a process for it."""
+        """Return the status without starting a process."""
         return read_status(self.instance, "")
 
     def of(self, name: str) -> SourceStatus | ProcessStatus:
@@ -80,11 +80,11 @@ class Cell:
 def cell(tmp_path: Path, instance: str, runtime: Path) -> Iterator[Cell]:
     cell = Cell(tmp_path, instance, runtime)
     yield cell
-    if instance in instances():  # a test has failed
+    if instance in instances():  # the test has failed
         cell.run("down", status=0)
 
 
-def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
+def test_up_status_restart_logs_and_down(cell: Cell) -> None:
     configured = cell.folder / "supervisor.toml"
     both = 'listen = ["127.0.0.1:0"]\naddress = [{ listen = "127.0.0.1:0" }]'
     configured.write_text(configured.read_text().replace('listen = ["127.0.0.1:0", "127.0.0.1:0"]', both))
@@ -143,7 +143,7 @@ def kill_supervisor(cell: Cell) -> None:
     until(lambda: cell.look().supervisor is None, "the supervisor's death")
 
 
-def test_what_a_killed_supervisor_left_is_taken_over_or_cleared(cell: Cell) -> None:
+def test_processes_of_a_killed_supervisor_are_taken_over_or_stopped(cell: Cell) -> None:
     cell.run("up", "--detach", status=0)
     processes = cell.status()["processes"]
     kill_supervisor(cell)
@@ -163,7 +163,7 @@ def test_what_a_killed_supervisor_left_is_taken_over_or_cleared(cell: Cell) -> N
     assert not list((cell.runtime / "shmio").iterdir())
 
 
-def test_a_block_without_a_number_is_played_and_read(cell: Cell) -> None:
+def test_emulated_block_without_a_number_is_read(cell: Cell) -> None:
     block = cell.folder / "db201.db"
     block.write_text(block.read_text().replace("DATA_BLOCK DB201", 'DATA_BLOCK "Cell"'))
     file = cell.folder / "supervisor.toml"
@@ -174,11 +174,11 @@ def test_a_block_without_a_number_is_played_and_read(cell: Cell) -> None:
 
 
 def moved(text: str) -> str:
-    """The configuration with emulator and broker on other ports."""
+    """Return the configuration with emulator and broker on other ports."""
     return re.sub(r'listen = "127\.0\.0\.1:\d+"', lambda _: f'listen = "127.0.0.1:{free_port()}"', text)
 
 
-def test_a_device_that_is_not_there_is_told_but_does_not_hold_up_the_start(cell: Cell) -> None:
+def test_missing_device_is_a_warning_and_does_not_delay_the_start(cell: Cell) -> None:
     file = cell.folder / "supervisor.toml"
     file.write_text(moved(file.read_text()))
     assert "warning: source cell is bad: " in cell.run("up", "--detach", status=0).stderr
@@ -186,13 +186,13 @@ def test_a_device_that_is_not_there_is_told_but_does_not_hold_up_the_start(cell:
     cell.run("down", status=0)
 
 
-def test_what_init_writes_for_a_block_runs_beside_a_running_cell(cell: Cell, instance: str) -> None:
+def test_configuration_from_init_runs_beside_a_running_cell(cell: Cell, instance: str) -> None:
     own, name = cell.folder / "own", f"{instance}-own"
     own.mkdir()
     (own / "my.db").write_text((cell.folder / "db201.db").read_text().replace("DB201", f'"{name}"', 1))
     (own / "plc.ini").write_text(f"host=127.0.0.1\nport={free_port()}\ndbNumber=201\n")
     with ExitStack() as stack:
-        for port in (8089, 8090):  # what a demo has, unless it is running here
+        for port in (8089, 8090):  # the ports of the demo, unless it is running
             with suppress(OSError):
                 demo = stack.enter_context(socket.socket())
                 demo.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -221,7 +221,7 @@ def serve_on(cell: Cell, address: str) -> None:
     file.write_text(file.read_text().replace('["127.0.0.1:0", "127.0.0.1:0"]', f'["{address}"]\ninsecure = true'))
 
 
-def test_a_start_that_fails_tells_why_and_leaves_nothing(cell: Cell) -> None:
+def test_failed_start_reports_the_reason_and_leaves_nothing(cell: Cell) -> None:
     serve_on(cell, "192.0.2.1:8089")  # RFC 5737: nobody's address
     error = cell.run("up", "--detach", status=1).stderr
     assert error.startswith("grpc: ")
@@ -230,7 +230,7 @@ def test_a_start_that_fails_tells_why_and_leaves_nothing(cell: Cell) -> None:
 
 
 @pytest.mark.parametrize("arguments", [["up"], ["up", "--detach"]])
-def test_a_port_that_another_program_has_is_found_before_the_start(cell: Cell, arguments: list[str]) -> None:
+def test_port_in_use_is_found_before_the_start(cell: Cell, arguments: list[str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -249,7 +249,7 @@ def test_a_port_that_another_program_has_is_found_before_the_start(cell: Cell, a
     assert not (cell.folder / "logs").exists()
 
 
-def test_a_left_over_segment_without_processes_hides_no_taken_port(cell: Cell) -> None:
+def test_leftover_segment_does_not_hide_a_port_in_use(cell: Cell) -> None:
     Path("/dev/shm", f"shmio-{cell.instance}").touch()
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -261,8 +261,8 @@ def test_a_left_over_segment_without_processes_hides_no_taken_port(cell: Cell) -
     assert f", pid {os.getpid()}, listens there; " in error
 
 
-def test_what_an_instances_broker_has_is_said_to_be_its(cell: Cell) -> None:
-    """Though the broker's process may have a program of its own for it."""
+def test_port_of_another_instances_broker_is_attributed_to_it(cell: Cell) -> None:
+    """The broker's process may start another program that listens there."""
     serve_on(cell, f"127.0.0.1:{free_port()}")
     cell.run("up", "--detach", status=0)
     text = (cell.folder / "supervisor.toml").read_text()
@@ -278,7 +278,7 @@ def test_what_an_instances_broker_has_is_said_to_be_its(cell: Cell) -> None:
     cell.run("down", status=0)
 
 
-def test_what_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
+def test_ports_and_logs_of_another_instance_are_attributed_to_it(cell: Cell) -> None:
     serve_on(cell, f"127.0.0.1:{free_port()}")
     cell.run("up", "--detach", status=0)
     text = (cell.folder / "supervisor.toml").read_text().replace(f'"{cell.instance}"', f'"{cell.instance}-2"')
@@ -299,8 +299,8 @@ def test_what_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
     cell.run("down", status=0)
 
 
-@pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGHUP])  # tests/system/test_cell.py has SIGINT
-def test_in_the_foreground_a_signal_stops_it_cleanly(cell: Cell, sign: signal.Signals) -> None:
+@pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGHUP])  # tests/system/test_cell.py sends SIGINT
+def test_signal_stops_a_foreground_instance_cleanly(cell: Cell, sign: signal.Signals) -> None:
     with subprocess.Popen(
         cell.command("up"),
         cwd=cell.folder,

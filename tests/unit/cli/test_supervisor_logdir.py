@@ -1,4 +1,4 @@
-"""Folders on a full disk."""
+"""Configured folders on a full disk."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from shmio.cli.supervisor import main
 
 
-def test_a_full_disk_keeps_nothing_from_running(
+def test_full_disk_is_only_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

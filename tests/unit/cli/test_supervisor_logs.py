@@ -1,4 +1,4 @@
-"""``shmio-supervisor logs``: several files as one, and what is added to them."""
+"""``shmio-supervisor logs``: merges the log files, and follows them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_missing_file_has_no_lines(tmp_path: Path) -> None:
     assert last_lines([tmp_path / "none.log"], 5) == []
 
 
-def test_a_follower_gives_what_is_added(files: list[Path]) -> None:
+def test_follower_returns_added_lines(files: list[Path]) -> None:
     with Follower(files) as follower:
         with files[1].open("a") as log:
             log.write("new one\nand a par")
@@ -52,7 +52,7 @@ def test_a_follower_gives_what_is_added(files: list[Path]) -> None:
         assert follower.wait() == [b"and a part"]
 
 
-def test_a_follower_goes_on_after_a_rotation(files: list[Path]) -> None:
+def test_follower_continues_after_a_rotation(files: list[Path]) -> None:
     with Follower(files) as follower:
         with files[0].open("a") as log:
             log.write("last of the old\n")
@@ -61,21 +61,21 @@ def test_a_follower_goes_on_after_a_rotation(files: list[Path]) -> None:
         assert follower.wait() == [b"last of the old", b"first of the new"]
 
 
-def test_a_follower_waits_for_a_file_that_is_not_there_yet(tmp_path: Path) -> None:
+def test_follower_waits_for_a_missing_file(tmp_path: Path) -> None:
     with Follower([tmp_path / "late.log"]) as follower:
         (tmp_path / "late.log").write_text("here\n")
         assert follower.wait() == [b"here"]
 
 
-def test_a_line_without_end_is_given_in_parts(files: list[Path]) -> None:
+def test_follower_returns_an_endless_line_in_parts(files: list[Path]) -> None:
     with Follower(files) as follower:
         with files[0].open("a") as log:
             log.write("x" * (MAX_LINE_BYTES + 1))
         assert [len(line) for line in follower.wait()] == [MAX_LINE_BYTES + 1]
 
 
-def test_a_follower_of_no_folder_is_an_error(tmp_path: Path) -> None:
-    gc.collect()  # what tests before have left is not to be closed meanwhile
+def test_follower_in_a_missing_folder_is_an_error(tmp_path: Path) -> None:
+    gc.collect()  # so that no leftover of earlier tests is closed meanwhile
     open_before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
     with pytest.raises(OSError, match="No such file"):
         Follower([tmp_path / "none" / "a.log"])
@@ -98,10 +98,10 @@ def instance_logs(
     return logs
 
 
-def test_logs_of_all_and_of_one(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_logs_of_all_processes_and_of_one(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["logs"]) == 0
     output = capsys.readouterr().out
-    assert output == stamped(1, "cell running") + stamped(2, "connected \\x1b[31mred"), "nothing moves the cursor"
+    assert output == stamped(1, "cell running") + stamped(2, "connected \\x1b[31mred"), "control characters are escaped"
     assert main(["logs", "supervisor", "-n", "1"]) == 0
     assert capsys.readouterr().out == stamped(1, "cell running")
 
@@ -118,7 +118,7 @@ def test_logs_as_json(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -
     assert json.loads(capsys.readouterr().out)["error"].startswith("no process 'cel'; there are: ")
 
 
-def test_logs_of_an_unknown_process_names_those_there_are(
+def test_unknown_process_is_refused_with_the_valid_names(
     instance_logs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["logs", "cel"]) == 1
@@ -127,7 +127,7 @@ def test_logs_of_an_unknown_process_names_those_there_are(
     )
 
 
-def test_the_bridge_and_its_broker_have_logs_too(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bridge_and_broker_have_logs(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (instance_logs / "broker.log").write_text(stamped(3, "broker ready"))
     (instance_logs / "mqtt.log").write_text(stamped(4, "bridge connected"))
     for name, word in (("broker", "ready\n"), ("mqtt", "connected\n")):
@@ -135,13 +135,13 @@ def test_the_bridge_and_its_broker_have_logs_too(instance_logs: Path, capsys: py
         assert capsys.readouterr().out.endswith(word)
     config = Path("supervisor.toml")
     config.write_text(config.read_text().replace('broker = "embedded"', 'broker = "external"\nhost = "broker.example"'))
-    assert main(["logs", "broker"]) == 1, "it is somebody else's"
+    assert main(["logs", "broker"]) == 1, "an external broker has no log here"
 
 
-def test_what_runs_and_is_in_no_file_has_logs_too(
+def test_running_process_that_is_not_configured_has_logs(
     instance_logs: Path, instance: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As a source does that ``--mode replay`` has added."""
+    """``--mode replay`` adds such a source."""
     (instance_logs / "arm.log").write_text(stamped(3, "arm plays"))
     assert main(["logs", "arm"]) == 1
     assert capsys.readouterr().err.startswith("no process 'arm'; ")
@@ -152,7 +152,7 @@ def test_what_runs_and_is_in_no_file_has_logs_too(
             assert capsys.readouterr().out == stamped(3, "arm plays")
             assert main(["logs", "-n", "1"]) == 0
             assert capsys.readouterr().out == stamped(3, "arm plays")
-            assert main(["logs", "plc"]) == 1, "it is in the file, and has no log"
+            assert main(["logs", "plc"]) == 1, "plc is configured, but has no log"
         finally:
             segment.unlink()
 

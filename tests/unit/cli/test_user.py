@@ -1,4 +1,4 @@
-"""``shmio``: which instance it looks at, and how it ends. What it prints is in tests/system."""
+"""``shmio``: the instance that it chooses, and how it ends. tests/system has its output."""
 
 from __future__ import annotations
 
@@ -37,16 +37,14 @@ def running(instance: str) -> Iterator[str]:
         segment.unlink()
 
 
-def test_the_instance_is_that_of_the_file_here_even_if_spoilt(running: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_faulty_file_in_the_current_folder_names_the_instance(running: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("supervisor.toml").write_text(f'wings = 2\n[instance]\nname = "{running}"\n')
     assert main(["get", "cell/a"]) == 0
     assert capsys.readouterr().out == "cell/a  7\n"
 
 
-def test_an_instance_that_does_not_tell_its_file_is_reached_by_its_name_alone(
-    instance: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As one of a shmio that did not tell it yet."""
+def test_instance_of_an_unknown_file_is_reached_only_by_name(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its segment does not name the configuration file."""
     Path("supervisor.toml").write_text(f'[instance]\nname = "{instance}"\n')
     with Segment.create(instance, [], []) as segment:
         assert main(["list"]) == 1
@@ -55,7 +53,7 @@ def test_an_instance_that_does_not_tell_its_file_is_reached_by_its_name_alone(
         segment.unlink()
 
 
-def test_an_empty_text_is_seen(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_empty_text_is_printed_as_quotes(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     layout = Layout("DB1", 1, 8, False, (Register("name", "STRING[6]", (), 0, None, 8, 1),))
     with Segment.create(instance, [BlockSpec("cell", layout, 20_000_000, 3600 * 10**9, 1 << 16)], []) as segment:
         for image, line in ((b"\6\0", 'cell/name  ""\n'), (b"\6\1a", "cell/name  a\n")):
@@ -66,12 +64,12 @@ def test_an_empty_text_is_seen(instance: str, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("name", ["../../etc", "", "a b"])
-def test_what_is_no_name_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_name_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--instance", name]) == 1
     assert capsys.readouterr().err.startswith(f"--instance: {name!r} is not a name: at most 40 letters")
 
 
-def test_of_several_one_must_be_chosen(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_instances_need_a_choice(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(target, "running_instances", lambda: ["one", "two"])
     assert main(["list"]) == 1
     assert "choose one by --instance (one, two)" in capsys.readouterr().err
@@ -95,7 +93,7 @@ def test_a_number_of_lines_is_one_or_more(count: str, capsys: pytest.CaptureFixt
         *((("--play", text), f"'{text}' is not a number above 0, at most 1000") for text in ("0", "1001", "nan")),
     ],
 )
-def test_a_step_and_a_rate_have_limits(
+def test_step_size_and_rate_have_limits(
     words: tuple[str, str], problem: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
@@ -105,7 +103,7 @@ def test_a_step_and_a_rate_have_limits(
 
 
 class Keyboard(io.StringIO):
-    """Standard input of somebody at a terminal."""
+    """Standard input from a terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -120,7 +118,7 @@ def mode(instance: str) -> str:
 
 
 @pytest.mark.parametrize("words", [(), ("--play",), ("--pause",)])
-def test_real_time_is_taken_from_a_device_by_no_script_that_does_not_say_so(
+def test_script_needs_yes_to_pause_real_time_over_a_device(
     running: str, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
     assert main(["step", "--instance", running, *words]) == 1
@@ -128,7 +126,7 @@ def test_real_time_is_taken_from_a_device_by_no_script_that_does_not_say_so(
     assert mode(running) == "wall"
 
 
-def test_real_time_is_taken_from_a_device_once_it_was_agreed_to(
+def test_real_time_over_a_device_is_paused_after_consent(
     running: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["step", "--instance", running, "--pause", "--json"]
@@ -143,19 +141,19 @@ def test_real_time_is_taken_from_a_device_once_it_was_agreed_to(
     assert main(command) == 0
     assert json.loads(capsys.readouterr().out)["mode"] == "virtual"
     monkeypatch.setattr("sys.stdin", None)
-    assert main(command) == 0, "it is not asked for again"
+    assert main(command) == 0, "consent is needed only once"
 
 
-def test_who_says_yes_is_not_asked(running: str) -> None:
+def test_option_yes_skips_the_question(running: str) -> None:
     assert main(["step", "--instance", running, "--pause", "--yes"]) == 0
     assert mode(running) == "virtual"
 
 
 def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def news(*_: object, **__: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Attachment, "subscribe", news)
+    monkeypatch.setattr(Attachment, "subscribe", interrupt)
     assert main(["watch", "--instance", running, "cell/a"]) == 130
 
 
@@ -181,7 +179,7 @@ def test_watch_prints_each_change_of_a_local_source(instance: str) -> None:
             try:
                 assert watch.stdout is not None
                 assert "cell/a  7" in watch.stdout.readline()
-                for cycle, value in enumerate((8, 7), 2):  # the second before watch can have looked
+                for cycle, value in enumerate((8, 7), 2):  # watch may read only after the second
                     writer.publish(bytes((0, value)), cycle=cycle, source_ns=1)
                 out, _ = watch.communicate(timeout=20)
             finally:
@@ -190,7 +188,7 @@ def test_watch_prints_each_change_of_a_local_source(instance: str) -> None:
     assert [line[-1] for line in out.splitlines()] == ["8", "7"]
 
 
-def test_watch_goes_on_with_the_block_that_a_reload_has_made(instance: str) -> None:
+def test_watch_continues_with_the_block_of_a_reload(instance: str) -> None:
     wide = Layout(
         "DB1", 1, 4, False, (Register("b", "INT", (), 0, None, 2, 1), Register("a", "INT", (), 2, None, 2, 1))
     )
@@ -204,7 +202,7 @@ def test_watch_goes_on_with_the_block_that_a_reload_has_made(instance: str) -> N
             segment.writer("cell").publish(b"\0\0\0\x08", cycle=2, source_ns=1)
             try:
                 while "cell/a  8" not in (line := watch.stdout.readline()):
-                    assert "no data yet" in line, "it may look before there is a frame"
+                    assert "no data yet" in line, "watch may read before the first frame"
                 watch.send_signal(signal.SIGINT)
                 _, err = watch.communicate(timeout=20)
             finally:
@@ -213,7 +211,7 @@ def test_watch_goes_on_with_the_block_that_a_reload_has_made(instance: str) -> N
     assert (watch.returncode, err) == (130, "")
 
 
-def test_watch_says_when_a_reload_has_taken_its_register(instance: str) -> None:
+def test_watch_ends_when_a_reload_removes_its_register(instance: str) -> None:
     other = Layout("DB1", 1, 2, False, (Register("other", "INT", (), 0, None, 2, 1),))
     spec = BlockSpec("cell", LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16)
     with Segment.create(instance, [spec], []) as segment:
@@ -236,7 +234,7 @@ def test_watch_says_when_a_reload_has_taken_its_register(instance: str) -> None:
         (("press/a", "robot/a"), "sources press, robot were"),
     ],
 )
-def test_watch_says_when_a_reload_has_removed_its_source(instance: str, patterns: tuple[str, ...], gone: str) -> None:
+def test_watch_ends_when_a_reload_removes_its_source(instance: str, patterns: tuple[str, ...], gone: str) -> None:
     names = ("cell", "press", "robot")
     specs = [BlockSpec(name, LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16) for name in names]
     with Segment.create(instance, specs, []) as segment:
@@ -280,7 +278,7 @@ def publish_times(segment: Segment, wait_ms: int) -> None:
     segment.writer("cell").publish(image.ljust(216, b"\0"), cycle=1, source_ns=1)
 
 
-def test_times_are_read_as_s7_literals_and_arrays_go_whole_into_a_pipe(
+def test_get_prints_times_as_s7_literals_and_whole_arrays_into_a_pipe(
     times: Segment, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["get", "--instance", times.instance, "cell"]) == 0
@@ -292,7 +290,7 @@ def test_times_are_read_as_s7_literals_and_arrays_go_whole_into_a_pipe(
     ]
 
 
-def test_watch_every_prints_all_again(times: Segment, capsys: pytest.CaptureFixture[str]) -> None:
+def test_watch_every_prints_all_registers_each_time(times: Segment, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--instance", times.instance, "--every", "0.01", "-n", "5", "cell/wait", "cell/day"]
     assert main(["watch", "--json", *words]) == 0
     told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
@@ -321,12 +319,12 @@ def terminal_of(*words: str) -> Terminal:
     return Terminal(sys.executable, "-P", "-c", "import sys; from shmio.cli.user import main; sys.exit(main())", *words)
 
 
-def test_on_a_terminal_watch_is_a_table_that_is_brought_up_to_date_in_place(times: Segment) -> None:
+def test_watch_on_a_terminal_updates_a_table_in_place(times: Segment) -> None:
     with terminal_of("watch", "--instance", times.instance, "--every", "0.02", "cell/wait", "cell/many") as terminal:
         first = terminal.until(r"\(all: --full\)")
         assert "cell/wait  T#1s500ms" in first
-        assert first.splitlines()[-1].count("0,") == 19, "the mark is still in the window"
-        assert "\x1b[2F" in terminal.until("cell/wait"), "it goes back up over both lines"
+        assert first.splitlines()[-1].count("0,") == 19, "the array is cut so that the mark fits"
+        assert "\x1b[2F" in terminal.until("cell/wait"), "the cursor goes up over both lines"
         publish_times(times, 7)
         terminal.until("cell/wait  T#7ms")
         terminal.process.send_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""Both clients, as a test with asyncio uses them: of the synchronous one each call is made in a thread."""
+"""Both clients for tests with asyncio: each call of the synchronous client runs in a thread."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from shmio.client import Campaign, Client, Events, Shadow, Simulation, Steps, Su
 
 _HELD: Final = (Campaign, Client, Events, Shadow, Simulation, Steps, Subscription)
 _AT_ONCE: Final = {"subscribe", "steps"} | {"close"}
-"""Methods that the asynchronous client does not await either; close: of all but those that follow."""
+"""Methods that are not awaited; ``close`` is awaited for the classes in ``_CLOSE_WAITS``."""
 _CLOSE_WAITS: Final = (Campaign, Client, Shadow)
 _OVER: Final = object()
 
 
 class Threaded:
-    """A client, or what it has given, with the methods of the asynchronous one."""
+    """The synchronous client, or one of its objects, with the asynchronous interface."""
 
     def __init__(self, held: Any) -> None:
         self._held = held
@@ -67,4 +67,4 @@ def _connect(address: str, **options: Any) -> Any:
 
 Connect = Callable[..., Any]
 BOTH: Final = pytest.mark.parametrize("connects", [_connect, connect_aio], ids=["threads", "asyncio"])
-"""A test for both: ``async with connects(address) as cell``, as of ``connect_aio``."""
+"""Runs a test with each client: ``async with connects(address) as cell``."""

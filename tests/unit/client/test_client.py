@@ -56,7 +56,7 @@ def test_values_by_path(segment: Segment, connects: Connect) -> None:
 
 
 @BOTH
-def test_a_reading_has_the_type_that_a_reload_has_given_the_register(segment: Segment, connects: Connect) -> None:
+def test_reading_has_the_type_of_the_reloaded_register(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, cell: Any) -> None:
         served.publish(image(1.5))
         (one,) = await cell.get("cell/axis/position")
@@ -69,7 +69,7 @@ def test_a_reading_has_the_type_that_a_reload_has_given_the_register(segment: Se
 
 
 @BOTH
-def test_no_step_at_all_is_refused(segment: Segment, connects: Connect) -> None:
+def test_step_of_count_zero_is_refused(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, cell: Any) -> None:
         with pytest.raises(ValueRangeError, match="at least 1, not 0"):
             await asyncio.wait_for(cell.step(count=0), 20)
@@ -78,7 +78,7 @@ def test_no_step_at_all_is_refused(segment: Segment, connects: Connect) -> None:
 
 
 @BOTH
-def test_a_bad_value_is_not_given_for_a_good_one(segment: Segment, connects: Connect) -> None:
+def test_bad_value_is_never_returned_as_good(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, cell: Any) -> None:
         with pytest.raises(QualityError, match="cell/step: no data yet"):
             await cell["cell/step"]
@@ -99,7 +99,7 @@ def test_a_bad_value_is_not_given_for_a_good_one(segment: Segment, connects: Con
 
 
 @BOTH
-def test_a_subscription_gives_what_changes_as_arrays(segment: Segment, connects: Connect) -> None:
+def test_subscription_yields_changes_as_arrays(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, cell: Any) -> None:
         served.publish(image(1.0, 2.0))
         async with cell.subscribe("cell/axis", "cell/inputs", every_frame=True) as stream:
@@ -126,9 +126,7 @@ def test_a_subscription_gives_what_changes_as_arrays(segment: Segment, connects:
 
 @BOTH
 @pytest.mark.parametrize("whole", [False, True], ids=["the stream", "the client"])
-def test_a_subscription_that_is_waited_for_ends_when_it_is_closed(
-    segment: Segment, connects: Connect, whole: bool
-) -> None:
+def test_closing_ends_a_subscription_that_is_waited_for(segment: Segment, connects: Connect, whole: bool) -> None:
     async def test(served: Endpoint, cell: Any) -> None:
         served.publish(image())
         stream = cell.subscribe("cell/axis")
@@ -145,7 +143,7 @@ def test_a_subscription_that_is_waited_for_ends_when_it_is_closed(
     with_client(segment, connects, test)
 
 
-def test_who_waits_for_an_update_may_be_cancelled(segment: Segment) -> None:
+def test_waiting_for_an_update_can_be_cancelled(segment: Segment) -> None:
     async def test(served: Endpoint, cell: Any) -> None:
         served.publish(image())
         async with cell.subscribe("cell/axis") as stream:
@@ -198,7 +196,7 @@ def test_errors_are_those_of_a_local_program(segment: Segment, connects: Connect
 
 
 @BOTH
-def test_more_than_a_message_holds_is_told_with_what_to_do(segment: Segment, connects: Connect) -> None:
+def test_too_large_message_is_refused_with_a_remedy(segment: Segment, connects: Connect) -> None:
     async def test(_: Endpoint, cell: Any) -> None:
         with pytest.raises(EndpointError, match=r"^too much for one message: give or ask for fewer values at once \("):
             await cell.write({"cell/name": "x" * (2 << 20)})
@@ -207,7 +205,7 @@ def test_more_than_a_message_holds_is_told_with_what_to_do(segment: Segment, con
 
 
 @BOTH
-def test_nobody_there(connects: Connect) -> None:
+def test_address_without_an_endpoint(connects: Connect) -> None:
     async def test() -> None:
         async with connects("127.0.0.1:1") as cell:
             with pytest.raises(RemoteError, match=r"^127\.0\.0\.1:1: no instance serves there"):
@@ -226,7 +224,7 @@ def test_nobody_there(connects: Connect) -> None:
         ("of another", "ca.pem", "its certificate does not name this host"),
     ],
 )
-def test_what_is_wrong_with_tls(tmp_path: Path, serves: str, ca: str | None, told: str) -> None:
+def test_tls_faults_are_named(tmp_path: Path, serves: str, ca: str | None, told: str) -> None:
     authority = trustme.CA()
     authority.cert_pem.write_to_path(tmp_path / "ca.pem")
     trustme.CA().cert_pem.write_to_path(tmp_path / "other.pem")
@@ -251,7 +249,7 @@ def test_what_is_wrong_with_tls(tmp_path: Path, serves: str, ca: str | None, tol
         server.stop(None).wait()
 
 
-def test_a_token_goes_to_another_host_by_tls() -> None:
+def test_token_for_another_host_needs_tls() -> None:
     for connects in (connect, connect_aio):
         with pytest.raises(ValueRangeError, match=r"^plant\.example:8089: a token is not sent to another host"):
             connects("plant.example:8089", token="secret")

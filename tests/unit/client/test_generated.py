@@ -1,4 +1,4 @@
-"""The synchronous client is what the script makes of the asynchronous one."""
+"""The synchronous client equals what the script generates from the asynchronous one."""
 
 from __future__ import annotations
 

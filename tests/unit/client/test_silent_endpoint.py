@@ -1,4 +1,4 @@
-"""An endpoint that takes calls and answers none: nobody waits for ever."""
+"""An endpoint that accepts calls but never answers: every call times out."""
 
 from __future__ import annotations
 
@@ -48,9 +48,7 @@ def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     ],
     ids=["layouts", "read", "inject", "declare"],
 )
-def test_a_call_that_is_not_answered_ends(
-    silent: str, connects: Connect, ask: Callable[[Any], Awaitable[object]]
-) -> None:
+def test_unanswered_call_times_out(silent: str, connects: Connect, ask: Callable[[Any], Awaitable[object]]) -> None:
     async def test() -> None:
         async with connects(silent, timeout_s=0.1) as client:
             with pytest.raises(RemoteError, match="answer"):

@@ -1,4 +1,4 @@
-"""Tokens: read from files that are their user's alone, and never told."""
+"""Tokens: read only from private files, and never shown."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def file(tmp_path: Path) -> Path:
     return file
 
 
-def test_a_file_and_a_hash_are_the_same_token(file: Path) -> None:
+def test_file_and_hash_give_the_same_token(file: Path) -> None:
     expected = hashlib.sha256(SECRET.encode()).hexdigest()
     (one,), (other,) = read_tokens([token(file)]), read_tokens([token(sha256=expected)])
     assert one == other
@@ -37,7 +37,7 @@ def test_a_file_and_a_hash_are_the_same_token(file: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o644, 0o620])
-def test_a_file_that_others_can_reach_is_refused(file: Path, mode: int) -> None:
+def test_file_that_other_users_can_access_is_refused(file: Path, mode: int) -> None:
     file.chmod(mode)
     with pytest.raises(
         ConfigError, match=rf"token_file: .*mode {mode:04o} lets other users read it: chmod 600, and a new token"
@@ -48,14 +48,14 @@ def test_a_file_that_others_can_reach_is_refused(file: Path, mode: int) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"short", b"a" * 1025, b"a b" * 10, SECRET.encode() * 2 + b"\nanother\n", b"\xff" * 32, b"\0" * 32]
 )
-def test_what_is_no_token_is_refused_and_not_told(file: Path, content: bytes) -> None:
+def test_invalid_token_is_refused_and_not_shown(file: Path, content: bytes) -> None:
     file.write_bytes(content)
     with pytest.raises(ConfigError, match=r"grpc\.token\[0\]\.token_file: .*openssl rand -hex 32") as caught:
         read_tokens([token(file)])
     assert SECRET not in str(caught.value)
 
 
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+def test_path_without_a_regular_file_is_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe", 0o600)
     for name, why in (("none", "No such file"), ("pipe", "not a file"), (".", "not a file")):
         with pytest.raises(ConfigError, match=rf"token_file: .*: {why}"):

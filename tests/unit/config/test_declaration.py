@@ -1,4 +1,4 @@
-"""Declared injections in files: what they may say, and errors that name the key in full."""
+"""Declared injections in files: valid keys, and errors that name the full key."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_campaign_is_read(tmp_path: Path) -> None:
     assert (drift.name, drift.target, drift.value, drift.start_s, drift.end_s) == ("drift", "cell/a", 1.5, 1, 2.5)
 
 
-def test_the_configuration_has_them_too(tmp_path: Path) -> None:
+def test_configuration_may_declare_injections(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text('[instance]\nname = "x"\n' + GOOD)
     assert [declared.name for declared in load(tmp_path / "s.toml").injection] == ["drift"]
     (tmp_path / "s.toml").write_text('[instance]\nname = "x"\n' + GOOD + "speed = 1\n")
@@ -70,7 +70,7 @@ def test_errors_name_the_key(tmp_path: Path, old: str, new: str, message: str) -
     assert "\n" not in str(refused.value)
 
 
-def test_a_name_is_given_once(tmp_path: Path) -> None:
+def test_duplicate_name_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"injection\[1\]\.name: 'drift' is already the name of injection\[0\]"):
         campaign(tmp_path, GOOD + GOOD)
 
@@ -89,7 +89,7 @@ def test_a_name_is_given_once(tmp_path: Path) -> None:
         ("set", {"value": [[[[[[[[1]]]]]]]]}, "value: lists within more than 6 others"),
     ],
 )
-def test_operands_go_with_their_operation(operation: str, keys: dict[str, object], message: str) -> None:
+def test_operands_must_fit_the_operation(operation: str, keys: dict[str, object], message: str) -> None:
     declared = msgspec.convert({"name": "x", "target": "a", "operation": operation, **keys}, Declaration)
     assert next(contradictions(declared)).startswith(message)
 
@@ -101,7 +101,7 @@ KEY_NAMES = sorted(
 
 
 @given(st.sampled_from(sorted(KEYS)), st.dictionaries(st.sampled_from(KEY_NAMES), values, max_size=5))
-def test_what_is_not_complained_of_can_be_sent(operation: str, keys: dict[str, object]) -> None:
+def test_accepted_declaration_survives_json(operation: str, keys: dict[str, object]) -> None:
     try:
         declared = msgspec.convert({"name": "x", "target": "a", "operation": operation, **keys}, Declaration)
     except msgspec.ValidationError:

@@ -1,4 +1,7 @@
-"""All faults of a configuration are told in one go, with their lines; hostile files cost little and are bounded."""
+"""All faults of a configuration are reported together, with their lines.
+
+A hostile file causes a bounded number of lines.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +64,7 @@ def refused(folder: Path, text: str) -> list[str]:
     return [line.replace(str(file), "F") for line in str(caught.value).split("\n")]
 
 
-def test_all_faults_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
+def test_all_faults_are_reported_together_with_their_lines(tmp_path: Path) -> None:
     assert refused(tmp_path, MANY) == [
         "F:3: instance.clock: 'Wall' is unknown; valid: wall, stepped; did you mean wall?",
         "F:4: instance.ring: unknown key; did you mean ring_mb?",
@@ -91,7 +94,7 @@ def test_all_faults_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
     ]
 
 
-def test_a_fault_in_a_properties_file_is_told_with_its_line_there(tmp_path: Path) -> None:
+def test_fault_in_a_properties_file_has_its_line(tmp_path: Path) -> None:
     (tmp_path / "plc.ini").write_text("# PLC\nhosst=10.0.0.1\nport=eleven\n")
     source = '[[source]]\nname = "c"\nconnector = "s7"\nlayout = "x.db"\nproperties = "plc.ini"\nperiod_ms = -1\n'
     file = tmp_path / "supervisor.toml"
@@ -117,7 +120,7 @@ def test_a_fault_in_a_properties_file_is_told_with_its_line_there(tmp_path: Path
         ("[instanse]\n", "instanse: unknown key; did you mean instance?"),
     ],
 )
-def test_a_slip_is_told_with_what_to_write(tmp_path: Path, text: str, said: str) -> None:
+def test_common_mistake_is_reported_with_the_correction(tmp_path: Path, text: str, said: str) -> None:
     [line] = refused(tmp_path, HEAD + text)
     assert said in line
 

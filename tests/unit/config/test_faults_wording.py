@@ -1,4 +1,4 @@
-"""What ``explain`` reads in the errors of msgspec, whose words are no promise of that library."""
+"""The wording of msgspec's errors, which ``explain`` parses and msgspec does not guarantee."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Sample(msgspec.Struct, forbid_unknown_fields=True):
         ([], "Expected `object`, got `array`", "expected a table, got a list in [ ]"),
     ],
 )
-def test_the_words_of_msgspec_are_those_that_explain_reads(value: Any, words: str, wanted: str) -> None:
+def test_msgspec_words_its_errors_as_explain_expects(value: Any, words: str, wanted: str) -> None:
     with pytest.raises(msgspec.ValidationError) as caught:
         msgspec.convert(value, Sample)
     assert str(caught.value) == words, (

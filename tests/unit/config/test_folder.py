@@ -1,4 +1,4 @@
-"""Whether a folder can be written: as who writes there will find it, and with nothing left behind."""
+"""The check whether this user can write to a folder, which leaves nothing behind."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from shmio.config.folder import Obstacle, unwritable
 
 
 @pytest.mark.parametrize("place", ["", "new", "new/and/deeper"])
-def test_one_that_can_be_written_stays_as_it_is(place: str, tmp_path: Path) -> None:
+def test_writable_folder_is_left_unchanged(place: str, tmp_path: Path) -> None:
     assert unwritable(tmp_path / place) is None
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("kind", [errno.EOPNOTSUPP, errno.EISDIR])
-def test_a_file_system_without_unnamed_files_is_tried_with_one_that_has_a_name(
+def test_named_file_is_tried_where_unnamed_files_are_not_supported(
     kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     really, made = os.open, []
@@ -45,7 +45,7 @@ def test_a_file_system_without_unnamed_files_is_tried_with_one_that_has_a_name(
         (errno.EIO, "Input/output error"),
     ],
 )
-def test_what_is_wrong_is_told_with_what_to_do(
+def test_obstacle_is_reported_with_a_remedy(
     number: int, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object, **__: object) -> int:
@@ -59,7 +59,7 @@ def test_what_is_wrong_is_told_with_what_to_do(
         assert found.full == ("make room" in told)
 
 
-def test_a_file_system_that_takes_no_files_is_found_out_as_root_too(tmp_path: Path) -> None:
+def test_file_system_without_files_is_found_even_as_root(tmp_path: Path) -> None:
     for folder in ("/proc", "/proc/logs"):
         assert "its file system takes no files: choose another folder" in str(unwritable(Path(folder)))
     (tmp_path / "file").touch()

@@ -1,4 +1,4 @@
-"""Addresses, tokens and roles of ``[grpc]``: what is accepted, what each address gives, how what is not is named."""
+"""Addresses, tokens and roles of ``[grpc]``: the roles that each address gives, and errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def read(folder: Path, text: str) -> Grpc:
 
 
 def served(grpc: Grpc) -> list[tuple[set[str], bool, bool]]:
-    """Of each address: roles of who shows nothing, whether it is encrypted, whether it takes tokens."""
+    """Return (roles without credentials, encrypted, accepts tokens) for each address."""
     return [(set(at.roles), encrypted(grpc, at), takes_tokens(grpc, at)) for at in grpc.listening.values()]
 
 
@@ -104,7 +104,7 @@ def test_each_address_gives_its_roles(tmp_path: Path, text: str, expected: list[
         ),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
+def test_fault_is_named_by_its_key(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         read(tmp_path, text)
     assert "hunter2" not in str(caught.value)
@@ -117,7 +117,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     assert parse_address(grpc.listen[1]) == UnixAddress("/abs/s")
 
 
-def test_a_folder_with_a_long_name_leaves_no_room_for_a_socket(tmp_path: Path) -> None:
+def test_long_folder_name_makes_a_socket_path_too_long(tmp_path: Path) -> None:
     folder = tmp_path / ("x" * 100)
     folder.mkdir()
     with pytest.raises(ConfigError, match=r"grpc\.listen\[0\]: unix:.*longer than the 107 bytes"):

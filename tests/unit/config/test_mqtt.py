@@ -1,4 +1,4 @@
-"""``[mqtt]``: what is accepted, where the broker is, how what is not accepted is named."""
+"""``[mqtt]``: defaults, the address of the broker, accounts, and errors."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def read(folder: Path, text: str) -> Mqtt:
     return mqtt
 
 
-def test_what_is_not_written_has_its_default(tmp_path: Path) -> None:
+def test_missing_keys_have_defaults(tmp_path: Path) -> None:
     mqtt = read(tmp_path, OWN)
     assert (mqtt.broker, mqtt.prefix, mqtt.keep_alive_s, mqtt.session_expiry_s) == ("embedded", "shmio/a", 30, 0)
     assert mqtt.password_file is None
 
 
-def test_paths_are_those_of_the_file(tmp_path: Path) -> None:
+def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     mqtt = read(tmp_path, f'{EXTERNAL}host = "b"\nusername = "u"\npassword_file = "p"\n{TLS}')
     assert mqtt.password_file == str(tmp_path / "p")
     assert mqtt.tls is not None
@@ -51,7 +51,7 @@ def test_paths_are_those_of_the_file(tmp_path: Path) -> None:
         ('host = "[::1]:9"', ["[::1]:9"]),
     ],
 )
-def test_where_an_external_broker_is(tmp_path: Path, text: str, expected: list[str]) -> None:
+def test_address_of_an_external_broker(tmp_path: Path, text: str, expected: list[str]) -> None:
     assert [str(address) for address in brokers(read(tmp_path, f"{EXTERNAL}{text}\n"))] == expected
 
 
@@ -123,19 +123,19 @@ def test_where_an_external_broker_is(tmp_path: Path, text: str, expected: list[s
         (f'{OWN}[[source]]\nname = "broker"\nconnector = "memory"\n', "is the name of one of shmio's processes"),
     ],
 )
-def test_what_will_not_do_is_named(tmp_path: Path, text: str, told: str) -> None:
+def test_fault_is_named_by_its_key(tmp_path: Path, text: str, told: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read(tmp_path, text)
     assert told in str(caught.value)
 
 
-def test_topics_beside_the_instances_own_may_be_anybodys(tmp_path: Path) -> None:
+def test_accounts_may_publish_on_topics_outside_the_instance(tmp_path: Path) -> None:
     topics = ["shmio/b/#", "shmio", "homeassistant/+/x", "spBv1.0/g/+/b/#"]
     mqtt = read(tmp_path, f'{OWN}{ACCOUNT}["write"]\npublish = {topics}\n[mqtt.sparkplug]\ngroup = "g"\n')
     assert mqtt.account[0].publish == topics
 
 
-def test_an_account_with_roles_has_a_password(tmp_path: Path) -> None:
+def test_account_with_roles_needs_a_password(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"mqtt\.account\[1\]\.name: 'bert' has no line"):
         read_accounts(secret(tmp_path, "anna:x\n"), [MqttAccount(roles=["read"], name=one) for one in ("anna", "bert")])
 
@@ -171,13 +171,13 @@ def test_accounts_are_hashed_as_mosquitto_does(tmp_path: Path) -> None:
         ("anna:$7$101$c2Fs*A==$aGFzaA==\n", "or damaged hash: use mosquitto_passwd -H sha512-pbkdf2"),
     ],
 )
-def test_accounts_that_will_not_do_are_named_and_not_shown(tmp_path: Path, text: str, told: str) -> None:
+def test_invalid_account_is_refused_and_not_shown(tmp_path: Path, text: str, told: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read_accounts(secret(tmp_path, text))
     assert told in str(caught.value)
 
 
-def test_a_password_is_the_first_line_of_a_file_that_nobody_else_reads(tmp_path: Path) -> None:
+def test_password_is_the_first_line_of_a_private_file(tmp_path: Path) -> None:
     assert read_password(secret(tmp_path, "se cret\r\nand more\n")) == "se cret"
     for text, mode, told in (("x\n", 0o644, "chmod 600"), ("\n", 0o600, "is empty")):
         with pytest.raises(ConfigError, match=told):

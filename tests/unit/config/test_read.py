@@ -1,4 +1,4 @@
-"""``supervisor.toml``: what is accepted, and how what is not is named."""
+"""``supervisor.toml``: valid configurations, and errors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def written(folder: Path, text: str) -> Path:
     return file
 
 
-def test_the_whole_contract_is_read(folder: Path) -> None:
+def test_all_sections_are_read(folder: Path) -> None:
     config = load(written(folder, WHOLE))
     assert (config.instance.name, config.instance.group, config.instance.ring_mb) == ("a50", "twins", 8)
     assert config.instance.clock == "wall"
@@ -94,7 +94,9 @@ def test_a_layout_may_be_several_files(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("period_ms", "stale_ms"), [(20, 500), (1, 500), (1000, 5000)])
-def test_a_frame_is_stale_after_five_periods_and_half_a_second(folder: Path, period_ms: int, stale_ms: int) -> None:
+def test_default_stale_time_is_five_periods_but_at_least_half_a_second(
+    folder: Path, period_ms: int, stale_ms: int
+) -> None:
     text = WHOLE.replace("period_ms = 20", f"period_ms = {period_ms}")
     assert load(written(folder, text)).source[0].stale_ns == stale_ms * 1_000_000
     text = text.replace("armed = false", "stale_ms = 2400")
@@ -180,7 +182,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
         ('"var/log"', '"var\\u0000log"', r"instance\.log_dir: must not contain control characters"),
     ],
 )
-def test_what_is_wrong_is_refused_by_its_full_key(folder: Path, old: str, new: str, message: str) -> None:
+def test_fault_is_named_by_its_full_key(folder: Path, old: str, new: str, message: str) -> None:
     assert old in WHOLE
     with pytest.raises(ConfigError, match=message) as caught:
         load(written(folder, WHOLE.replace(old, new, 1)))
@@ -205,7 +207,7 @@ def test_what_is_wrong_is_refused_by_its_full_key(folder: Path, old: str, new: s
     ],
 )
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_a_slip_in_toml_is_shown_with_what_to_write(folder: Path, old: str, new: str, said: str, end: str) -> None:
+def test_toml_mistake_is_shown_with_the_correction(folder: Path, old: str, new: str, said: str, end: str) -> None:
     assert old in WHOLE
     (folder / "supervisor.toml").write_text(WHOLE.replace(old, new, 1), newline=end)
     with pytest.raises(ConfigError, match=r"not TOML: .* \(at line \d+, column \d+\): ") as caught:
@@ -214,7 +216,7 @@ def test_a_slip_in_toml_is_shown_with_what_to_write(folder: Path, old: str, new:
     assert "\n" not in str(caught.value)
 
 
-def test_plain_text_off_host_must_be_written_down(folder: Path) -> None:
+def test_plain_text_to_other_hosts_needs_insecure(folder: Path) -> None:
     text = WHOLE.replace('"127.0.0.1:8089"', '"0.0.0.0:8089"')
     with pytest.raises(ConfigError, match="insecure"):
         load(written(folder, text))
@@ -226,7 +228,7 @@ def test_a_missing_file_is_named_with_the_remedy(tmp_path: Path) -> None:
         load(tmp_path / "nowhere.toml")
 
 
-def test_bytes_that_are_no_text_are_refused(folder: Path) -> None:
+def test_file_that_is_not_utf8_or_too_large_is_refused(folder: Path) -> None:
     (folder / "supervisor.toml").write_bytes(b"name = '\xff'")
     with pytest.raises(ConfigError, match="not UTF-8 at byte 8; save the file as UTF-8"):
         load(folder / "supervisor.toml")
@@ -243,7 +245,7 @@ def test_bytes_that_are_no_text_are_refused(folder: Path) -> None:
     ("text", "message"),
     [("host", r":1: expected key=value"), ("a=1\n=2", r":2: expected"), ("a=1\n\na=2", r":3: a is given twice")],
 )
-def test_a_wrong_line_of_the_properties_is_named(folder: Path, text: str, message: str) -> None:
+def test_faulty_line_of_the_properties_is_named(folder: Path, text: str, message: str) -> None:
     (folder / "plc.ini").write_text(text)
     with pytest.raises(ConfigError, match=r"source\[0\]\.properties.*" + message):
         load(written(folder, WHOLE))
@@ -254,7 +256,7 @@ def test_properties_may_have_comments_sections_and_a_bom(folder: Path) -> None:
     assert load(written(folder, WHOLE)).source[0].texts == {"host": "a = b"}
 
 
-def test_an_unknown_option_of_a_connector_gets_the_nearest_name() -> None:
+def test_unknown_option_is_refused_with_the_nearest_name() -> None:
     known = ["host", "packetSize"]
     assert unknown_option(1, "packetsize", known) == "source[1].packetsize: unknown key; did you mean packetSize?"
     assert "did you mean period_ms?" in unknown_option(0, "perid_ms", known)
@@ -282,12 +284,12 @@ def test_any_text_is_read_or_refused(folder: Path, text: str) -> None:
         ("localhost.evil.example:1", False),
     ],
 )
-def test_addresses_know_whether_they_leave_the_host(text: str, loopback: bool) -> None:
+def test_address_knows_if_it_is_loopback(text: str, loopback: bool) -> None:
     address = Address.parse(text)
     assert (str(address), address.loopback) == (text, loopback)
 
 
 @pytest.mark.parametrize("text", ["", ":1", "host", "host:", "host:-1", "host:٣", "host:65536", "::1:5"])
-def test_what_is_no_address_is_refused(text: str) -> None:
+def test_invalid_address_is_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         Address.parse(text)

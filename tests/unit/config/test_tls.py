@@ -1,4 +1,4 @@
-"""The endpoint's PEM files: which one will not do, and why."""
+"""The endpoint's PEM files: errors name the unusable file and the reason."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def authority() -> trustme.CA:
 
 @pytest.fixture
 def files(tmp_path: Path, authority: trustme.CA) -> Path:
-    """A folder with what is right and what is not."""
+    """A folder with usable and unusable files."""
     server, other = authority.issue_cert("localhost"), authority.issue_cert("localhost")
     server.cert_chain_pems[0].write_to_path(tmp_path / "certificate")
     server.private_key_pem.write_to_path(tmp_path / "key")
@@ -41,7 +41,7 @@ def tls(files: Path, certificate: str, key: str, client_ca: str | None) -> Tls:
 
 
 @pytest.mark.parametrize("client_ca", [None, "ca"])
-def test_what_will_do_is_read(files: Path, client_ca: str | None) -> None:
+def test_usable_files_are_read(files: Path, client_ca: str | None) -> None:
     read = read_tls(tls(files, "certificate", "key", client_ca))
     assert read.certificate == (files / "certificate").read_bytes()
     assert read.key == (files / "key").read_bytes()
@@ -65,8 +65,6 @@ def test_what_will_do_is_read(files: Path, client_ca: str | None) -> None:
         ("certificate", "key", "none", r"client_ca: .*none: No such file"),
     ],
 )
-def test_what_will_not_do_is_named(
-    files: Path, certificate: str, key: str, client_ca: str | None, message: str
-) -> None:
+def test_unusable_file_is_named(files: Path, certificate: str, key: str, client_ca: str | None, message: str) -> None:
     with pytest.raises(ConfigError, match=rf"^grpc\.tls\.{message}"):
         read_tls(tls(files, certificate, key, client_ca))

@@ -1,4 +1,4 @@
-"""The file of a UNIX socket: what is in its way, who may open it, when it goes."""
+"""The file of a UNIX socket: what stands in its place, its permissions, and its removal."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def bound(path: Path) -> socket.socket:
     return listener
 
 
-def test_what_a_dead_process_left_is_cleared(tmp_path: Path) -> None:
+def test_socket_of_a_dead_process_is_removed(tmp_path: Path) -> None:
     path = tmp_path / "s"
     clear(str(path))
     bound(path).close()
@@ -31,17 +31,17 @@ def test_what_a_dead_process_left_is_cleared(tmp_path: Path) -> None:
     assert not path.exists()
 
 
-def test_what_a_living_one_has_is_not_taken(tmp_path: Path) -> None:
+def test_socket_of_a_living_process_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "s"
     with bound(path) as listener:
         listener.listen(0)
-        for _ in range(3):  # its queue is full by then
+        for _ in range(3):  # the later attempts find the queue full
             with pytest.raises(EndpointError, match=rf"unix:{path}: another program listens there.*ss -xlp"):
                 clear(str(path))
     assert path.is_socket()
 
 
-def test_what_another_user_left_in_a_folder_for_all_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_socket_that_cannot_be_removed_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "s"
     bound(path).close()
 
@@ -53,7 +53,7 @@ def test_what_another_user_left_in_a_folder_for_all_is_told(tmp_path: Path, monk
         clear(str(path))
 
 
-def test_what_is_no_socket_is_left(tmp_path: Path) -> None:
+def test_file_that_is_no_socket_is_kept(tmp_path: Path) -> None:
     for name in ("file", "link"):
         path = tmp_path / name
         path.write_text("precious") if name == "file" else path.symlink_to(tmp_path / "file")
@@ -65,19 +65,21 @@ def test_what_is_no_socket_is_left(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("gid", "mode"), [(None, 0o600), (os.getegid(), 0o660)])
-def test_its_user_may_open_it_and_maybe_a_group(tmp_path: Path, gid: int | None, mode: int) -> None:
+def test_permissions_for_the_user_and_a_group(tmp_path: Path, gid: int | None, mode: int) -> None:
     path = tmp_path / "s"
-    before = os.umask(0)  # as open as it gets
+    before = os.umask(0)  # the most permissive
     try:
         file = SocketFile(str(path), gid)
         with file.binding() as place, bound(Path(place)) as listener:
             assert not path.exists()
             (folder,) = tmp_path.iterdir()
-            assert stat.S_IMODE(folder.stat().st_mode) == 0o700, "nobody else comes to it before it has its mode"
+            assert stat.S_IMODE(folder.stat().st_mode) == 0o700, (
+                "no other user can reach the socket before it has its mode"
+            )
             listener.listen(1)
         assert stat.S_IMODE(path.stat().st_mode) == mode
         assert path.stat().st_gid == os.getegid()
-        assert os.umask(0) == 0, "which all threads share"
+        assert os.umask(0) == 0, "the umask, which all threads share, is unchanged"
     finally:
         os.umask(before)
     assert list(tmp_path.iterdir()) == [path]
@@ -86,7 +88,7 @@ def test_its_user_may_open_it_and_maybe_a_group(tmp_path: Path, gid: int | None,
     file.remove()
 
 
-def test_its_path_may_be_as_long_as_a_socket_s(tmp_path: Path) -> None:
+def test_path_may_have_the_full_length_of_a_socket_address(tmp_path: Path) -> None:
     path = tmp_path / ("s" * (MAX_PATH_BYTES - len(str(tmp_path)) - 1))
     file = SocketFile(str(path), None)
     with file.binding() as place:
@@ -94,7 +96,7 @@ def test_its_path_may_be_as_long_as_a_socket_s(tmp_path: Path) -> None:
     assert path.is_socket()
 
 
-def test_what_has_come_there_meanwhile_stays(tmp_path: Path) -> None:
+def test_socket_that_appears_during_binding_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "s"
     file = SocketFile(str(path), None)
     other = bound(tmp_path / "other")
@@ -111,12 +113,12 @@ def test_what_has_come_there_meanwhile_stays(tmp_path: Path) -> None:
     assert path.is_socket()
 
 
-def test_another_ones_socket_of_that_name_stays(tmp_path: Path) -> None:
+def test_removal_keeps_the_socket_of_another_process(tmp_path: Path) -> None:
     path = tmp_path / "s"
     file = SocketFile(str(path), None)
     with file.binding() as place:
         bound(Path(place)).close()
-    path.rename(tmp_path / "old")  # so that its inode is not given to the next
+    path.rename(tmp_path / "old")  # keeps the inode, so that the next socket gets another
     with bound(path):
         file.remove()
         assert path.is_socket()

@@ -1,4 +1,4 @@
-"""What becomes of commands: judged at once, carried out once a cycle, each with an end that is true."""
+"""Commands: judged at once, carried out once a cycle, each with a true outcome."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ class Bench:
         return event
 
     def accepted(self, *writes: Write, deadline_ns: int = FAR) -> int:
-        """Send, and wait until it is among what waits for the cycle."""
+        """Send a command, wait until it is queued for the next cycle, and return its number."""
         number = self.send(*writes, deadline_ns=deadline_ns)
         for place in range(len(writes)):
             event = self.event()
             assert (event.kind, event.command, event.item) == (EventKind.ACCEPTED, number, place)
-        # Accepted is told before it waits; the next command is judged after both.
+        # The event comes before the command is queued; the next command is judged after both.
         self.send(Write(4, 0, b"\0\0"))
         assert self.event().kind == EventKind.REJECTED
         return number
@@ -117,7 +117,7 @@ def test_a_command_is_accepted_carried_out_and_confirmed(bench: Bench) -> None:
     assert not bench.processor.waiting
 
 
-def test_a_note_is_an_event_whatever_the_device_does(bench: Bench) -> None:
+def test_note_is_an_event_even_without_the_device(bench: Bench) -> None:
     bench.processor.close("cable out")
     number = bench.sender.submit([], FAR, CommandKind.NOTE, name="Greifer getauscht")
     event = bench.event()
@@ -125,18 +125,18 @@ def test_a_note_is_an_event_whatever_the_device_does(bench: Bench) -> None:
     assert (event.data, event.size, event.items) == (b"", 0, 1)
 
 
-def test_a_note_that_comes_too_late_is_not_taken(bench: Bench) -> None:
+def test_late_note_is_rejected(bench: Bench) -> None:
     bench.now_ns = FAR
     bench.sender.submit([], FAR - 1, CommandKind.NOTE, name="late")
     assert bench.event().kind == EventKind.REJECTED
 
 
-def test_of_one_cycle_the_last_value_wins_and_is_written_once(bench: Bench) -> None:
+def test_last_value_of_a_cycle_wins_and_is_written_once(bench: Bench) -> None:
     first = bench.accepted(Write(0, 0, b"\0\1"), Write(2, 1, b"\1"))
     second = bench.accepted(Write(0, 0, b"\0\2"))
     device: list[Write] = []
     bench.processor.carry_out(confirm(device))
-    assert device == [Write(2, 1, b"\1"), Write(0, 0, b"\0\2")], "in the order of what counts"
+    assert device == [Write(2, 1, b"\1"), Write(0, 0, b"\0\2")], "in the order of the writes that count"
     ends = [bench.event() for _ in range(3)]
     assert [(end.command, end.item, end.kind, end.text) for end in ends] == [
         (first, 0, EventKind.WRITTEN, "superseded by a later write of the same cycle"),
@@ -166,7 +166,7 @@ def test_neighbouring_bits_of_two_writers_both_arrive(bench: Bench, writer: Bloc
         (Write(2**32 - 1, 0, b"\0\0"), "lies outside the block"),
     ],
 )
-def test_what_must_not_be_written_is_rejected_as_a_whole(bench: Bench, write: Write, reason: str) -> None:
+def test_command_with_a_forbidden_write_is_rejected_as_a_whole(bench: Bench, write: Write, reason: str) -> None:
     number = bench.send(Write(0, 0, b"\0\0"), write)
     event = bench.event()
     assert (event.kind, event.command, event.items) == (EventKind.REJECTED, number, 2)
@@ -174,7 +174,7 @@ def test_what_must_not_be_written_is_rejected_as_a_whole(bench: Bench, write: Wr
     assert not bench.processor.waiting
 
 
-def test_a_command_for_the_process_before_is_rejected(writer: BlockWriter, instance: str) -> None:
+def test_command_for_an_earlier_process_is_rejected(writer: BlockWriter, instance: str) -> None:
     sender = CommandSender(writer.block, 4)
     sender.submit([Write(0, 0, b"\0\0")], FAR)
     with Segment.open(instance, writable=True) as segment:
@@ -190,14 +190,14 @@ def test_a_command_for_the_process_before_is_rejected(writer: BlockWriter, insta
         assert "for an earlier process of the source" in last.text
 
 
-def test_a_command_that_comes_too_late_is_rejected(bench: Bench) -> None:
+def test_late_command_is_rejected(bench: Bench) -> None:
     bench.now_ns = 5_000_000
     bench.send(Write(0, 0, b"\0\0"), deadline_ns=2_000_000)
     event = bench.event()
     assert (event.kind, event.text) == (EventKind.REJECTED, "it came 3 ms after its deadline")
 
 
-def test_what_no_cycle_carried_out_in_time_expires(bench: Bench) -> None:
+def test_command_that_no_cycle_carries_out_in_time_expires(bench: Bench) -> None:
     number = bench.accepted(Write(0, 0, b"\0\0"), deadline_ns=1_000)
     bench.now_ns = 2_000
     device: list[Write] = []
@@ -207,7 +207,7 @@ def test_what_no_cycle_carried_out_in_time_expires(bench: Bench) -> None:
     assert device == []
 
 
-def test_at_its_very_deadline_a_command_is_carried_out(bench: Bench) -> None:
+def test_command_is_carried_out_exactly_at_its_deadline(bench: Bench) -> None:
     bench.now_ns = 1_000
     number = bench.accepted(Write(0, 0, b"\1\2"), deadline_ns=1_000)
     device: list[Write] = []
@@ -217,7 +217,7 @@ def test_at_its_very_deadline_a_command_is_carried_out(bench: Bench) -> None:
     assert device == [Write(0, 0, b"\1\2")]
 
 
-def test_nothing_is_accepted_while_the_device_is_away_and_nothing_done_when_it_is_back(bench: Bench) -> None:
+def test_disconnection_expires_waiting_commands_and_rejects_new_ones(bench: Bench) -> None:
     number = bench.accepted(Write(0, 0, b"\0\0"))
     bench.processor.close("cable out")
     event = bench.event()
@@ -230,7 +230,7 @@ def test_nothing_is_accepted_while_the_device_is_away_and_nothing_done_when_it_i
     bench.accepted(Write(0, 0, b"\0\0"))
 
 
-def test_a_lost_connection_leaves_the_end_unknown(bench: Bench) -> None:
+def test_lost_connection_leaves_the_outcome_unknown(bench: Bench) -> None:
     bench.accepted(Write(0, 0, b"\0\0"))
 
     def lost(_: Sequence[Write]) -> list[str]:
@@ -242,8 +242,8 @@ def test_a_lost_connection_leaves_the_end_unknown(bench: Bench) -> None:
     assert (event.kind, event.text) == (EventKind.UNKNOWN, "sent, but not confirmed: cut")
 
 
-def test_of_a_lost_batch_each_item_has_the_end_that_is_known(bench: Bench) -> None:
-    """Confirmed and refused before the loss, under way at that moment, never sent; one is superseded."""
+def test_each_item_of_a_lost_batch_has_its_known_outcome(bench: Bench) -> None:
+    """Items are written, refused, under way at the loss, never sent, or superseded."""
     first = bench.accepted(Write(0, 0, b"\0\0"), Write(6, 0, b"a"), Write(8, 0, b"b"), Write(10, 0, b"c"))
     second = bench.accepted(Write(10, 0, b"d"), Write(2, 1, b"\1"), Write(2, 2, b"\2"))
 
@@ -263,8 +263,8 @@ def test_of_a_lost_batch_each_item_has_the_end_that_is_known(bench: Bench) -> No
     ]
 
 
-def test_an_item_of_which_a_part_was_done_is_not_expired(bench: Bench) -> None:
-    """The bytes that a later item did not take were written, the others were not."""
+def test_partly_written_item_is_unknown_not_expired(bench: Bench) -> None:
+    """Its first two bytes are written; a later item, which is not sent, supersedes the others."""
     bench.accepted(Write(6, 0, b"abcd"))
     bench.accepted(Write(8, 0, b"xy"))
 
@@ -278,7 +278,7 @@ def test_an_item_of_which_a_part_was_done_is_not_expired(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("lost", [True, False])
-def test_of_a_connector_that_tells_too_little_nothing_is_known(bench: Bench, lost: bool) -> None:
+def test_too_few_outcomes_leave_all_items_unknown(bench: Bench, lost: bool) -> None:
     number = bench.send(Write(0, 0, b"\0\1"), Write(6, 0, b"\1"))
     for _ in range(2):
         assert bench.event().kind == EventKind.ACCEPTED
@@ -294,7 +294,7 @@ def test_of_a_connector_that_tells_too_little_nothing_is_known(bench: Bench, los
     assert (end.command, end.item, end.items, end.kind) == (number, 0, 2, EventKind.UNKNOWN)
 
 
-def test_the_refusal_of_one_item_is_told_of_that_item(bench: Bench) -> None:
+def test_refusal_concerns_only_its_item(bench: Bench) -> None:
     bench.accepted(Write(0, 0, b"\0\0"), Write(2, 1, b"\1"), Write(2, 2, b"\2"), Write(6, 0, b"\0"))
     bench.processor.carry_out(lambda writes: ["access denied" if write.mask == 2 else "" for write in writes])
     ends = [bench.event() for _ in range(3)]
@@ -305,7 +305,7 @@ def test_the_refusal_of_one_item_is_told_of_that_item(bench: Bench) -> None:
     ]
 
 
-def test_a_long_write_is_told_in_parts(bench: Bench) -> None:
+def test_long_write_is_reported_in_parts(bench: Bench) -> None:
     data = bytes(range(256)) + bytes(44)
     bench.send(Write(6, 0, data))
     first, second = bench.event(), bench.event()
@@ -313,7 +313,7 @@ def test_a_long_write_is_told_in_parts(bench: Bench) -> None:
     assert [(part.item, part.offset, part.size) for part in (first, second)] == [(0, 6, 256), (0, 262, 44)]
 
 
-def test_what_waits_has_a_bound_and_the_rest_its_turn(bench: Bench) -> None:
+def test_number_of_waiting_items_is_bounded_and_the_rest_is_accepted_later(bench: Bench) -> None:
     numbers = [bench.send(*[Write(0, 0, b"\0\0")] * 100) for _ in range(5)]
     device: list[Write] = []
     seen: list[tuple[int, EventKind]] = []
@@ -327,15 +327,17 @@ def test_what_waits_has_a_bound_and_the_rest_its_turn(bench: Bench) -> None:
     assert len(bench.processor._items) <= MAX_WAITING
     for commands in (2, 4, 5):
         until(commands)
-        while not bench.processor.waiting:  # accepted is told before it waits
+        while not bench.processor.waiting:  # the event comes before the command is queued
             pass
         bench.processor.carry_out(confirm(device))
     accepted = [command for command, kind in seen if kind is EventKind.ACCEPTED]
     assert accepted == [number for number in numbers for _ in range(100)]
 
 
-def test_what_waits_has_a_bound_in_bytes(bench: Bench, writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four times what the block has: five of 300 of its 400 bytes."""
+def test_size_of_waiting_commands_is_bounded(
+    bench: Bench, writer: BlockWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The limit is four times the block's 400 bytes: five writes of 300 bytes fit."""
     commands, looked = writer.block.commands, threading.Semaphore(0)
     wait = commands.wait
 
@@ -349,7 +351,7 @@ def test_what_waits_has_a_bound_in_bytes(bench: Bench, writer: BlockWriter, monk
     assert accepted == [number for number in numbers[:5] for _ in range(2)]
     while looked.acquire(blocking=False):
         pass
-    for _ in range(2):  # one may have been under way
+    for _ in range(2):  # one wait may have been under way
         commands.wake()
         assert looked.acquire(timeout=20)
     assert bench._events.next(0) is None
@@ -362,7 +364,7 @@ def test_what_waits_has_a_bound_in_bytes(bench: Bench, writer: BlockWriter, monk
 def test_a_connection_lost_while_a_command_is_being_accepted(
     bench: Bench, writer: BlockWriter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was judged before, and would wait after: it is neither done later nor left without an end."""
+    """The command, judged but not queued at the loss, expires and is not carried out later."""
     tell = writer.event
 
     def told(record: Record) -> int:
@@ -383,7 +385,7 @@ def test_a_connection_lost_while_a_command_is_being_accepted(
     assert not bench.processor.waiting
 
 
-def test_a_superseded_value_is_not_written_when_what_took_its_place_was_refused(bench: Bench) -> None:
+def test_refusal_of_the_later_value_applies_to_the_superseded_one(bench: Bench) -> None:
     first, second = bench.accepted(Write(0, 0, b"\0\1")), bench.accepted(Write(0, 0, b"\0\2"))
     bench.processor.carry_out(lambda writes: ["no"] * len(writes))
     ends = [bench.event() for _ in range(2)]
@@ -393,8 +395,8 @@ def test_a_superseded_value_is_not_written_when_what_took_its_place_was_refused(
     ]
 
 
-def test_commands_go_in_the_order_in_which_they_were_accepted(bench: Bench) -> None:
-    """First the data, then the strobe that tells of them, though it lies before them."""
+def test_writes_keep_the_order_of_acceptance(bench: Bench) -> None:
+    """Data are written before their strobe, though the strobe has a lower offset."""
     bench.accepted(Write(100, 0, b"DATA"))
     bench.accepted(Write(2, 1, b"\1"))
     bench.accepted(Write(104, 0, b"MORE"))
@@ -403,7 +405,7 @@ def test_commands_go_in_the_order_in_which_they_were_accepted(bench: Bench) -> N
     assert device == [Write(100, 0, b"DATA"), Write(2, 1, b"\1"), Write(104, 0, b"MORE")]
 
 
-def test_what_waits_expires_at_its_deadline_though_no_cycle_comes(bench: Bench) -> None:
+def test_waiting_command_expires_at_its_deadline_without_a_cycle(bench: Bench) -> None:
     number = bench.accepted(Write(0, 0, b"\0\0"), deadline_ns=1_000)
     bench.now_ns = 2_000
     bench.processor._writer.block.commands.wake()
@@ -412,7 +414,7 @@ def test_what_waits_expires_at_its_deadline_though_no_cycle_comes(bench: Bench) 
     assert not bench.processor.waiting
 
 
-def test_whatever_a_write_raises_the_end_is_told(bench: Bench) -> None:
+def test_outcome_is_reported_whatever_the_write_raises(bench: Bench) -> None:
     bench.accepted(Write(0, 0, b"\0\0"))
 
     def defect(_: Sequence[Write]) -> list[str]:
@@ -423,7 +425,7 @@ def test_whatever_a_write_raises_the_end_is_told(bench: Bench) -> None:
     assert bench.event().kind == EventKind.UNKNOWN
 
 
-def test_a_writer_of_garbage_is_told_once_a_second(bench: Bench, writer: BlockWriter) -> None:
+def test_garbage_is_reported_once_a_second(bench: Bench, writer: BlockWriter) -> None:
     for _ in range(50):
         while not writer.block.commands.push(2, b"garbage"):
             pass
@@ -431,7 +433,7 @@ def test_a_writer_of_garbage_is_told_once_a_second(bench: Bench, writer: BlockWr
     bench.accepted(Write(0, 0, b"\0\0"))  # the next event is about this one
 
 
-def test_what_is_no_command_is_told_and_passed_over(bench: Bench, writer: BlockWriter) -> None:
+def test_invalid_command_is_rejected_and_skipped(bench: Bench, writer: BlockWriter) -> None:
     writer.block.commands.push(2, b"garbage")
     event = bench.event()
     assert (event.kind, event.writer) == (EventKind.REJECTED, 2)
@@ -439,7 +441,7 @@ def test_what_is_no_command_is_told_and_passed_over(bench: Bench, writer: BlockW
     bench.accepted(Write(0, 0, b"\0\0"))
 
 
-def test_a_source_that_cannot_write_says_so(writer: BlockWriter) -> None:
+def test_connector_that_cannot_write_rejects_commands(writer: BlockWriter) -> None:
     bench = Bench(writer, None)
     bench.processor.open()
     try:
@@ -457,7 +459,9 @@ whole = st.tuples(st.integers(0, 5), st.just(0), st.binary(min_size=1, max_size=
 
 @given(st.lists(st.one_of(single, whole), max_size=12), st.binary(min_size=10, max_size=10))
 @settings(max_examples=300)
-def test_coalesced_writes_leave_what_the_single_ones_would(items: list[tuple[int, int, bytes]], before: bytes) -> None:
+def test_coalesced_writes_have_the_effect_of_the_single_ones(
+    items: list[tuple[int, int, bytes]], before: bytes
+) -> None:
     def apply(image: bytes, writes: Sequence[Write]) -> bytes:
         changed = bytearray(image)
         for offset, mask, data in writes:
@@ -477,8 +481,7 @@ def test_coalesced_writes_leave_what_the_single_ones_would(items: list[tuple[int
     assert apply(before, [w for place, w in enumerate(writes) if place not in superseded]) == apply(before, writes)
 
 
-def test_a_command_keeps_its_place_in_its_queue(writer: BlockWriter) -> None:
-    """Commands of one writer are judged in the order in which they were sent."""
+def test_commands_of_one_writer_are_judged_in_order(writer: BlockWriter) -> None:
     sender = CommandSender(writer.block, 0)
     numbers = [sender.submit([Write(0, 0, bytes([0, n]))], FAR) for n in range(50)]
     bench = Bench(writer)

@@ -29,7 +29,7 @@ def layout(order: ByteOrder = "big") -> Layout:
 
 @pytest.mark.parametrize("value", [math.nan, -math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("order", ["big", "little"])
-def test_they_are_refused_by_name(value: float, order: ByteOrder) -> None:
+def test_nan_and_infinity_are_refused_by_path(value: float, order: ByteOrder) -> None:
     block = layout(order)
     finite = FiniteCheck(block, ["free/2"])
     speed, _, way, free = REGISTERS
@@ -47,12 +47,14 @@ def test_they_are_refused_by_name(value: float, order: ByteOrder) -> None:
 
 
 @given(LITTLE_OR_BIG, st.floats(allow_nan=False, allow_infinity=False, width=32))
-def test_every_number_is_taken(order: ByteOrder, value: float) -> None:
+def test_finite_numbers_are_accepted(order: ByteOrder, value: float) -> None:
     block = layout(order)
     finite = FiniteCheck(block, [])
     assert not finite.refusal(encode(REGISTERS[0], value, order))
     assert not finite.refusal(encode(REGISTERS[2], [[value, -value], [0.0, 1.0]], order))
-    assert not finite.refusal([Write(6, 0, b"\xff\xff"), Write(0, 0, b"\xff\xff")]), "no number is there"
+    assert not finite.refusal([Write(6, 0, b"\xff\xff"), Write(0, 0, b"\xff\xff")]), (
+        "no REAL or LREAL is at these offsets"
+    )
 
 
 BYTES = st.sampled_from(b"\0\x3f\x7f\x80\xbf\xc0\xf0\xfe\xff")
@@ -64,7 +66,7 @@ WRITES = st.one_of(
 
 
 @given(LITTLE_OR_BIG, st.lists(WRITES, max_size=40))
-def test_no_sequence_of_writes_makes_one_of_parts(order: ByteOrder, writes: list[Write]) -> None:
+def test_partial_writes_cannot_assemble_nan_or_infinity(order: ByteOrder, writes: list[Write]) -> None:
     finite = FiniteCheck(layout(order), ["free"])
     image = bytearray(48)
     for write in writes:

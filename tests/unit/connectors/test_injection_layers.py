@@ -1,4 +1,4 @@
-"""The chain of injections: what consumers see of an image, and who gets what is written toward the device."""
+"""The chain of injections: what consumers see, and which injection takes a write."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def laid(*layers: Layer) -> LayerStack:
     return injections
 
 
-def test_without_an_injection_an_image_is_what_it_is() -> None:
+def test_image_without_injections_is_unchanged() -> None:
     assert laid().effective(bytes(SIZE)) is None
     assert laid(layer(1, whole(0, 2), direction=Direction.IN)).effective(bytes(SIZE)) is None
 
 
-def test_consumers_see_the_values_of_the_covered_bits_alone() -> None:
+def test_injection_changes_only_covered_bits() -> None:
     injections = laid(layer(1, whole(2, 2), bit(5, 3), values=b"\xaa" * SIZE))
     assert injections.effective(b"\x11" * SIZE) == b"\x11\x11\xaa\xaa\x11\x19\x11\x11"
     assert injections.effective(b"\xff" * SIZE) == b"\xff\xff\xaa\xaa\xff\xff\xff\xff"
@@ -61,16 +61,16 @@ def test_the_highest_priority_is_outermost_then_the_newest() -> None:
     assert injections.effective(bytes(SIZE)) == b"\x00\x02\x03\x03\x03\x03\x00\x00"
 
 
-def test_a_shadow_gives_what_it_covers_and_nothing_else() -> None:
+def test_shadow_accepts_only_values_that_it_covers() -> None:
     one = layer(1, whole(0, 2), bit(4, 0))
     assert shadow(one, [Write(0, 0, b"\x12\x34"), Write(4, 1, b"\xff")]) == ""
     assert laid(one).effective(bytes(SIZE)) == b"\x12\x34\0\0\x01\0\0\0"
     for beyond in (Write(1, 0, b"\1\1"), Write(4, 2, b"\2"), Write(4, 0, b"\1"), Write(SIZE, 0, b"\1")):
         assert "not covered by the injection s1" in shadow(one, [Write(0, 0, b"\x99"), beyond])
-    assert laid(one).effective(bytes(SIZE)) == b"\x12\x34\0\0\x01\0\0\0", "it took a part"
+    assert laid(one).effective(bytes(SIZE)) == b"\x12\x34\0\0\x01\0\0\0", "a refused value has no effect"
 
 
-def test_a_write_goes_to_the_outermost_injection_on_its_way() -> None:
+def test_write_is_diverted_to_the_outermost_injection() -> None:
     inner = layer(1, whole(0, 4), direction=Direction.IN)
     outer = layer(2, whole(2, 1), bit(6, 1), direction=Direction.IN, priority=1)
     injections = laid(inner, outer, layer(3, whole(0, 8)))
@@ -83,7 +83,7 @@ def test_a_write_goes_to_the_outermost_injection_on_its_way() -> None:
     assert injections.divert(Write(6, 4, b"\4"), None)[:2] == ([], b"\4")
 
 
-def test_what_cannot_be_is_refused() -> None:
+def test_invalid_injections_are_refused() -> None:
     injections = laid(layer(1, whole(0, 1)))
     assert "an injection 1 already" in injections.lay(layer(1, whole(0, 1)))
     with pytest.raises(ValueError, match="byte 8 lies outside"):
@@ -94,7 +94,7 @@ def test_what_cannot_be_is_refused() -> None:
 
 
 def has(parts: list[Write], at: int, mask: int, byte: int) -> bool:
-    """Whether these are writes of that bit, with its value."""
+    """Return whether these writes contain the bit with its value."""
     return any(
         offset <= at < offset + len(part) and (bits or 0xFF) & mask and (part[at - offset] ^ byte) & mask == 0
         for offset, bits, part in parts
@@ -105,7 +105,7 @@ images = st.binary(min_size=SIZE, max_size=SIZE)
 
 
 @given(images, st.lists(st.tuples(images, images, st.integers(-2, 2), st.sampled_from(Direction)), max_size=5), images)
-def test_each_bit_is_of_the_outermost_layer_over_it(
+def test_each_bit_belongs_to_the_outermost_layer_that_covers_it(
     raw: bytes, layers: list[tuple[bytes, bytes, int, Direction]], data: bytes
 ) -> None:
     injections = laid(

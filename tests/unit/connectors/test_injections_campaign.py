@@ -1,4 +1,4 @@
-"""Declared injections in virtual time: a campaign is the same frames, however the processes take turns."""
+"""Declared injections in virtual time: a campaign is reproducible, whichever process is faster."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Shown = tuple[int, bytes, bytes | None]
 
 
 def played(instance: str, trouble: Callable[[int], None]) -> list[Shown]:
-    """The frames of a model under the campaign in ten steps of 50 ms; another runs beside it."""
+    """Run two models for ten steps of 50 ms; return the frames of the one under the campaign."""
     declared = [msgspec.convert({"name": name, **keys}, Declaration) for name, keys in CAMPAIGN.items()]
     attributes = Attributes("simulation", ("given",), stepped=True)
     blocks = [
@@ -47,13 +47,13 @@ def played(instance: str, trouble: Callable[[int], None]) -> list[Shown]:
         for step in range(10):
             if step == 4:
                 writer.submit({"given": 7})
-                judged = writer.shadow(1, {"given": 0})  # refused, behind the other
+                judged = writer.shadow(1, {"given": 0})  # refused, after the write before it is judged
                 assert "no injection" in judged[0].text
             coordinator.step(50 * MS)
         return [(frame.cycle, frame.raw, frame.effective) for frame in models[1].frames() if frame.cycle]
 
 
-def test_a_campaign_goes_on_with_time_that_is_released(instance: str) -> None:
+def test_campaign_continues_after_time_is_released(instance: str) -> None:
     start_s = 3600.2
     declared = Declaration("late", "one/sum", "set", value=7, start_s=start_s)
     attributes = Attributes("simulation", ("given",), stepped=True)
@@ -67,12 +67,12 @@ def test_a_campaign_goes_on_with_time_that_is_released(instance: str) -> None:
             while frame.effective is None:
                 before, frame = frame, model.next()
         assert before.cycle <= frame.cycle
-        assert frame.clock_ns >= start_s * 1e9, "by the instance's clock"
+        assert frame.clock_ns >= start_s * 1e9, "start_s is by the instance's clock"
         segment.unlink()
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_two_runs_are_the_same_frames(instance: str, seed: int) -> None:
+def test_two_runs_give_the_same_frames(instance: str, seed: int) -> None:
     turns = random.Random(seed)
     never = threading.Event()
 
@@ -87,6 +87,6 @@ def test_two_runs_are_the_same_frames(instance: str, seed: int) -> None:
     noisy = [cycle for cycle, (raw, effective) in shown.items() if effective and effective[:4] != raw[:4]]
     assert noisy == [2, 3, 4, 5], "from 0.1 s to before 0.3 s of simulation time"
     blind = [cycle for cycle, (_, effective) in shown.items() if effective and effective[8:] == b"\0\0\0\x63"]
-    assert blind == [5, 6, 7, 8, 9, 10], "the other model's step before is what counts"
+    assert blind == [5, 6, 7, 8, 9, 10], "the condition reads the other model's previous step"
     given = [cycle for cycle, (raw, _) in shown.items() if raw[4:8] == b"\0\0\0\x07"]
     assert given[0] == 6, "written after step 4 (0.2 s), sent on 0.1 s later"

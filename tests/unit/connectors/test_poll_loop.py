@@ -1,4 +1,4 @@
-"""The loop that runs a connector, with time in the test's hands."""
+"""The loop that runs a connector, with a virtual clock."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PERIOD_NS = 20_000_000
 
 
 class VirtualClock:
-    """Time moves only by waiting; ends after ``end_ns``."""
+    """A clock that moves only by waiting, and stops the loop at ``end_ns``."""
 
     def __init__(self, end_ns: int) -> None:
         self.time_ns = 0
@@ -88,7 +88,7 @@ def run(segment: Segment, trouble: Callable[[str, int], None], cycles: int) -> t
     return device, loop, frames
 
 
-def test_every_cycle_is_one_frame_and_the_end_is_told(segment: Segment) -> None:
+def test_each_cycle_gives_one_frame_and_the_end_a_bad_one(segment: Segment) -> None:
     device, loop, frames = run(segment, lambda *_: None, 6)
     assert [(f.cycle, int.from_bytes(f.raw, "big"), f.quality) for f in frames[:-1]] == [
         (cycle, cycle, Quality.GOOD) for cycle in range(1, 6)
@@ -99,7 +99,7 @@ def test_every_cycle_is_one_frame_and_the_end_is_told(segment: Segment) -> None:
     assert (loop.counters.polls, loop.counters.overruns, loop.counters.connects) == (5, 0, 1)
 
 
-def test_a_failure_is_one_bad_frame_with_the_last_bytes_and_recovery_needs_no_restart(segment: Segment) -> None:
+def test_outage_is_one_bad_frame_with_the_last_bytes_and_the_loop_recovers(segment: Segment) -> None:
     def cut_in_reads_3_to_5(hook: str, reads: int) -> None:
         if hook == "read" and 3 <= reads <= 5:
             raise ConnectorError("cable out")
@@ -115,7 +115,7 @@ def test_a_failure_is_one_bad_frame_with_the_last_bytes_and_recovery_needs_no_re
     assert (loop.counters.failures, loop.counters.overruns) == (3, 0)
 
 
-def test_cycles_do_not_go_back_when_a_source_is_stopped_and_started_within_a_period(segment: Segment) -> None:
+def test_cycle_numbers_do_not_go_back_after_a_restart_within_a_period(segment: Segment) -> None:
     class Punctual(VirtualClock):
         def wait_ns(self, duration_ns: int) -> bool:
             return super().wait_ns(min(duration_ns, self.end_ns - self.time_ns))
@@ -128,10 +128,10 @@ def test_cycles_do_not_go_back_when_a_source_is_stopped_and_started_within_a_per
     cycles = []
     while (frame := cursor.poll()) is not None:
         cycles.append(frame.cycle)
-    assert cycles[:7] == [1, 2, 3, 4, 5, 5, 6], "the end has the cycle that it came in"
+    assert cycles[:7] == [1, 2, 3, 4, 5, 5, 6], "the last frame has the cycle in which it came"
 
 
-def test_a_new_reason_is_a_new_bad_frame(segment: Segment) -> None:
+def test_new_reason_gives_a_new_bad_frame(segment: Segment) -> None:
     reasons = iter(["refused", "refused", "garbage"])
 
     def trouble(hook: str, reads: int) -> None:
@@ -144,7 +144,7 @@ def test_a_new_reason_is_a_new_bad_frame(segment: Segment) -> None:
     assert loop.note == "the source was stopped"
 
 
-def test_backing_off_grows_and_ends_with_success(segment: Segment) -> None:
+def test_back_off_grows_up_to_two_seconds(segment: Segment) -> None:
     attempts: list[int] = []
 
     def absent(hook: str, _: int) -> None:
@@ -160,7 +160,7 @@ def test_backing_off_grows_and_ends_with_success(segment: Segment) -> None:
     assert max(gaps_ms) <= 2000 + 2 * PERIOD_NS // 1_000_000
 
 
-def test_slow_reads_are_counted_as_overruns(segment: Segment) -> None:
+def test_cycles_missed_by_a_slow_read_are_overruns(segment: Segment) -> None:
     clock = VirtualClock(20 * PERIOD_NS)
 
     def slow(hook: str, reads: int) -> None:
@@ -211,7 +211,7 @@ def test_an_answer_that_took_too_long_is_never_good(segment: Segment) -> None:
     assert device.calls[:3] == ["connect", "close", "connect"]
 
 
-def test_a_bad_frame_tells_since_when_its_bytes_are(segment: Segment) -> None:
+def test_bad_frame_has_the_time_of_its_bytes(segment: Segment) -> None:
     def fails_first_and_in_read_3(hook: str, reads: int) -> None:
         if (hook == "connect" and not device_calls) or (hook == "read" and reads == 3):
             device_calls.append(hook)
@@ -225,7 +225,7 @@ def test_a_bad_frame_tells_since_when_its_bytes_are(segment: Segment) -> None:
     assert (again.quality, again.source_ns) == (Quality.BAD, second.source_ns)
 
 
-def test_a_flapping_device_is_left_alone_for_longer_and_longer(segment: Segment) -> None:
+def test_back_off_grows_for_a_flapping_device(segment: Segment) -> None:
     clock = VirtualClock(8 * 10**9)
     connects_ns: list[int] = []
 
@@ -241,7 +241,7 @@ def test_a_flapping_device_is_left_alone_for_longer_and_longer(segment: Segment)
     assert gaps_ms[-1] >= 2000
 
 
-def test_a_device_that_was_stable_is_tried_again_at_once(segment: Segment) -> None:
+def test_stable_device_is_reconnected_at_once(segment: Segment) -> None:
     clock = VirtualClock(20 * 10**9)
     failures_ns: list[int] = []
     connects_ns: list[int] = []
@@ -259,7 +259,7 @@ def test_a_device_that_was_stable_is_tried_again_at_once(segment: Segment) -> No
     assert max(waits_ms) < 150
 
 
-def test_a_number_in_a_reason_makes_no_new_frame(segment: Segment) -> None:
+def test_reason_that_differs_only_in_numbers_gives_no_new_frame(segment: Segment) -> None:
     def varies(hook: str, reads: int) -> None:
         if hook == "read":
             raise ConnectorError(f"frame of {reads} bytes")
@@ -268,7 +268,7 @@ def test_a_number_in_a_reason_makes_no_new_frame(segment: Segment) -> None:
     assert [frame.reason for frame in frames] == ["frame of 1 bytes", "the source was stopped"]
 
 
-def test_an_error_without_words_is_bad_too_and_another_code_is_another_reason(segment: Segment) -> None:
+def test_empty_reason_is_replaced_and_another_error_code_is_a_new_reason(segment: Segment) -> None:
     reasons = iter(["", "error 0x8104", "error 0x8304"])
 
     def fails(hook: str, reads: int) -> None:
@@ -280,7 +280,7 @@ def test_an_error_without_words_is_bad_too_and_another_code_is_another_reason(se
 
 
 class Pipe(Device):
-    """A device that answers after ``answer_ns`` and takes ``cycles`` requests at once."""
+    """A device that answers after ``answer_ns`` and accepts ``cycles`` requests at once."""
 
     def __init__(self, clock: VirtualClock, answer_ns: int, cycles: int) -> None:
         super().__init__(lambda *_: None)
@@ -317,7 +317,7 @@ def pipe(segment: Segment, cycles: int, answer_ns: int) -> tuple[Pipe, SourceLoo
     return device, loop, [frame for frame in iter(cursor.poll, None) if frame.quality is Quality.GOOD]
 
 
-def test_with_two_cycles_under_way_every_cycle_has_its_frame_though_answers_take_longer(segment: Segment) -> None:
+def test_two_cycles_under_way_keep_up_with_slow_answers(segment: Segment) -> None:
     device, loop, frames = pipe(segment, 2, 3 * PERIOD_NS // 2)
     assert device.most == 2
     assert loop.counters.overruns == 0
@@ -326,7 +326,7 @@ def test_with_two_cycles_under_way_every_cycle_has_its_frame_though_answers_take
     assert all(b.publish_ns >= a.publish_ns for a, b in pairwise(frames))
 
 
-def test_with_one_cycle_under_way_a_late_answer_delays_the_next_cycle_and_skips_what_the_device_cannot_do(
+def test_one_cycle_under_way_skips_cycles_if_answers_are_slow(
     segment: Segment,
 ) -> None:
     device, loop, frames = pipe(segment, 1, 17 * PERIOD_NS // 10)
@@ -350,7 +350,7 @@ def test_one_answer_that_is_late_by_less_than_a_period_skips_no_cycle(segment: S
     assert loop.counters.overruns == 0
 
 
-def test_what_was_under_way_is_forgotten_with_its_connection(segment: Segment) -> None:
+def test_requests_under_way_are_dropped_with_the_connection(segment: Segment) -> None:
     clock = VirtualClock(60 * PERIOD_NS)
     device = Pipe(clock, PERIOD_NS // 2, 2)
     collect = device.collect
@@ -432,7 +432,7 @@ def test_a_write_lost_with_the_connection_is_unknown_and_never_repeated(segment:
     kinds = [event.kind for n in range(1, block.events.head() + 1) if (event := block.events.read(n))]
     assert kinds.count(EventKind.UNKNOWN) == 1
     assert device.calls.count("write") == 1
-    assert device.reads > 10, "it recovered"
+    assert device.reads > 10, "the loop recovers"
 
 
 def test_a_doubtful_image_is_uncertain_with_its_reason(segment: Segment) -> None:
@@ -450,11 +450,11 @@ def test_a_doubtful_image_is_uncertain_with_its_reason(segment: Segment) -> None
     assert {frame.reason for frame in frames[2:5]} == {"the PLC is in STOP"}
 
 
-def test_a_cycle_that_was_held_up_in_its_wait_is_an_overrun(segment: Segment) -> None:
+def test_cycles_that_pass_while_the_process_is_stopped_are_overruns(segment: Segment) -> None:
     class Held(VirtualClock):
         def wait_ns(self, duration_ns: int) -> bool:
             ended = super().wait_ns(duration_ns)
-            if self.time_ns == 4 * PERIOD_NS:  # the process is stopped, and goes on in cycle 7
+            if self.time_ns == 4 * PERIOD_NS:  # the process is stopped, and continues in cycle 7
                 self.time_ns += 3 * PERIOD_NS + 1
             return ended
 
@@ -467,14 +467,14 @@ def test_a_cycle_that_was_held_up_in_its_wait_is_an_overrun(segment: Segment) ->
     assert loop.counters.overruns == 3
 
 
-def test_a_frame_tells_how_long_the_device_took(segment: Segment) -> None:
+def test_frame_has_the_delay_of_the_device(segment: Segment) -> None:
     _, _, frames = run(segment, lambda *_: None, 3)
     assert 0 < frames[0].delay_us < 10**7
-    assert frames[-1].delay_us == 0, "a bad one has no answer"
+    assert frames[-1].delay_us == 0, "a bad frame has no answer"
 
 
-def test_no_frame_behind_the_end_of_a_write_is_older_than_it(segment: Segment) -> None:
-    """With several cycles under way, too."""
+def test_frames_after_the_outcome_of_a_write_show_it(segment: Segment) -> None:
+    """Several cycles are under way."""
 
     class Register(Pipe):
         can_write = True

@@ -1,4 +1,4 @@
-"""The absolute schedule and the back-off."""
+"""The schedule of cycles, at multiples of the period."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_every_cycle_is_run_or_counted_whatever_the_delays(start: int, period: i
     for delay in delays:
         due = schedule.next(now)
         assert due.due_ns == start + due.cycle * period
-        assert due.due_ns + period > now  # never begun when its whole period has passed
+        assert due.due_ns + period > now  # no cycle begins after its whole period has passed
         if previous is not None:
             assert due.cycle - previous - 1 == due.skipped
         previous, skipped = due.cycle, skipped + due.skipped

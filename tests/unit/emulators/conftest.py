@@ -9,7 +9,7 @@ from shmio.layout.model import Layout, Register
 
 @pytest.fixture(scope="session")
 def db201() -> Layout:
-    """DB201 with the printed names, some of which have a space for the underscore."""
+    """DB201 with the printed names, some of which have a space in place of the underscore."""
     registers = [
         Register("Inputs", "BYTE", ((0, 999),), 0, None, 1000, 1000),
         Register("Outputs", "BYTE", ((0, 1099),), 1000, None, 1100, 1100),

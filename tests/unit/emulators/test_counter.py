@@ -23,24 +23,24 @@ def test_a_whole_frame_is_of_one_generation(size: int) -> None:
         assert generations(frame) == [1234]
 
 
-def test_a_mixture_shows_both() -> None:
+def test_mixed_frame_shows_both_generations() -> None:
     old, new = frame_at(5.0), frame_at(5.001)
     assert generations(new[:960] + old[960:]) == [5000, 5001]
 
 
 @pytest.mark.parametrize("place", [0, 7, 1000, 2175, 2176, 2180])
-def test_a_wrong_byte_shows(place: int) -> None:
+def test_wrong_byte_is_detected(place: int) -> None:
     frame = frame_at(3.0)
     frame[place] ^= 0x10
     assert generations(frame) != [3000]
 
 
-def test_shifted_data_shows() -> None:
+def test_shifted_data_are_detected() -> None:
     frame = frame_at(3.0)
     assert generations(frame[8:] + frame[:8]) != [3000]
 
 
-def test_same_time_same_frame() -> None:
+def test_frame_depends_only_on_the_time() -> None:
     assert frame_at(2.5) == frame_at(2.5)
     assert all(
         a != b

@@ -35,8 +35,8 @@ def client_of(emulator: Emulator, size: int = 2180, number: int = 201) -> S7Clie
     return S7Client(S7Options(host=emulator.address.host, port=emulator.address.port), number, size)
 
 
-def test_one_pdu_is_of_one_program_cycle(counter: Emulator) -> None:
-    """Also under load: two clients that read as fast as they can while the program runs at 1 kHz."""
+def test_pdu_never_mixes_program_cycles(counter: Emulator) -> None:
+    """Two clients read as fast as they can while the program runs at 1 kHz."""
     seen: set[int] = set()
     with closing(client_of(counter, 936)) as first, closing(client_of(counter, 936)) as second:
         first.connect()
@@ -73,7 +73,7 @@ def test_stopping_the_cpu_stops_the_program_and_not_the_server(counter: Emulator
     with closing(client_of(counter)) as client:
         client.connect()
         peer.plc_stop()
-        client.read()  # a cycle that had begun is over by the end of this
+        client.read()  # a cycle under way ends before this read does
         stopped = client.read()
         assert len(generations(stopped)) == 1
         assert all(client.read() == stopped for _ in range(100))
@@ -84,13 +84,13 @@ def test_stopping_the_cpu_stops_the_program_and_not_the_server(counter: Emulator
     peer.destroy()
 
 
-def test_first_cycle_is_over_before_the_first_client(db201: Layout) -> None:
+def test_first_cycle_ends_before_the_first_client_connects(db201: Layout) -> None:
     with Emulator(db201, "a50", LOOPBACK) as emulator, closing(client_of(emulator)) as client:
         client.connect()
         assert client.read()[1002:1004] == b"\x00\x0a"
 
 
-def test_clients_write_what_the_program_does_not_drive(db201: Layout) -> None:
+def test_clients_can_write_registers_that_the_program_does_not_drive(db201: Layout) -> None:
     with Emulator(db201, "a50", LOOPBACK) as emulator, closing(client_of(emulator)) as client:
         client.connect()
         peer = snap7.Client()
@@ -146,8 +146,8 @@ def test_a_failing_program_is_reported(db201: Layout, monkeypatch: pytest.Monkey
     assert isinstance(emulator.failure, ZeroDivisionError)
 
 
-def test_traits_and_orders_reach_the_program_and_its_clients(db201: Layout) -> None:
-    """A client orders a hold: the cell stands, and says so."""
+def test_traits_reach_the_client_and_commands_reach_the_program(db201: Layout) -> None:
+    """A client commands a hold: the cell stops all motion, and reports it."""
     with (
         Emulator(db201, "a50", LOOPBACK, traits=Traits(max_pdu_size=480, max_jobs=10)) as emulator,
         closing(client_of(emulator)) as client,

@@ -1,4 +1,4 @@
-"""An emulated controller in a process of its own, with peers that wish it ill, over real sockets."""
+"""An emulated controller in its own process, attacked over real sockets."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Plc:
 
     @property
     def clients(self) -> int:
-        """As many as it has, by its own account."""
+        """Number of clients that the server counts."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write("\n")
@@ -74,7 +74,7 @@ class Plc:
 
 @pytest.fixture
 def plc(tmp_path: Path) -> Iterator[Plc]:
-    log = tmp_path / "log"  # no pipe: a full one would hold it up
+    log = tmp_path / "log"  # not a pipe: the process would block when it is full
     with (
         log.open("w") as said,
         subprocess.Popen(
@@ -84,7 +84,7 @@ def plc(tmp_path: Path) -> Iterator[Plc]:
         plc = Plc(process)
         with closing(plc.honest):
             yield plc
-            assert len(plc.honest.read()) == SIZE, "it serves on"
+            assert len(plc.honest.read()) == SIZE, "the honest client is still served"
         process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
     assert "Traceback" not in log.read_text()
@@ -158,7 +158,7 @@ services = st.sampled_from(
         "32 01 0000 0001 0008 0000 1d 000000000000 00",
     ]
 ).map(lambda text: data(bytes.fromhex(text)))
-orderly = jobs | setups | services  # to be answered, one by one
+orderly = jobs | setups | services  # each of these must be answered
 noise = st.builds(data, st.binary(max_size=300)) | st.builds(tpkt, st.binary(), word)
 spoilt = st.builds(
     lambda frame, at, new: frame[: at % len(frame)] + bytes((new,)) + frame[at % len(frame) + 1 :], orderly, word, byte
@@ -168,7 +168,7 @@ beginnings = st.sampled_from([SESSION + SETUP] * 4 + [SESSION, b""]) | st.builds
 
 
 def answers(received: bytes) -> list[bytes]:
-    """Cut what came back into messages; AssertionError if it is none."""
+    """Split the received bytes into messages, and check their lengths."""
     found = []
     while received:
         version, length = struct.unpack_from(">BxH", received)
@@ -181,23 +181,23 @@ def answers(received: bytes) -> list[bytes]:
 
 
 def attack(peer: socket.socket, sent: bytes) -> bytes:
-    """Send, say that this was all, and take what comes until the connection ends."""
+    """Send, shut down the sending side, and return what comes until the connection ends."""
     received = b""
-    with contextlib.suppress(ConnectionError):  # it may close before all is sent, or after
+    with contextlib.suppress(ConnectionError):  # the server may close before all is sent
         peer.sendall(sent)
-        with contextlib.suppress(OSError):  # not connected any more
+        with contextlib.suppress(OSError):  # no longer connected
             peer.shutdown(socket.SHUT_WR)
         while piece := peer.recv(65536):
             received += piece
     return received
 
 
-def test_whatever_comes_it_answers_or_closes(plc: Plc) -> None:
+def test_any_input_is_answered_or_closes_the_connection(plc: Plc) -> None:
     plc.honest.read()
     peak_kib, threads, descriptors = plc.resources
     count = 0
 
-    @settings(max_examples=300)  # which ones depends on the modules that other tests have loaded
+    @settings(max_examples=300)  # the examples depend on the modules that other tests have loaded
     @given(beginnings, conversations)
     def run(beginning: bytes, sent: list[bytes]) -> None:
         nonlocal count
@@ -208,24 +208,24 @@ def test_whatever_comes_it_answers_or_closes(plc: Plc) -> None:
         assert len(plc.honest.read()) == SIZE
 
     run()
-    assert count > 100, "it came to talk"
+    assert count > 100, "many jobs were answered"
     until(lambda: plc.clients == 1, "all places are free again")
     until(lambda: plc.resources[1:] == (threads, descriptors), "threads and descriptors are given back")
     assert plc.resources[0] < peak_kib + 16 * 1024
 
 
-def test_hundreds_that_say_nothing_take_no_more_than_the_places(plc: Plc) -> None:
-    """Connected and silent, in the middle of the handshake, in the middle of a job, and gone without a word."""
+def test_silent_connections_use_only_the_allowed_places(plc: Plc) -> None:
+    """The peers fall silent at once, within the handshake, within a frame, or after the set-up."""
     peak_kib, threads, descriptors = plc.resources
     with ExitStack() as stack:
         for begun in (b"", SESSION[:9], b"\x03\x00\xff\xff" + bytes(9000), SESSION + SETUP, SESSION + SETUP[:20]) * 60:
             peer = stack.enter_context(plc.dial())
-            with contextlib.suppress(ConnectionError):  # refused
+            with contextlib.suppress(ConnectionError):  # the server refuses it
                 peer.sendall(begun)
         assert plc.clients <= MAX_CLIENTS
         now_kib, now_threads, now_descriptors = plc.resources
         assert now_threads <= threads + MAX_CLIENTS
-        assert now_descriptors <= descriptors + MAX_CLIENTS + 1  # one that is just being refused
+        assert now_descriptors <= descriptors + MAX_CLIENTS + 1  # one connection that is being refused
         assert now_kib < peak_kib + 16 * 1024
         assert len(plc.honest.read()) == SIZE
     with closing(plc.client()) as late:
@@ -245,8 +245,8 @@ def send_forever(peer: socket.socket, sent: bytes) -> None:
         peer.send(sent)
 
 
-def test_a_flood_is_answered_in_bounded_memory(plc: Plc) -> None:
-    """Jobs as fast as they go, by a peer that takes no answer."""
+def test_flood_of_jobs_uses_bounded_memory(plc: Plc) -> None:
+    """A peer sends jobs as fast as it can, and reads no answer."""
     read = bytes.fromhex("0300001f 02f080 32 01 0000 0001 000e 0000 04 01 12 0a 10 02 0100 0005 84 000000")
     plc.honest.read()
     peak_kib, _, _ = plc.resources

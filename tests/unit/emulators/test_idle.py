@@ -1,4 +1,4 @@
-"""A controller without a program: its blocks are memory, for every layout."""
+"""An emulated controller without a program: its blocks are memory, with any layout."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def compiled(*sources: Source) -> tuple[Layout, ...]:
 
 
 def read(emulator: Emulator, number: int, size: int) -> bytes:
-    """The whole block, by a connection of its own."""
+    """Read the whole block over a new connection."""
     options = S7Options(host=emulator.address.host, port=emulator.address.port)
     with closing(S7Client(options, number, size)) as client:
         client.connect()
@@ -68,7 +68,7 @@ def test_serves_the_initial_values_of_every_layout(file: Path) -> None:
             assert read(emulator, 5, layout.size) == bytes(initial_frame(layout)[0])
 
 
-def test_keeps_what_is_written_over_connections_stop_and_start() -> None:
+def test_written_values_survive_disconnection_stop_and_start() -> None:
     first, second = compiled(Source("two.db", TWO.encode()))
     wanted, counts = bytes.fromhex("0100 41480000 0805") + b"first\0\0\0", bytearray.fromhex("0001 0014 0003")
     with Emulator(first, "idle", LOOPBACK, others=[second]) as emulator:

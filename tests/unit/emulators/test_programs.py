@@ -1,4 +1,4 @@
-"""The cell must look alive, and possible."""
+"""The program of the A50 cell: it moves all the time, and only as a real cell could."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
 from shmio.simulation.a50 import ACTUATORS, AXIS_LIMITS, CYCLE_S, STEPS
 
-PERIOD_S = 0.02  # at which it is watched
+PERIOD_S = 0.02  # of the sampling in these tests
 MAX_DEG_PER_S = 123.0
 
 
@@ -131,11 +131,11 @@ def test_trolley_comes_stays_and_leaves(film: list[bytes]) -> None:
     assert all(bit(frame, 1, 1) for frame, place in zip(film, places, strict=False) if place == 3000)
 
 
-def test_same_time_same_frame_wherever_one_begins(db201: Layout, film: list[bytes]) -> None:
+def test_frame_depends_only_on_the_time(db201: Layout, film: list[bytes]) -> None:
     assert watch(db201, 30, 31) == film[1500:1550]
 
 
-def test_leaves_alone_what_it_does_not_drive(db201: Layout) -> None:
+def test_other_registers_are_unchanged(db201: Layout) -> None:
     frame = bytearray(b"\xa5" * db201.size)
     A50(db201).step(12.0, frame)
     assert frame[20:1000] == b"\xa5" * 980
@@ -148,7 +148,7 @@ def test_runs_on_the_printed_source(db201: Layout) -> None:
     assert watch(printed, 40, 41) == watch(db201, 40, 41)
 
 
-def test_goes_by_the_layout_not_by_offsets(db201: Layout) -> None:
+def test_registers_are_found_by_the_layout_not_by_fixed_offsets(db201: Layout) -> None:
     moved = replace(
         db201, size=db201.size + 10, registers=tuple(structs.replace(r, offset=r.offset + 10) for r in db201.registers)
     )
@@ -170,11 +170,14 @@ def test_names_the_register_that_is_missing_or_wrong(db201: Layout, path: str) -
         A50(other)
 
 
-# -- orders ------------------------------------------------------------------------------------------------------------
+# -- commands ----------------------------------------------------------------------------------------------------------
 
 
 def follow(layout: Layout, orders: dict[int, bytes], end_s: float) -> dict[int, bytes]:
-    """Run from the start; from each time in ms on, its orders stand in Outputs 13 to 17. Frames by time in ms."""
+    """Run from the start, and return the frames by time in ms.
+
+    ``orders`` has the values of Outputs 13 to 17 that a client writes, by time in ms.
+    """
     program = A50(layout)
     frame = bytearray(layout.size)
     frames = {}
@@ -189,11 +192,11 @@ def follow(layout: Layout, orders: dict[int, bytes], end_s: float) -> dict[int, 
 HOLD, GO = b"\x01\0\0\0\0", bytes(5)
 
 
-def test_hold_stops_all_motion_until_it_is_taken_back(db201: Layout) -> None:
-    """In the middle of a robot's move: everything stands, the heartbeat goes on, and the move is finished later."""
+def test_hold_stops_all_motion_until_it_is_released(db201: Layout) -> None:
+    """A hold within a robot's move stops all but the heartbeat; the move is finished afterwards."""
     free = follow(db201, {}, 9)
     held = follow(db201, {8000: HOLD, 10_000: GO}, 11)
-    assert axes(held[8000]) == axes(free[7980])  # the order came before that cycle
+    assert axes(held[8000]) == axes(free[7980])  # the hold takes effect in this cycle
     assert {axes(held[time_ms]) for time_ms in range(8000, 10_000, 20)} == {axes(held[8000])}
     assert {bit(held[time_ms], 1000, 0) for time_ms in range(8000, 10_000, 20)} == {True, False}
     assert (bit(free[8000], 5, 1), bit(held[8000], 5, 1)) == (True, False)
@@ -203,7 +206,7 @@ def test_hold_stops_all_motion_until_it_is_taken_back(db201: Layout) -> None:
     assert held[10_980][1000:1013] == free[8980][1000:1013]
 
 
-def test_actuators_obey_orders_and_go_back(db201: Layout) -> None:
+def test_actuators_obey_commands_and_then_the_program_again(db201: Layout) -> None:
     place = next(place for place, actuator in enumerate(ACTUATORS) if actuator.name == "gripper of Robot_825")
 
     def state(frame: bytes) -> tuple[bool, int, bool]:
@@ -217,4 +220,4 @@ def test_actuators_obey_orders_and_go_back(db201: Layout) -> None:
     assert state(frames[980]) == (False, 2, False)
     assert state(frames[1000]) == (True, 1, True)
     assert [state(frames[time_ms]) for time_ms in (2000, 3000, 4000)] == [(False, 2, False)] * 3
-    assert frames[1500][1008:1010] == mask  # no other
+    assert frames[1500][1008:1010] == mask  # no other valve

@@ -1,4 +1,4 @@
-"""What the emulated controller answers, byte by byte, and to noise."""
+"""Answers of the emulated controller, byte by byte, and its answers to noise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read(*items: bytes) -> memoryview:
 
 
 def write(*pairs: tuple[bytes, int, bytes]) -> memoryview:
-    """Pairs of item, transport size, value."""
+    """Return a job that writes; each of ``pairs`` is an item, a transport size and a value."""
     data = b""
     for _, transport, value in pairs:
         length = len(value) * 8 if transport in {4, 5} else len(value)
@@ -52,7 +52,7 @@ def jobs(block: bytearray) -> Jobs:
 
 
 def payload(answer: bytes | None) -> bytes:
-    """What follows the parameters of a good answer."""
+    """Return the data of an answer without an error."""
     assert answer is not None
     assert answer[:2] == b"\x32\x03"
     assert answer[4:6] == b"\x12\x34"
@@ -96,7 +96,7 @@ def test_reads_a_bit(jobs: Jobs) -> None:
     assert payload(jobs.answer(read(item(BIT, 1, 5, bit=1)))) == bytes.fromhex("ff 03 0001 00")
 
 
-def test_reads_several_items_each_with_its_own_fate(jobs: Jobs) -> None:
+def test_each_of_several_items_has_its_own_result(jobs: Jobs) -> None:
     answer = jobs.answer(
         read(
             item(BYTE, 3, 0),
@@ -202,7 +202,7 @@ def test_other_address_forms_are_not_known(jobs: Jobs, syntax: bytes) -> None:
     assert payload(jobs.answer(read(syntax + item(BYTE, 1, 0)[3:]))) == bytes.fromhex("06 00 0000")
 
 
-def test_leaves_other_functions_to_others(jobs: Jobs) -> None:
+def test_jobs_of_other_functions_are_not_handled(jobs: Jobs) -> None:
     assert jobs.answer(job(b"\x28\x00")) is None
     assert jobs.answer(memoryview(bytes.fromhex("32 07 0000 0001 0004 0000 04 01 12 00"))) is None
     assert jobs.answer(memoryview(b"\x72" + bytes(SETUP)[1:])) is None
@@ -217,7 +217,7 @@ def jobs_of(block: bytearray, traits: Traits) -> Jobs:
     return jobs
 
 
-def test_grants_what_it_is_told_to(block: bytearray) -> None:
+def test_grants_the_configured_size_and_jobs(block: bytearray) -> None:
     jobs = Jobs(Memory({}), Traits(max_pdu_size=480, max_jobs=19))
     answer = jobs.answer(SETUP)
     assert answer is not None
@@ -255,12 +255,12 @@ def test_put_get_off_refuses_every_job_but_the_set_up(block: bytearray) -> None:
     assert block == bytes(range(200))
 
 
-def test_optimized_are_data_blocks_only(block: bytearray) -> None:
+def test_only_data_blocks_are_optimized(block: bytearray) -> None:
     jobs = jobs_of(block, Traits(fault=Fault.OPTIMIZED))
     assert payload(jobs.answer(read(item(BYTE, 5, 0, number=0, area=0x83)))) == bytes.fromhex("ff 04 0028") + b"flags"
 
 
-def test_a_shorter_block(block: bytearray) -> None:
+def test_block_shorter_than_its_memory(block: bytearray) -> None:
     jobs = jobs_of(block, Traits(block_size=100))
     assert payload(jobs.answer(read(item(BYTE, 1, 99)))) == bytes.fromhex("ff 04 0008 63")
     assert payload(jobs.answer(read(item(BYTE, 2, 99)))) == bytes.fromhex("05 00 0000")

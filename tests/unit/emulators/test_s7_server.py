@@ -95,7 +95,7 @@ def test_answers_while_stopped(client: snap7.Client, server: S7Server, block: by
     assert server.get_status()[1] == "Run"
 
 
-def test_only_a_start_starts(client: snap7.Client, server: S7Server) -> None:
+def test_only_a_start_command_starts_the_cpu(client: snap7.Client, server: S7Server) -> None:
     client.plc_stop()
     client.compress(1000)
     client.copy_ram_to_rom(1000)
@@ -115,14 +115,16 @@ def test_only_a_start_starts(client: snap7.Client, server: S7Server) -> None:
     [
         (b"\x00\x00\x05_DELE", b"_MODU"),
         (b"\x00\x05_MODU\x05_DELE", b""),
-        (b"\x00\x09P_PROGRAM\x05_MODU", b""),  # python-snap7 would start
+        (b"\x00\x09P_PROGRAM\x05_MODU", b""),  # python-snap7's server would start
         (b"\x00\x00\x04_MODU", b""),
         (b"\x00\x00\x09_MODU", b""),
         (b"\xff\xff\x05_MODU", b""),
     ],
     ids=["in the data", "in the argument", "a second one", "too short", "too long", "beyond the end"],
 )
-def test_a_service_is_read_at_its_place(client: snap7.Client, server: S7Server, parameters: bytes, data: bytes) -> None:
+def test_service_name_elsewhere_in_the_job_is_ignored(
+    client: snap7.Client, server: S7Server, parameters: bytes, data: bytes
+) -> None:
     client.plc_stop()
     block = bytes.fromhex("28 000000000000fd") + parameters
     job = bytes.fromhex("32 01 0000 0001") + len(block).to_bytes(2, "big") + len(data).to_bytes(2, "big") + block + data
@@ -134,8 +136,8 @@ def test_a_service_is_read_at_its_place(client: snap7.Client, server: S7Server, 
     assert server.get_status()[1] == "Stop"
 
 
-def test_tells_its_operating_mode(client: snap7.Client) -> None:
-    """SZL 0x0424: one record of 20 bytes, in its fourth byte the mode; Snap7 takes all but 0x08 for STOP."""
+def test_operating_mode_is_reported(client: snap7.Client) -> None:
+    """The mode is the fourth byte in the only record of SZL 0x0424; Snap7 takes all but 8 for STOP."""
 
     def mode() -> int:
         data = bytes(client.read_szl(0x0424).Data)
@@ -153,8 +155,8 @@ def test_tells_its_operating_mode(client: snap7.Client) -> None:
     assert mode() == 0x08
 
 
-def test_python_snap7_is_told_whether_it_runs(client: snap7.Client) -> None:
-    """It takes any acknowledgement of its question for RUN."""
+def test_python_snap7_sees_the_operating_mode(client: snap7.Client) -> None:
+    """python-snap7 takes any acknowledgement of its query for RUN."""
     assert client.get_cpu_state() == "S7CpuStatusRun"
     client.plc_stop()
     with pytest.raises(Exception, match="code=0x04"):
@@ -180,7 +182,7 @@ def test_an_address_of_another_machine() -> None:
         S7Server(Address("192.0.2.1", 4102)).start()
 
 
-def test_the_address_can_be_had_again_at_once() -> None:
+def test_address_can_be_reused_at_once() -> None:
     with reserved_port() as address:
         for _ in range(2):
             with S7Server(address) as server:
@@ -192,7 +194,7 @@ def test_the_address_can_be_had_again_at_once() -> None:
                     assert server.stop() == 0
 
 
-def test_is_started_once() -> None:
+def test_server_starts_only_once() -> None:
     with S7Server(LOOPBACK) as server:
         with pytest.raises(ShmioError, match="not started"):
             _ = server.address
@@ -201,7 +203,7 @@ def test_is_started_once() -> None:
             server.start()
 
 
-def test_refuses_a_number_twice_or_none() -> None:
+def test_duplicate_or_invalid_block_number_is_refused() -> None:
     server = S7Server(LOOPBACK)
     server.add_block(1, bytearray(1))
     for number in (1, 0, 65536):
@@ -209,7 +211,7 @@ def test_refuses_a_number_twice_or_none() -> None:
             server.add_block(number, bytearray(1))
 
 
-def test_takes_only_so_many_clients(server: S7Server, block: bytearray) -> None:
+def test_number_of_clients_is_limited(server: S7Server, block: bytearray) -> None:
     with ExitStack() as stack:
         clients = [stack.enter_context(closing(ours(server))) for _ in range(5)]
         for client in clients[:4]:
@@ -256,9 +258,9 @@ def test_garbage_ends_only_its_own_connection(server: S7Server, block: bytearray
         client.connect()
         peer.settimeout(10)
         received = b""
-        with contextlib.suppress(ConnectionError):  # it may close before all is sent, or after
+        with contextlib.suppress(ConnectionError):  # the server may close before all is sent
             peer.sendall(noise)
-            with contextlib.suppress(OSError):  # not connected any more
+            with contextlib.suppress(OSError):  # no longer connected
                 peer.shutdown(socket.SHUT_WR)
             while data := peer.recv(4096):
                 received += data
@@ -305,7 +307,7 @@ def send_forever(peer: socket.socket, data: bytes) -> None:
         peer.send(data)
 
 
-def test_a_client_that_takes_no_answers_holds_up_no_other(server: S7Server, block: bytearray) -> None:
+def test_client_that_reads_no_answers_delays_no_other(server: S7Server, block: bytearray) -> None:
     request = bytes.fromhex("0300001f 02f080 32 01 0000 0001 000e 0000 04 01 12 0a 10 02 0384 0005 84 000000")
     setup = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
     with closing(ours(server)) as client, socket.create_connection(tuple_of(server)) as greedy:
@@ -321,7 +323,7 @@ def test_a_client_that_takes_no_answers_holds_up_no_other(server: S7Server, bloc
         assert client.read() == block
 
 
-def test_requests_in_pieces_and_in_one(server: S7Server, block: bytearray) -> None:
+def test_requests_byte_by_byte_and_many_at_once(server: S7Server, block: bytearray) -> None:
     setup = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
     request = bytes.fromhex("0300001f 02f080 32 01 0000 0002 000e 0000 04 01 12 0a 10 02 0004 0005 84 000000")
     answer = bytes.fromhex("0300001d 02f080 32 03 0000 0002 0002 0008 0000 04 01 ff 04 0020") + block[:4]

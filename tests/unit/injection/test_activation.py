@@ -11,7 +11,7 @@ A, W, O = State.ACTIVE, State.WAITING, State.OVER  # noqa: E741
 
 
 def states(window: Window, conditions: str, step_ns: int = 10) -> list[State]:
-    """The state after each look, at times 0, 10, …; ``conditions``: ``#`` where it holds."""
+    """Return the states at times 0, 10, …; a ``#`` in ``conditions`` is a true condition."""
     activation = Activation(window)
     found = []
     for cycle, mark in enumerate(conditions):
@@ -30,18 +30,18 @@ def test_while_a_condition_holds() -> None:
     assert states(Window(20, 50), "###.###") == [W, W, A, W, A, O, O]
 
 
-def test_for_a_limited_time_after_it_came_true() -> None:
+def test_limited_time_after_a_condition_became_true() -> None:
     assert states(Window(for_ns=20), ".#....#####") == [W, A, A, W, W, W, A, A, W, W, W]
     assert states(Window(for_ns=20), "#..#.") == [A, A, W, A, A]
     assert states(Window(0, 30, for_ns=100), "######") == [A, A, A, O, O, O]
 
 
-def test_so_many_times() -> None:
+def test_limited_number_of_activations() -> None:
     assert states(Window(times=2), "#.#.#.") == [A, W, A, O, O, O]
     assert states(Window(for_ns=10, times=1), "##.#") == [A, O, O, O]
 
 
-def test_one_that_goes_on_for_another_process_does_not_begin_anew() -> None:
+def test_restored_activation_continues() -> None:
     activation = Activation(Window(for_ns=20), State.WAITING, runs=1)
     activation.advance(100, 10, holds=True)
     assert activation.state is W
@@ -65,7 +65,7 @@ times = st.none() | st.integers(0, 300)
     st.none() | st.integers(1, 3),
     st.text("#.", max_size=40),
 )
-def test_what_always_holds(start: int, end: int | None, for_ns: int | None, most: int | None, marks: str) -> None:
+def test_invariants(start: int, end: int | None, for_ns: int | None, most: int | None, marks: str) -> None:
     window = Window(start, end, for_ns, most)
     activation = Activation(window)
     before = activation.state

@@ -1,4 +1,4 @@
-"""Conditions: what they mean, what they refuse, and that no text whatever does anything else."""
+"""Conditions: their meaning and their errors; any text is either valid or refused."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ def holds(text: str, **others: Number | None) -> bool:
         "1.5e1 == 15", '"cell/R 1/x" == 7', "'cell/R 1/x' > a", "on == 1", "(a)", "a-1 == 2",
     ],
 )  # fmt: skip
-def test_what_is_true(text: str) -> None:
+def test_true_conditions(text: str) -> None:
     assert holds(text)
     assert not holds(f"not ({text})")
 
 
-def test_a_path_is_one_word() -> None:
+def test_path_is_one_token() -> None:
     expression = parse("cell/Outputs/13.%X0 and sim/Kuka.j1/R>2 and cell/Outputs/13.%X0")
     assert expression.references == ("cell/Outputs/13.%X0", "sim/Kuka.j1/R")
 
 
-def test_edges_are_of_two_looks() -> None:
+def test_edges_compare_consecutive_evaluations() -> None:
     rising, falling, changed = (parse(f"{edge}(a > 1)") for edge in ("rising", "falling", "changed"))
     memories = [Memory(), Memory(), Memory()]
     seen = [
@@ -56,18 +56,18 @@ def test_edges_are_of_two_looks() -> None:
     ]  # fmt: skip
 
 
-def test_no_edge_is_missed_by_the_rest_of_a_condition() -> None:
+def test_edge_is_seen_even_if_the_rest_decides_the_result() -> None:
     expression, memory = parse("off and rising(a) or on and rising(a)"), Memory()
     assert expression.references == ("off", "a", "on")
     assert [expression.holds([False, value, True], memory) for value in (False, True, True)] == [False, True, False]
 
 
-def test_what_is_not_known_is_not_true_and_neither_is_its_opposite() -> None:
+def test_condition_with_an_unknown_value_is_false_and_so_is_its_negation() -> None:
     for text in ("a > 1", "not a > 1", "on or a > 1", "1 / (a - 3) > 0", "not 1 / (b + 2.5) > 0"):
         assert not holds(text, a=None if "-" not in text else 3)
 
 
-def test_not_a_number_compares_with_nothing() -> None:
+def test_comparison_with_nan_is_false() -> None:
     assert not holds("b > 0 or b <= 0", b=math.nan)
 
 
@@ -91,7 +91,7 @@ def test_not_a_number_compares_with_nothing() -> None:
         ("1" * 41 + " > a", "at most 40 digits"),
     ],
 )
-def test_what_is_refused(text: str, message: str) -> None:
+def test_faulty_condition_is_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=r"^[^\n]*$") as raised:
         parse(text)
     assert message in str(raised.value)
@@ -127,7 +127,7 @@ TREES = st.recursive(
 
 
 @given(TREES)
-def test_arithmetic_is_that_of_numbers(tree: tuple[str, int]) -> None:
+def test_arithmetic_agrees_with_python(tree: tuple[str, int]) -> None:
     text, value = tree
     if len(text) < 900:
         expression = parse(f"{text} == {value}" if value >= 0 else f"{text} == -{-value}")

@@ -1,4 +1,4 @@
-"""Random numbers that follow from a seed and a place."""
+"""Random numbers that depend only on a seed and a place."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from shmio.injection.draw import FEW, Purpose, SeededRandom
 places = st.integers(0, 2**40)
 
 
-def test_the_numbers_are_these_for_ever() -> None:
+def test_numbers_are_the_same_in_every_version() -> None:
     """A campaign recorded with one version repeats with the next."""
     words = SeededRandom(7, "drift").words(1, 12, Purpose.VALUE, 3)
     assert [f"{word:016x}" for word in words.tolist()] == ["c5b32a2bd6d0f3ce", "20657407695298c2", "a78378d3780506af"]
 
 
 @given(st.integers(0, 2**63 - 1), places, places)
-def test_the_same_place_has_the_same_numbers_in_any_order(seed: int, run: int, place: int) -> None:
+def test_numbers_of_a_place_do_not_depend_on_the_order_of_calls(seed: int, run: int, place: int) -> None:
     one, other = SeededRandom(seed, "a"), SeededRandom(seed, "a")
     later = other.uniform(run, place + 1, 4)
     assert one.uniform(run, place, 8).tolist() == other.uniform(run, place, 8).tolist()
@@ -27,7 +27,7 @@ def test_the_same_place_has_the_same_numbers_in_any_order(seed: int, run: int, p
     assert one.uniform(run, place + 1, 4).tolist() == later.tolist()
 
 
-def test_seed_name_activation_place_and_purpose_tell_numbers_apart() -> None:
+def test_each_seed_name_activation_place_and_purpose_has_its_own_numbers() -> None:
     found = [
         SeededRandom(seed, name).words(run, place, purpose, 1)[0]
         for seed in (0, 1) for name in ("a", "b") for run in (1, 2) for place in (0, 1) for purpose in Purpose
@@ -36,7 +36,7 @@ def test_seed_name_activation_place_and_purpose_tell_numbers_apart() -> None:
 
 
 @given(st.integers(0, 2**32), places)
-def test_ranges(seed: int, place: int) -> None:
+def test_numbers_are_within_their_range(seed: int, place: int) -> None:
     draw = SeededRandom(seed, "x")
     uniform = draw.uniform(1, place, 50)
     assert ((uniform >= 0) & (uniform < 1)).all()
@@ -46,7 +46,7 @@ def test_ranges(seed: int, place: int) -> None:
     assert draw.happens(1, 1, place)
 
 
-def test_distributions_are_as_they_are_called() -> None:
+def test_statistics_of_the_distributions() -> None:
     draw = SeededRandom(1, "x")
     uniform = np.concatenate([draw.uniform(1, place, 100) for place in range(1000)])
     assert uniform.mean() == pytest.approx(0.5, abs=0.005)
@@ -62,7 +62,7 @@ def test_distributions_are_as_they_are_called() -> None:
 
 
 @given(st.integers(0, 2**32), places)
-def test_few_numbers_are_the_first_of_many(seed: int, place: int) -> None:
+def test_short_sequence_is_the_beginning_of_a_longer_one(seed: int, place: int) -> None:
     draw = SeededRandom(seed, "x")
     for purpose in Purpose:
         assert draw.words(3, place, purpose, FEW).tolist() == draw.words(3, place, purpose, FEW + 1)[:FEW].tolist()

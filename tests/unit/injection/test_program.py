@@ -1,4 +1,4 @@
-"""Operations on images: each against its meaning in plain numbers; and what a declaration may not say."""
+"""Operations on images, compared with plain arithmetic, and errors of declarations."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def value_of(path: str, image: np.ndarray[Any, np.dtype[np.uint8]]) -> Value:
 
 
 def becomes(path: str, value: Value, operation: str, place: int = 0, /, **keys: Any) -> Value:
-    """What an operation makes of a register, on the image's covered bits."""
+    """Return the value of a register after an operation on its covered bits."""
     found = program(path, operation, **keys)
     image = image_of({path: value})
     before = image.copy()
@@ -70,7 +70,7 @@ LIMITS = {"int": (-(2**15), 2**15 - 1), "uint": (0, 2**16 - 1), "lint": (-(2**63
 
 
 @given(st.sampled_from(sorted(LIMITS)), st.data())
-def test_whole_numbers_are_exact_and_stop_at_the_limits_of_their_type(path: str, data: st.DataObject) -> None:
+def test_whole_numbers_are_exact_and_limited_to_their_type(path: str, data: st.DataObject) -> None:
     least, most = LIMITS[path]
     value = data.draw(st.integers(least, most))
     by = data.draw(st.integers(-(2**60), 2**60))
@@ -84,13 +84,13 @@ floats = st.floats(allow_nan=False, allow_infinity=False)
 
 
 @given(floats, floats)
-def test_reals_are_those_of_ieee_754_within_their_range(value: float, by: float) -> None:
+def test_reals_follow_ieee_754_and_are_limited_to_their_range(value: float, by: float) -> None:
     most = struct.unpack(">d", b"\x7f\xef" + b"\xff" * 6)[0]
     assert becomes("lreal", value, "offset", value=by) == min(max(value + by, -most), most)
     assert becomes("lreal", value, "scale", value=by) == min(max(value * by, -most), most)
 
 
-def test_not_a_number_stays_so() -> None:
+def test_nan_stays_nan() -> None:
     for operation, keys in (("offset", {"value": 1}), ("scale", {"value": 2}), ("clamp", {"min": 0})):
         found = becomes("real", math.nan, operation, **keys)
         assert isinstance(found, float)
@@ -133,7 +133,7 @@ def test_random_is_from_its_range_or_set(place: int, least: int, width: int) -> 
     assert becomes("run", False, "random", place, values=[True]) is True
 
 
-def test_each_value_of_a_range_comes_and_each_register_draws_its_own() -> None:
+def test_every_value_of_a_range_occurs_and_registers_draw_independently() -> None:
     assert {becomes("int", 0, "random", place, min=1, max=3) for place in range(100)} == {1, 2, 3}
     assert {becomes("run", False, "random", place, values=[True, False]) for place in range(50)} == {True, False}
     grids = [becomes("grid", [0] * 4, "random", place, min=0, max=1000) for place in range(5)]
@@ -143,7 +143,7 @@ def test_each_value_of_a_range_comes_and_each_register_draws_its_own() -> None:
 
 
 @given(st.integers(0, 2**15 - 1), st.sets(st.integers(0, 15), min_size=1), st.integers(0, 100))
-def test_flip_turns_over_the_bits_given_or_one_of_all(value: int, bits: set[int], place: int) -> None:
+def test_flip_inverts_the_given_bits_or_one_random_bit(value: int, bits: set[int], place: int) -> None:
     assert becomes("uint", value, "flip", bits=sorted(bits)) == value ^ sum(1 << bit for bit in bits)
     one = becomes("uint", value, "flip", place)
     assert isinstance(one, int)
@@ -151,7 +151,7 @@ def test_flip_turns_over_the_bits_given_or_one_of_all(value: int, bits: set[int]
     assert becomes("run", True, "flip") is False
 
 
-def test_a_flipped_bit_is_any_of_those_covered() -> None:
+def test_random_flip_reaches_every_covered_bit() -> None:
     assert {becomes("uint", 0, "flip", place) for place in range(300)} == {1 << bit for bit in range(16)}
 
 
@@ -159,7 +159,7 @@ moments = st.lists(st.integers(0, 3), min_size=1, max_size=40)
 
 
 def walk(operation: Operation, steps: list[int]) -> list[tuple[int, int]]:
-    """(value of the device, value shown) for images of cycles that go on by 0 to 3."""
+    """Return (device's value, shown value) of each image; ``steps``: cycles between images."""
     seen = []
     cycle = 0
     for number, step in enumerate(steps):
@@ -171,12 +171,12 @@ def walk(operation: Operation, steps: list[int]) -> list[tuple[int, int]]:
         seen.append((cycle, shown))
         again = image_of({"uint": cycle})
         operation.apply(again, OperationContext(1, cycle, cycle, cycle * 10))
-        assert value_of("uint", again) == shown, f"image {number}: looking twice changed something"
+        assert value_of("uint", again) == shown, f"image {number}: the same cycle again gives the same value"
     return seen
 
 
 @given(moments, st.integers(1, 6))
-def test_a_delay_shows_the_newest_that_is_old_enough(steps: list[int], cycles: int) -> None:
+def test_delay_shows_the_newest_value_that_is_old_enough(steps: list[int], cycles: int) -> None:
     for keys in ({"delay_cycles": cycles}, {"delay_ms": cycles * 1e-5}):
         operation = program("t/uint", "delay", **keys).operate(DRAW)
         seen = walk(operation, steps)
@@ -187,13 +187,13 @@ def test_a_delay_shows_the_newest_that_is_old_enough(steps: list[int], cycles: i
 
 
 @given(moments)
-def test_freeze_and_drop_hold(steps: list[int]) -> None:
+def test_freeze_and_drop_keep_the_first_value(steps: list[int]) -> None:
     for name in ("freeze", "drop"):
         operation = program("t/uint", name).operate(DRAW)
         first = steps[0]
         assert {shown for _, shown in walk(operation, steps)} == {first}
         operation.begin()
-        assert walk(operation, [50])[0] == (50, 50), "a new activation holds anew"
+        assert walk(operation, [50])[0] == (50, 50), "a new activation keeps a new value"
 
 
 @pytest.mark.parametrize(
@@ -220,14 +220,14 @@ def test_freeze_and_drop_hold(steps: list[int]) -> None:
         ("t/int", "freeze", {"when": "t/int/in"}, "leave out /in"),
     ],
 )
-def test_what_is_refused_begins_with_the_key(target: str, operation: str, keys: dict[str, Any], message: str) -> None:
+def test_faulty_declaration_is_refused_by_key(target: str, operation: str, keys: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as refused:
         program(target, operation, **keys)
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
-def test_a_large_target_is_refused_where_each_value_counts() -> None:
+def test_large_target_is_refused_for_operations_on_single_values() -> None:
     large = compile_sources([Source("l.toml", b'[registers]\nall = "ARRAY[0..5000] OF INT"\n')]).layouts[0]
     declared = msgspec.convert({"name": "x", "target": "l", "operation": "offset", "value": 1}, Declaration)
     with pytest.raises(ConfigError, match="more than 4096 single values"):
@@ -265,10 +265,10 @@ places = st.lists(st.tuples(st.integers(0, 3), st.binary(min_size=LAYOUT.size, m
     ),
     places,
 )
-def test_whatever_is_not_refused_runs_over_any_bytes(
+def test_accepted_operation_runs_on_any_bytes(
     operation: tuple[str, dict[str, Any]], targets: list[str], images: list[tuple[int, bytes]]
 ) -> None:
-    """An operation that failed would end the source's process. Warnings are errors here."""
+    """A failing operation would end the source's process. In tests, warnings are errors."""
     name, keys = operation
     try:
         found = program([f"t/{target}" for target in targets], name, **keys)

@@ -1,4 +1,4 @@
-"""What a target names: registers, elements, ranges, slices of integers, structures, patterns, whole sources."""
+"""Targets of injections: registers, elements, ranges, parts, structures, patterns, sources."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def test_registers_elements_structures_patterns_and_sources() -> None:
     assert resolve(["SIM://a/out"], LAYOUTS)[:2] == ("sim", "out")
 
 
-def test_ranges_are_of_the_last_index() -> None:
+def test_range_is_of_the_last_index() -> None:
     assert paths("cell/bytes/2..4") == ["bytes/2", "bytes/3", "bytes/4"]
     assert paths("cell/grid/2/1..3/in") == ["grid/2/1", "grid/2/2", "grid/2/3"]
 
 
-def test_slices_count_from_the_least_significant() -> None:
+def test_bits_bytes_and_words_count_from_the_least_significant() -> None:
     offset = BIG.registers[BIG.by_path["word"]].offset
     assert bits(resolve(["cell/word.%X0"], LAYOUTS).cover) == {(offset + 1, 0)}
     assert bits(resolve(["cell/word.%X15"], LAYOUTS).cover) == {(offset, 7)}
@@ -96,22 +96,22 @@ def test_a_register_named_twice_counts_once() -> None:
         (["cell//speed"], "empty segment"),
     ],
 )
-def test_what_is_refused(texts: list[str], message: str) -> None:
+def test_faulty_target_is_refused(texts: list[str], message: str) -> None:
     if not message:
-        assert paths(*texts) == ["word"], "it is there already"
+        assert paths(*texts) == ["word"], "the whole register is named already"
         return
     with pytest.raises(PathError) as refused:
         resolve(texts, LAYOUTS)
     assert message in str(refused.value)
 
 
-def test_a_target_has_a_bound() -> None:
+def test_size_of_a_target_is_bounded() -> None:
     many = Layout("m", None, 5000, False, tuple(Register(f"r{at}", "BYTE", (), at, None, 1, 1) for at in range(5000)))
     with pytest.raises(PathError, match=f"more than {MAX_REGISTERS} registers"):
         resolve(["m/**"], {"m": many})
 
 
-def test_what_a_condition_reads_is_one_register_that_comes_out() -> None:
+def test_condition_refuses_registers_toward_the_device() -> None:
     assert single("cell/speed/out", LAYOUTS)[1].path == "speed"
     for text in ("cell/speed/in", "cell/word.%X1/in"):
         with pytest.raises(PathError, match="leave out /in"):

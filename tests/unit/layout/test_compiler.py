@@ -80,7 +80,7 @@ def test_names_of_any_script_and_keywords_before_a_colon() -> None:
 
 
 @pytest.mark.parametrize("gap", [" ", "\t", "\x1f", "(* note *)", " (*\x1f*) "])
-def test_what_stands_between_the_words_of_a_name_becomes_spaces(gap: str) -> None:
+def test_gap_between_the_words_of_a_name_becomes_a_space(gap: str) -> None:
     text = block(f"fill{gap}level : Int;", f"fill{gap}level := 3;")
     layout = layout_of(text)
     assert [(r.path, r.initial) for r in layout.registers] == [("fill level", "3")]
@@ -218,7 +218,7 @@ def test_arrays_of_structures_are_expanded() -> None:
     assert (found["a/1/0/y"].dims, found["a/1/0/y"].count, found["a/1/0/y"].size) == (((0, 2),), 3, 6)
 
 
-def test_aliases_have_one_name() -> None:
+def test_aliases_of_a_type_become_one_name() -> None:
     found = registers("a : TOD; b : DT; c : LTIME_OF_DAY; d : String; e : WString; f : DATE_AND_LTIME;")
     types = ["TIME_OF_DAY", "DATE_AND_TIME", "LTOD", "STRING[254]", "WSTRING[254]", "LDT"]
     assert [r.type for r in found.values()] == types
@@ -386,7 +386,7 @@ def test_long_chains_of_types_end_in_an_error(order: int) -> None:
     assert any("32" in error for error in errors(text))
 
 
-def test_explosive_types_end_in_an_error() -> None:
+def test_types_of_exponential_size_end_in_an_error() -> None:
     types = [
         f'TYPE "t{i}" STRUCT a : Array[1..99] of "t{i + 1}"; b : "t{i + 1}"; END_STRUCT; END_TYPE' for i in range(20)
     ]
@@ -406,7 +406,7 @@ def test_bounds_on_files() -> None:
     assert len(many) == MAX_ERRORS
 
 
-def test_warnings_come_with_the_errors_too() -> None:
+def test_warnings_come_with_errors() -> None:
     with pytest.raises(LayoutError) as caught:
         compile_text(block("a b : Int; c : Nope;"))
     assert [d.severity for d in caught.value.diagnostics] == ["error", "warning"]

@@ -16,7 +16,7 @@ from shmio.layout.topic import Topic
     ("pattern", "path", "matches"),
     [
         ("a", "a", True),
-        ("a", "a/b/c", True),  # what is below is covered
+        ("a", "a/b/c", True),  # also covers all below
         ("a", "ab", False),
         ("a/b", "a", False),
         ("*", "a", True),
@@ -62,7 +62,7 @@ def test_refused(pattern: str) -> None:
 
 
 def reference(pattern: str, path: str) -> bool:
-    """The same by regular expressions: obvious, and slow for patterns with many stars."""
+    """Match by a regular expression: simple, but slow for patterns with many stars."""
     expression = ""
     for piece in re.findall(r"(?:(?<=/)|^)\*\*+/|\*+|[^*]", pattern):
         if piece.startswith("**") and piece.endswith("/"):
@@ -83,7 +83,7 @@ def test_agrees_with_regular_expressions(pattern: str, path: str) -> None:
     assert Glob(pattern).matches(path) == reference(pattern, path)
 
 
-def test_many_stars_end() -> None:
+def test_many_stars_do_not_take_exponential_time() -> None:
     assert not Glob("*a" * 500 + "b").matches("a" * 10_000)
 
 
@@ -117,13 +117,13 @@ LISTS = compile_sources(
         ("a/3..3", ["a/3"]),
     ],
 )
-def test_what_a_path_names(path: str, paths: list[str]) -> None:
+def test_path_names_registers(path: str, paths: list[str]) -> None:
     assert [register.path for register in named(LISTS, Topic("cell", path))] == paths
 
 
 @pytest.mark.parametrize(
     "path", ["q", "a/4", "a/2..4", "a/1..0", "z/0..1", "s/0..1", "s/y/0..1", "a/1..", "a/..", "q/0..1"]
 )
-def test_what_a_path_does_not_name(path: str) -> None:
+def test_path_that_names_nothing_is_refused(path: str) -> None:
     with pytest.raises(PathError):
         named(LISTS, Topic("cell", path))

@@ -25,7 +25,7 @@ def address(register: Register) -> str:
 
 
 @pytest.mark.parametrize("path", RULES, ids=lambda path: path.stem)
-def test_registers_lie_where_the_source_says(path: Path) -> None:
+def test_registers_are_at_the_stated_addresses(path: Path) -> None:
     compiled = compile_file(path)
     (layout,) = compiled.layouts
     found: dict[tuple[str, str], list[str]] = defaultdict(list)
@@ -53,4 +53,4 @@ def test_db201_as_printed() -> None:
     assert [warning.line for warning in spaced] == [7, 11, 12, 13, 14, 15, 29, 30]
     (optimized,) = set(compiled.warnings) - set(spaced)
     assert "Optimized block access" in optimized.message
-    assert "OPC UA" not in optimized.message, "no such way to read it exists yet"
+    assert "OPC UA" not in optimized.message, "shmio does not read by OPC UA"

@@ -102,7 +102,7 @@ def test_instances_within_instances_and_system_function_blocks() -> None:
         BEGIN
         END_DATA_BLOCK
     """
-    # As the CPU sees them, by the absolute addresses in a public test of a soft PLC; TON by Siemens' interface.
+    # The absolute addresses are from a public test of a soft PLC; TON is from Siemens' interface.
     layout = layout_of(text)
     assert (layout.number, layout.size) == (1, 50)
     assert places(layout) == {
@@ -157,7 +157,7 @@ def test_an_instance_without_members_is_empty() -> None:
     assert layout_of(f'FUNCTION_BLOCK "f" x := 1; END_FUNCTION_BLOCK DATA_BLOCK "d" "f" BEGIN {END}').size == 0
 
 
-def test_endless_arrays_of_nothing_end_in_an_error() -> None:
+def test_huge_arrays_of_empty_structures_end_in_an_error() -> None:
     nothing = 'FUNCTION_BLOCK "f" VAR_INPUT v : Variant; END_VAR BEGIN END_FUNCTION_BLOCK '
     assert layout_of(nothing + block('a : Array[0..99] of "f"; b : Int;')).size == 2
     message = error(nothing + block('a : Array[0..2147483647] of "f" := [(1)];'))
@@ -165,7 +165,7 @@ def test_endless_arrays_of_nothing_end_in_an_error() -> None:
 
 
 def nested(count: int, last: str) -> str:
-    """Types of three members each, all of the next type; the last one is given."""
+    """Return types that each have three members of the next type, and the given last type."""
     return "".join(
         f'TYPE "t{i}" STRUCT\n a, b : "t{i + 1}";\n c : "t{i + 1}";\nEND_STRUCT; END_TYPE\n' for i in range(count)
     ) + last.format(f"t{count}")
@@ -179,7 +179,7 @@ def nested(count: int, last: str) -> str:
         'FUNCTION_BLOCK "{}" VAR_INPUT v : Variant; END_VAR BEGIN END_FUNCTION_BLOCK\n',
     ],
 )
-def test_structures_count_though_they_hold_nothing(last: str) -> None:
+def test_empty_structures_count_toward_the_limit(last: str) -> None:
     message = error(nested(29, last) + block('a : "t0";'))
     assert message.startswith("0.scl:75:")
     assert "expected at most 200000 structures in the type 't18'; up to this member there are 265719" in message
@@ -247,7 +247,7 @@ def test_constants_as_bounds(bounds: str, dims: tuple[int, int]) -> None:
     assert layout_of(constants, block(f"a : Array[{bounds}] of Int;")).registers[0].dims == (dims,)
 
 
-def test_the_constants_of_a_block_come_before_those_of_all() -> None:
+def test_constants_of_a_block_shadow_global_ones() -> None:
     own = 'DATA_BLOCK "b" VAR CONSTANT N : Int := 3; END_VAR VAR a : Array[1..N] of Byte; t : "t"; END_VAR BEGIN '
     udt = 'TYPE "t" STRUCT a : String[N]; END_STRUCT; END_TYPE '
     layout = layout_of("VAR CONSTANT N : Int := 5; END_VAR", own + END, udt)
@@ -290,14 +290,14 @@ def test_constants_as_initial_values() -> None:
         ("N : Int := 1", "a : Int;", "expected ';' after the value"),
     ],
 )
-def test_constants_that_cannot_be(constants: str, member: str, message: str) -> None:
+def test_invalid_constants_are_refused(constants: str, member: str, message: str) -> None:
     sources = [block(member)]
     if constants:
         sources.append(f"VAR CONSTANT\n{constants}\nEND_VAR")
     assert message in error(*sources)
 
 
-def test_long_sums_and_chains_of_constants_have_an_end() -> None:
+def test_long_sums_and_chains_of_constants_are_bounded() -> None:
     assert layout_of(block(f"a : Array[0..{'1+' * 50_000}1] of Bool;")).registers[0].count == 50_002
     doubled = "".join(f"C{i} : Int := C{i + 1} * C{i + 1} + C{i + 1};\n" for i in range(31))
     zero = f"VAR CONSTANT {doubled} C31 : Int := 0; END_VAR"
@@ -337,7 +337,7 @@ def test_initial_values_of_structures(value: str, found: list[str | None]) -> No
     assert list(initials(f'a : "p" := {value};', POINT).values()) == found
 
 
-def test_initial_values_come_from_the_outermost_that_gives_one() -> None:
+def test_outermost_initial_value_wins() -> None:
     types = 'TYPE "o" STRUCT p : "p" := (4, 5); q : "p"; END_STRUCT; END_TYPE ' + POINT
     found = initials('a : "o" := (((), 6), (y := 7)); b : "o";', types)
     assert {path: value for path, value in found.items() if "/z/" not in path} == {
@@ -421,7 +421,7 @@ def test_comments_within_a_value_are_left_out() -> None:
         ("TOF", 22, ("ATIME", 18)),
     ],
 )
-def test_system_types_have_the_length_that_is_stated(name: str, size: int, last: tuple[str, float]) -> None:
+def test_system_types_have_the_stated_length(name: str, size: int, last: tuple[str, float]) -> None:
     layout = layout_of(block(f"a : {name}; after : Byte;"))
     found = list(places(layout).items())
     assert found[-2:] == [(f"a/{last[0]}", last[1]), ("after", size)]
@@ -442,7 +442,7 @@ def test_tcon_param_at_its_stated_bytes() -> None:
         ("Timer", "UINT", 2),
     ],
 )
-def test_types_that_name_something_are_numbers(name: str, type_: str, size: int) -> None:
+def test_identifier_types_are_plain_values(name: str, type_: str, size: int) -> None:
     (register,) = layout_of(block(f"a : {name};")).registers
     assert (register.type, register.size) == (type_, size)
 
@@ -454,12 +454,12 @@ def test_system_types_without_a_public_placement_are_refused_with_the_remedy(nam
     assert f'give it as a PLC data type: TYPE "{name}" STRUCT' in message
 
 
-def test_a_given_type_replaces_the_refusal_and_what_is_known() -> None:
+def test_declared_type_replaces_the_built_in_one() -> None:
     given = 'TYPE "IEC_TIMER" STRUCT x : DInt; END_STRUCT; END_TYPE TYPE CREF STRUCT y : Byte; END_STRUCT; END_TYPE '
     assert places(layout_of(given + block("a : IEC_TIMER; b : CREF;"))) == {"a/x": 0, "b/y": 4}
 
 
-# -- types of which the size alone is known --------------------------------------------------------------------
+# -- types of which only the size is known ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -486,7 +486,7 @@ def test_a_system_type_of_public_length_is_bytes_without_meaning(name: str, size
     assert layout.registers[1].type == "BYTE"
 
 
-def test_a_block_that_is_a_timer_with_values_that_nobody_can_place() -> None:
+def test_initial_values_of_an_unknown_structure_are_ignored() -> None:
     compiled = compile_text(f'DATA_BLOCK "T1" NON_RETAIN IEC_TIMER BEGIN PT := T#5s; {END}')
     assert places(compiled.layouts[0]) == {"bytes": 0}
     assert "the value is ignored" in compiled.warnings[1].message
@@ -528,7 +528,7 @@ DATA_BLOCK "Twice" STRUCT a : Int; END_STRUCT; BEGIN END_DATA_BLOCK
 
 
 @pytest.mark.parametrize("text", [OTHERS + "{}", "{}" + OTHERS], ids=["behind", "before"])
-def test_what_is_wrong_with_other_blocks_does_not_count(text: str) -> None:
+def test_faults_of_other_blocks_are_ignored(text: str) -> None:
     plain = (
         'DATA_BLOCK "Plain" STRUCT a : Array[0..199] of Int; b : Bool; END_STRUCT; BEGIN b := TRUE; END_DATA_BLOCK\n'
     )
@@ -547,7 +547,7 @@ def test_what_is_wrong_with_other_blocks_does_not_count(text: str) -> None:
         assert len({error.line for error in caught.value.diagnostics}) == 1
 
 
-def test_a_type_that_the_block_uses_counts() -> None:
+def test_fault_of_a_type_that_the_block_uses_is_reported() -> None:
     text = OTHERS + 'DATA_BLOCK "Uses" STRUCT a : "broken"; END_STRUCT; BEGIN END_DATA_BLOCK\n'
     with pytest.raises(LayoutError, match="2:26: error: expected a type"):
         compile_sources([Source("x.db", text.encode())], blocks=["Uses"])

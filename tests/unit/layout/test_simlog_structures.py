@@ -21,7 +21,7 @@ def block(body: str) -> Sequence[Register]:
 
 
 @pytest.mark.parametrize("shape", CONTENTS)
-def test_every_shape_is_a_type_of_tag_tables_and_recognised(shape: str) -> None:
+def test_every_structure_is_a_type_of_tag_tables_and_is_recognised(shape: str) -> None:
     layout = place_tags("t", {"zones/Z1": f"{shape}{LENGTHS.get(shape, '')}"})
     assert layout.registers
     found = recognise("zones/Z1", layout.registers)
@@ -57,11 +57,11 @@ def test_wrong_lengths_are_refused(text: str, message: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["LREAL", "STRING[20]", "time", "Pose", "ARRAY[0..1] OF Point"])
-def test_others_are_no_structures(text: str) -> None:
+def test_other_types_are_no_structures(text: str) -> None:
     assert members(text) is None
 
 
-def test_a_data_block_may_have_them_in_any_order_and_case() -> None:
+def test_members_are_recognised_in_any_order_and_case() -> None:
     body = "Zone : String; LEVEL : LReal; Object2 : String[8]; object1 : WString;"
     found = recognise("z", block(body))
     assert found is not None
@@ -82,7 +82,7 @@ def test_a_data_block_may_have_them_in_any_order_and_case() -> None:
         "joint_names : Array[0..1] of String; points : Struct positions : Array[0..1] of Real; END_STRUCT;",
     ],
 )
-def test_what_lacks_a_member_or_has_another_is_none(body: str) -> None:
+def test_missing_or_additional_member_prevents_recognition(body: str) -> None:
     assert recognise("z", block(body)) is None
 
 
@@ -102,7 +102,7 @@ def test_a_table_cannot_hide_more_registers_than_a_block_may_have() -> None:
 
 
 @pytest.mark.parametrize("key", ["a/in", "out"])
-def test_a_structure_has_no_direction_in_its_name_either(key: str) -> None:
+def test_path_of_a_structure_must_not_end_in_a_direction(key: str) -> None:
     with pytest.raises(LayoutError, match=f"{key}: the path ends in a direction"):
         place_tags("t", {key: "Point"})
 

@@ -42,7 +42,7 @@ LAYOUTS = {"cell": CELL, "other": PLAIN.layouts[0]}
         ("Kuka.j1", "Kuka.j1"),
         ("odd[1]", "odd[1]"),
         ("Axes/2/Vel", "Axes/2/Vel"),
-        ("Axes[9].Vel", "Axes[9].Vel"),  # it names nothing
+        ("Axes[9].Vel", "Axes[9].Vel"),  # no such register: unchanged
         ("Axes[2]Vel", "Axes[2]Vel"),
         ("Other.Axes[2].Vel", "Other.Axes[2].Vel"),
         ("Axes[a]", "Axes[a]"),
@@ -65,7 +65,7 @@ def test_within_a_block(text: str, path: str) -> None:
         ("DB7.a[1].%X3/out", "other/a/1.%X3/out"),
         ("other/a[1..2]", "other/a/1..2"),
         ("CELL://Kuka.j1", "CELL://Kuka.j1"),
-        ("Axes[2].Vel", "Axes[2].Vel"),  # of which source?
+        ("Axes[2].Vel", "Axes[2].Vel"),  # no source: unchanged
     ],
 )
 def test_with_a_source(text: str, path: str) -> None:

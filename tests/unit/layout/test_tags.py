@@ -37,7 +37,7 @@ def refusal(text: str | bytes) -> str:
     return str(error.value)
 
 
-def test_values_lie_in_the_order_of_the_file_at_multiples_of_their_size() -> None:
+def test_registers_are_placed_in_file_order_at_multiples_of_their_size() -> None:
     layout = compiled(TABLE)
     assert (layout.name, layout.number, layout.byte_order, layout.optimized) == ("cell", None, "little", False)
     assert [(r.path, r.type, r.offset, r.bit) for r in layout.registers] == [
@@ -112,7 +112,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("text", WRONG)
-def test_what_is_wrong_is_named(text: str) -> None:
+def test_fault_is_named_with_its_line(text: str) -> None:
     assert WRONG[text] in refusal(text)
 
 
@@ -131,11 +131,11 @@ def test_paths_that_differ_in_case_only_are_warned_of() -> None:
     ]
 
 
-def test_what_is_no_text_is_refused() -> None:
+def test_file_that_is_not_utf8_is_refused() -> None:
     assert "cell.toml:2:1: error: it is not in UTF-8" in refusal(b"[registers]\n\xff = 'INT'")
 
 
-def test_a_tag_table_stands_alone() -> None:
+def test_tag_table_cannot_be_combined_with_other_files() -> None:
     with pytest.raises(LayoutError, match="cannot be combined with other files"):
         compile_sources([Source("a.toml", b"[registers]"), Source("b.udt", b"")])
 

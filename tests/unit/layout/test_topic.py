@@ -41,7 +41,7 @@ SOURCES = ("cell", "sim", "Robot")
         ("sim/", "sim", "", None),
         ("SIM://", "sim", "", None),
         ("CELL://in", "cell", "", "in"),
-        ("Cell/a", "cell", "Cell/a", None),  # only a scheme is free in its case
+        ("Cell/a", "cell", "Cell/a", None),  # only a scheme ignores case
         ("cell/cell/a", "cell", "cell/a", None),
         ("cell/a/In", "cell", "a/In", None),
         ("cell/a/in/out", "cell", "a/%69n", "out"),
@@ -93,7 +93,7 @@ def test_a_path_may_end_in_a_part_of_a_register(part: str) -> None:
     with pytest.raises(PathError, match=rf"^8\.{part}: a bit or another part of a register is allowed only at the end"):
         parse_topic(f"cell/a/8.{part}/b", SOURCES, "cell")
     with pytest.raises(PathError, match="only at the end"):
-        canonical_path(f"a/8.{part}")  # as of a register in a layout
+        canonical_path(f"a/8.{part}")  # like the path of a register in a layout
     assert parse_topic("cell/8.%X07", SOURCES, "cell").path == "8.%X7"
 
 
@@ -109,7 +109,7 @@ def test_without_default_the_source_must_be_named() -> None:
         parse_topic("nope://a", SOURCES, "cell")
 
 
-def test_a_path_without_a_source_says_where_it_was_looked_for(layout: Layout) -> None:
+def test_error_for_a_path_without_a_source_names_the_searched_source(layout: Layout) -> None:
     with pytest.raises(PathError, match=r"^b: no such register in DB1; searched in source cell, because the path"):
         look_up(layout, parse_topic("b/out", SOURCES, "cell"))
     with pytest.raises(PathError, match=r"^cell/b: no such register in DB1$"):
@@ -118,7 +118,7 @@ def test_a_path_without_a_source_says_where_it_was_looked_for(layout: Layout) ->
 
 
 @given(st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1))
-def test_every_name_survives_a_path(name: str) -> None:
+def test_every_name_can_be_encoded_in_a_path(name: str) -> None:
     segment = encode_segment(name)
     assert decode_segment(segment) == name
     assert not set(segment) & set("/+#")
@@ -210,7 +210,7 @@ def test_members(layout: Layout) -> None:
 
 
 def test_deep_and_long_paths_are_looked_up_in_little_memory() -> None:
-    """224 segments and 16 kB each, the longest there can be: a table of all structures would have 180 MB."""
+    """The paths have the maximum length. A table of all structures would take 180 MB."""
     deep = "/".join(["x" * 70] * 222)
     paths = [f"{index}/{deep}/Last" for index in range(100)]
     layout = Layout("x", None, 100, False, tuple(Register(p, "BYTE", (), i, None, 1, 1) for i, p in enumerate(paths)))
@@ -226,7 +226,7 @@ def test_deep_and_long_paths_are_looked_up_in_little_memory() -> None:
         tracemalloc.stop()
 
 
-def test_structures_are_told_from_names_that_begin_alike() -> None:
+def test_structures_are_distinguished_from_names_with_the_same_prefix() -> None:
     paths = ["a.b/c", "a/c", "a-b", "A/d", "a0", "a/b/c"]
     layout = Layout("x", None, 6, False, tuple(Register(p, "BYTE", (), i, None, 1, 1) for i, p in enumerate(paths)))
     assert layout.members("a") == (1, 5)

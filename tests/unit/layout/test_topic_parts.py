@@ -1,4 +1,4 @@
-"""Slices of arrays, and bits, bytes and words of integers: where they lie, against plain arithmetic."""
+"""Slices of arrays and parts of integers, compared with plain arithmetic."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def layout_of(register: Register, order: ByteOrder = "big") -> Layout:
 
 
 @given(st.sampled_from(sorted(INTEGERS)), ORDERS, st.sampled_from("XBWD"), st.integers(0, 7), st.binary(min_size=14))
-def test_a_part_is_these_bits_of_the_number(type_: str, order: ByteOrder, kind: str, number: int, data: bytes) -> None:
+def test_part_of_an_integer_is_its_bits(type_: str, order: ByteOrder, kind: str, number: int, data: bytes) -> None:
     register = integer(type_)
     layout = layout_of(register, order)
     width = WIDTHS[kind]
@@ -65,7 +65,7 @@ def test_a_part_is_these_bits_of_the_number(type_: str, order: ByteOrder, kind: 
     st.sampled_from(["BOOL", "BYTE", "INT", "REAL", "STRING[3]"]),
     st.integers(-3, 3), st.integers(1, 40), st.data(), st.binary(min_size=300, max_size=300),
 )  # fmt: skip
-def test_a_slice_is_these_elements(type_: str, low: int, count: int, data: st.DataObject, image: bytes) -> None:
+def test_slice_is_its_elements(type_: str, low: int, count: int, data: st.DataObject, image: bytes) -> None:
     register = array(type_, low, count)
     layout = layout_of(register)
     first = data.draw(st.integers(low, low + count - 1))
@@ -79,7 +79,7 @@ def test_a_slice_is_these_elements(type_: str, low: int, count: int, data: st.Da
     for element in elements:
         for at, bits in enumerate(bits_of(element), element.offset):
             own[at] |= bits
-    if type_ != "STRING[3]":  # which has a byte of padding between two
+    if type_ != "STRING[3]":  # its elements have a byte of padding between them
         covered = bytes(part.offset) + bits_of(part)
         assert covered.ljust(layout.size, b"\0") == bytes(own)
 
@@ -95,7 +95,7 @@ def test_a_slice_is_these_elements(type_: str, low: int, count: int, data: st.Da
 
 
 @given(st.integers(0, 39), st.integers(1, 40), st.integers(0, 39))
-def test_a_slice_of_bits_has_changed_when_one_of_its_bits_has(first: int, count: int, flipped: int) -> None:
+def test_scan_sees_a_change_within_a_slice_of_bits(first: int, count: int, flipped: int) -> None:
     layout = layout_of(array("BOOL", 0, 40))
     last = min(39, first + count - 1)
     scan = ChangeScan([find(layout, f"a/{first}..{last}")])
@@ -118,7 +118,7 @@ def test_a_slice_of_bits_has_changed_when_one_of_its_bits_has(first: int, count:
         ("DWORD", "b.%X0", "b: no such register"),
     ],
 )
-def test_what_is_no_part(type_: str, path: str, message: str) -> None:
+def test_invalid_part_is_refused(type_: str, path: str, message: str) -> None:
     register = Register("a", "BOOL", (), 3, 0, 1, 1) if type_ == "BOOL" else Register("a", type_, (), 3, None, 4, 1)
     if type_ == "BYTE":
         register = integer(type_)
@@ -126,7 +126,7 @@ def test_what_is_no_part(type_: str, path: str, message: str) -> None:
         find(layout_of(register), path)
 
 
-def test_a_part_of_an_array_is_one_of_an_element() -> None:
+def test_part_of_an_array_needs_an_element() -> None:
     layout = layout_of(array("WORD", 0, 4))
     assert find(layout, "a/2.%X3").offset == 3 + 2 * 2 + 1
     for path in ("a.%X0", "a/0..1.%X0"):
@@ -135,7 +135,7 @@ def test_a_part_of_an_array_is_one_of_an_element() -> None:
 
 
 @pytest.mark.parametrize("order", ["big", "little"])
-def test_what_is_written_is_named_as_it_was(order: ByteOrder) -> None:
+def test_writes_are_named_by_the_paths_that_made_them(order: ByteOrder) -> None:
     registers = (
         Register("speed", "REAL", (), 0, None, 4, 1),
         Register("bytes", "BYTE", ((0, 9),), 4, None, 10, 10),

@@ -95,7 +95,7 @@ def test_values_by_path(cell: Attachment, writer: BlockWriter) -> None:
     assert cell["CELL://on"] is True
 
 
-def test_no_value_without_quality(cell: Attachment, writer: BlockWriter) -> None:
+def test_value_without_good_quality_is_refused(cell: Attachment, writer: BlockWriter) -> None:
     with pytest.raises(QualityError, match="no data yet"):
         cell["cell/on"]
     with pytest.raises(QualityError, match="no data yet"):
@@ -112,7 +112,7 @@ def test_no_value_without_quality(cell: Attachment, writer: BlockWriter) -> None
 @pytest.mark.parametrize(
     "path", ["cell/nothing", "press/on", "cell/counts/3", "cell/axis", "cell/on/in", "model/clock"]
 )
-def test_what_is_not_there_is_said(cell: Attachment, path: str) -> None:
+def test_missing_path_is_refused(cell: Attachment, path: str) -> None:
     with pytest.raises(PathError):
         cell.read(path)
 
@@ -137,7 +137,7 @@ def test_a_stream_has_every_frame_from_its_start_on(cell: Attachment, writer: Bl
     assert [(view.cycle, view["axis/position"], view.missed) for view in stream] == [(n, n, 0) for n in range(1, 20)]
 
 
-def test_a_stream_says_where_frames_were_missed(cell: Attachment, writer: BlockWriter) -> None:
+def test_stream_counts_missed_frames(cell: Attachment, writer: BlockWriter) -> None:
     slots = cell.block().ring.slot_count
     stream = cell.stream(timeout_s=0)
     total = slots + 100
@@ -161,14 +161,14 @@ def test_wait_returns_the_next_frame(cell: Attachment, writer: BlockWriter) -> N
     assert newer.cycle == 3
 
 
-def test_the_end_of_the_instance_is_seen(instance: str) -> None:
+def test_attachment_is_not_current_after_the_instance_has_stopped(instance: str) -> None:
     with Segment.create(instance, [], []) as segment, shmio.attach(instance) as cell:
         assert cell.current
         segment.unlink()
         assert not cell.current
 
 
-def test_attaching_to_nothing_names_the_remedy(instance: str) -> None:
+def test_attaching_to_a_stopped_instance_names_the_remedy(instance: str) -> None:
     with pytest.raises(NotRunningError, match="shmio-supervisor up"):
         shmio.attach(instance)
 
@@ -184,13 +184,13 @@ def test_a_value_that_was_never_read_is_none(cell: Attachment, writer: BlockWrit
     assert (now.value, now.source_time, now.quality) == (None, None, Quality.BAD)
 
 
-def test_a_view_takes_paths_with_the_source_too(cell: Attachment, writer: BlockWriter) -> None:
+def test_view_accepts_paths_with_and_without_the_source(cell: Attachment, writer: BlockWriter) -> None:
     writer.publish(image(3.5), cycle=1)
     view = cell.frame()
     assert view["cell/axis/position"] == view["axis/position"] == 3.5
 
 
-def test_a_detached_program_is_told_so(instance: str, writer: BlockWriter) -> None:
+def test_closed_attachment_refuses_reads(instance: str, writer: BlockWriter) -> None:
     cell = shmio.attach(instance)
     cell.close()
     with pytest.raises(SegmentError, match="detached"):

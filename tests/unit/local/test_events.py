@@ -1,4 +1,4 @@
-"""The events of a local instance: what they say, what is lost, and what a restart and a reload do."""
+"""The events of a local instance: their fields, losses, restarts and reloads."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_the_kinds_are_those_of_the_segment() -> None:
     assert all(kind.value == kind.name.lower() for kind in EventKind)
 
 
-def test_an_event_says_what_has_happened_where_and_when(segment: Segment, cell: Attachment) -> None:
+def test_event_has_all_its_fields(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     writer.publish(bytes(4), cycle=3)
     with cell.events() as events:
@@ -72,7 +72,7 @@ def test_an_event_says_what_has_happened_where_and_when(segment: Segment, cell: 
     assert (noted.kind, noted.text, noted.by, noted.paths) == (EventKind.NOTED, "here", "program 3", ())
 
 
-def test_an_injection_that_was_laid_before_is_known(segment: Segment, cell: Attachment) -> None:
+def test_injection_from_before_the_stream_is_known(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     standing = {"id": 9, "direction": "in", "priority": 0, "keep": False, "name": "n", "writer": 0, "pid": 1}
     writer.block.standing.write(json.dumps([standing | {"ranges": [[0, 2, 255]]}]).encode())
@@ -134,7 +134,7 @@ def test_the_outcome_of_a_long_item_names_a_bounded_number_of_registers(segment:
         assert len(next(events).paths) == MAX_PATHS
 
 
-def test_a_command_whose_end_is_lost_is_forgotten(segment: Segment, cell: Attachment) -> None:
+def test_command_whose_outcome_is_lost_is_forgotten(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     with cell.events("cell") as events:
         writer.event(Record(Recorded.ACCEPTED, "", 3, 7, 0, 1, 2, 0, 2, b"\1\2"))
@@ -147,7 +147,7 @@ def test_a_command_whose_end_is_lost_is_forgotten(segment: Segment, cell: Attach
         assert not under_way
 
 
-def test_a_command_of_the_process_before_is_forgotten(segment: Segment, cell: Attachment) -> None:
+def test_command_of_an_earlier_process_is_forgotten(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     with cell.events("cell") as events:
         writer.event(Record(Recorded.ACCEPTED, "", 3, 7, 0, 1, 2, 0, 2, b"\1\2"))
@@ -172,20 +172,22 @@ def test_an_injection_whose_end_is_lost_is_forgotten(segment: Segment, cell: Att
         assert next(events).missed
         while (event := next(events)).number < newest:
             pass
-        assert (event.kind, event.injection, event.paths) == ("lifted", 8, ("cell/a",)), "its end is not lost"
+        assert (event.kind, event.injection, event.paths) == ("lifted", 8, ("cell/a",)), (
+            "the event of its end is not lost"
+        )
         writer.event(NOTE)
         next(events)
         assert set(events._readers[0]._explainer._injections) == {9}
 
 
-def test_an_event_of_a_later_version_is_some_other(segment: Segment, cell: Attachment) -> None:
+def test_event_of_an_unknown_kind_is_other(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     with cell.events("cell") as events:
         writer.event(NOTE._replace(kind=99))  # type: ignore[arg-type]
         assert next(events).kind is EventKind.OTHER
 
 
-def test_what_the_ring_lost_is_counted(segment: Segment, cell: Attachment) -> None:
+def test_events_that_the_ring_lost_are_counted(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     with cell.events("cell") as events:
         first = writer.event(NOTE)
@@ -212,7 +214,7 @@ def test_sources_take_turns_and_each_is_in_order(segment: Segment, cell: Attachm
         assert all(new.number == old.number + 1 for old, new in pairwise([e for e in found if e.source == source]))
 
 
-def test_a_restart_of_the_sources_process_is_told(segment: Segment, cell: Attachment) -> None:
+def test_restart_of_the_source_gives_stopped_and_started(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     with cell.events("cell") as events:
         writer.event(Record(Recorded.STOPPED, "told to"))
@@ -227,7 +229,7 @@ def test_a_restart_of_the_sources_process_is_told(segment: Segment, cell: Attach
     assert again.incarnation == writer.incarnation + 1
 
 
-def test_a_reload_goes_on_with_the_new_block_and_ends_what_it_removes(segment: Segment, cell: Attachment) -> None:
+def test_reload_continues_with_the_new_block_and_reports_a_removed_source(segment: Segment, cell: Attachment) -> None:
     for source in ("cell", "press"):
         segment.writer(source)
     with cell.events("cell", "press") as events:
@@ -243,7 +245,7 @@ def test_a_reload_goes_on_with_the_new_block_and_ends_what_it_removes(segment: S
         assert gone.text == f"source 'press' was removed from instance {segment.instance!r} by a reload"
 
 
-def test_a_reload_that_is_not_complete_yet_repeats_nothing(segment: Segment, cell: Attachment) -> None:
+def test_incomplete_reload_repeats_no_event(segment: Segment, cell: Attachment) -> None:
     segment.writer("cell").event(NOTE)
     with cell.events("cell") as events:
         blocks, old = events._blocks, events._readers[0].block
@@ -259,20 +261,20 @@ def test_an_unknown_source_is_refused_at_once(cell: Attachment) -> None:
         cell.events("cell", "nix")
 
 
-def test_another_thread_may_close_it(segment: Segment, cell: Attachment) -> None:
+def test_another_thread_may_close_the_stream(segment: Segment, cell: Attachment) -> None:
     events = cell.events()
     threading.Timer(0.05, events.close).start()
     assert list(events) == []
     assert list(events) == []
 
 
-def test_closing_the_attachment_ends_it(segment: Segment) -> None:
+def test_closing_the_attachment_ends_the_stream(segment: Segment) -> None:
     with attach(segment.instance) as cell:
         events = cell.events()
     assert list(events) == []
 
 
-def test_the_end_of_the_instance_ends_it(instance: str) -> None:
+def test_stopped_instance_ends_the_stream(instance: str) -> None:
     with Segment.create(instance, [spec("cell")], []) as segment, attach(instance) as cell:
         events = cell.events()
         segment.unlink()
@@ -291,5 +293,5 @@ def test_an_iterator_that_is_dropped_leaves_no_thread(segment: Segment, cell: At
 
 
 def relays() -> list[str]:
-    """The threads that wake iterators."""
+    """Return the names of the threads that wake iterators."""
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("following-")]

@@ -31,7 +31,7 @@ HOUR_NS = 3600 * 1_000_000_000
 
 
 class Cell:
-    """A segment with a source and an endpoint, whose processes are played by this one."""
+    """A segment with a source and an endpoint, both played by the process of the test."""
 
     def __init__(self, instance: str) -> None:
         specs = [ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]
@@ -54,7 +54,7 @@ class Cell:
 
     def supervisor_dies(self) -> None:
         self.segment.set_state(os.getpid(), State.RUNNING)
-        self.writer = None  # it maps the segment, whose lock lives as long
+        self.writer = None  # it maps the segment, which keeps the segment's lock
         self.segment.close()
 
 
@@ -80,7 +80,7 @@ def test_nothing_running(instance: str) -> None:
     assert status["segment"] is None
 
 
-def test_all_is_well(cell: Cell, instance: str) -> None:
+def test_running_instance(cell: Cell, instance: str) -> None:
     cell.run("cell", restarts=2)
     cell.run("grpc")
     cell.segment.set_state(os.getpid(), State.RUNNING)
@@ -98,10 +98,10 @@ def test_all_is_well(cell: Cell, instance: str) -> None:
     assert (source.rate_hz, source.overruns, source.real_time) == (49.9, 3, True)
     assert "rate_mhz" not in source.counters
     assert grpc.counters == {"streams": 7, "messages": 3, "dropped": 0, "published": 1, "refused": 250}
-    assert type(grpc) is ProcessStatus, "quality is for sources"
+    assert type(grpc) is ProcessStatus, "only a source has a quality"
 
 
-def test_a_supervisor_that_took_over_is_as_old_as_it_is(
+def test_uptime_of_a_supervisor_counts_from_its_take_over(
     cell: Cell, instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hour_ns = 3600 * 10**9
@@ -115,7 +115,7 @@ def test_a_supervisor_that_took_over_is_as_old_as_it_is(
     assert supervisor.uptime_s < 3600
 
 
-def test_the_json_has_what_the_contract_names(cell: Cell, instance: str) -> None:
+def test_json_has_the_documented_keys(cell: Cell, instance: str) -> None:
     cell.run("cell")
     status = msgspec.json.decode(msgspec.json.encode(read_status(instance)))
     assert {"instance", "mode", "state", "segment", "processes"} <= set(status)
@@ -142,7 +142,7 @@ def test_a_source_without_a_frame_is_bad(cell: Cell, instance: str) -> None:
 
 
 @pytest.mark.parametrize("state", [State.STARTING, State.STOPPING])
-def test_starting_and_stopping_are_as_told(cell: Cell, instance: str, state: State) -> None:
+def test_state_while_starting_or_stopping(cell: Cell, instance: str, state: State) -> None:
     cell.segment.set_state(os.getpid(), state)
     assert read_status(instance).state == str(state)
 
@@ -189,14 +189,14 @@ def test_a_dead_supervisor_with_living_processes_is_degraded(cell: Cell, instanc
     assert [process.state for process in status.processes] == ["running", "stopped"]
 
 
-def test_a_left_over_segment_is_nothing_running(cell: Cell, instance: str) -> None:
+def test_leftover_segment_is_a_stopped_instance(cell: Cell, instance: str) -> None:
     cell.supervisor_dies()
     status = read_status(instance)
     assert (status.state, status.processes, status.running) == ("stopped", [], False)
     assert "left" in status.note
 
 
-def test_a_process_that_died_is_not_running_whatever_was_told_of_it(cell: Cell) -> None:
+def test_dead_process_is_stopped_whatever_its_last_report(cell: Cell) -> None:
     cell.run("cell")
     cell.run("grpc")
     cell.publish(1)
@@ -208,7 +208,7 @@ def test_a_process_that_died_is_not_running_whatever_was_told_of_it(cell: Cell) 
 
 
 @pytest.mark.parametrize("content", [b"", b"0123456789", bytes(8192)])
-def test_a_segment_that_was_never_finished_is_no_instance(instance: str, content: bytes) -> None:
+def test_incomplete_segment_is_a_stopped_instance(instance: str, content: bytes) -> None:
     Path(f"/dev/shm/shmio-{instance}").write_bytes(content)
     status = read_status(instance)
     assert (status.state, status.processes) == ("stopped", [])

@@ -1,4 +1,4 @@
-"""What a local subscription does that a running cell does not show at will."""
+"""Local subscriptions in situations that a running cell does not produce at will."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def cell(segment: Segment) -> Iterator[Attachment]:
     ("patterns", "options"),
     [((), {}), (("cell/a",), {"max_rate_hz": -1.0}), (("cell/a",), {"max_rate_hz": 5.0, "every_frame": True})],
 )
-def test_what_an_endpoint_refuses_is_refused_here_too(
+def test_local_subscription_refuses_what_an_endpoint_refuses(
     cell: Attachment, patterns: tuple[str, ...], options: dict[str, Any]
 ) -> None:
     with cell.subscribe(*patterns, **options) as updates, pytest.raises(ValueRangeError):
         next(updates)
 
 
-def test_a_slow_reader_gets_what_has_changed_up_to_the_newest_frame(segment: Segment, cell: Attachment) -> None:
+def test_slow_reader_gets_the_changes_up_to_the_newest_frame(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     publish(writer, 1, 1, 1)
     with cell.subscribe("cell") as updates:
@@ -64,7 +64,7 @@ def test_a_slow_reader_gets_what_has_changed_up_to_the_newest_frame(segment: Seg
         assert (update.cycle, [(one.path, one.value) for one in update.readings]) == (9, [("cell/b", 9)])
 
 
-def test_every_frame_comes_and_what_the_ring_lost_is_counted(segment: Segment, cell: Attachment) -> None:
+def test_every_frame_comes_and_lost_ones_are_counted(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     publish(writer, 1, 1, 1)
     with cell.subscribe("cell/a", every_frame=True) as updates:
@@ -104,13 +104,13 @@ def test_a_source_whose_next_update_is_not_due_is_not_stale(segment: Segment, ce
     publish(writer, 1, 1, 1)
     with cell.subscribe("tired/a", max_rate_hz=1) as updates:
         next(updates)
-        later = Stamp(time.monotonic_ns() + LONG_NS, 0, time.time_ns())  # it is good all the time
+        later = Stamp(time.monotonic_ns() + LONG_NS, 0, time.time_ns())  # this frame stays good
         writer.publish(bytes(4), cycle=2, at=later)
         update = next(updates)
     assert (update.cycle, update.quality) == (2, Quality.GOOD)
 
 
-def test_frames_that_a_slow_reader_gets_late_have_the_quality_of_their_time(segment: Segment, cell: Attachment) -> None:
+def test_late_frames_have_the_quality_of_their_own_time(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("tired")
     publish(writer, 1, 1, 1)
     with cell.subscribe("tired/a", every_frame=True) as updates:
@@ -118,12 +118,12 @@ def test_frames_that_a_slow_reader_gets_late_have_the_quality_of_their_time(segm
         writer.publish(bytes(4), cycle=2, asked_ns=time.monotonic_ns() - 60 * 10**9)
         publish(writer, 3, 1, 1)
         update = next(updates)
-        while update.cycle < 2:  # the first frame has become stale before the second came
+        while update.cycle < 2:  # the first frame may become stale before the second comes
             update = next(updates)
     assert (update.cycle, update.quality, update.readings[0].quality) == (2, Quality.GOOD, Quality.GOOD)
 
 
-def test_a_reload_ends_what_it_removes_and_goes_on_with_what_it_changes(segment: Segment, cell: Attachment) -> None:
+def test_reload_ends_removed_sources_and_continues_changed_ones(segment: Segment, cell: Attachment) -> None:
     for source in ("cell", "press"):
         publish(segment.writer(source), 1, 1, 1)
     with cell.subscribe("cell/b", "press/b") as updates:
@@ -146,11 +146,11 @@ def test_a_subscription_that_is_dropped_leaves_no_thread(segment: Segment, cell:
 
 
 def relays() -> list[str]:
-    """The threads that wake subscriptions."""
+    """Return the names of the threads that wake subscriptions."""
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("following-")]
 
 
-def test_a_subscription_that_comes_while_another_thread_closes_the_attachment_is_over(
+def test_subscription_during_a_close_by_another_thread_is_over(
     segment: Segment, cell: Attachment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     publish(segment.writer("cell"), 1, 1, 1)

@@ -1,4 +1,4 @@
-"""Steps: asked for, answered, delivered, failed; with participants in threads, which wait on their bells."""
+"""Steps of virtual time: requested, answered, delivered or failed. Participants are threads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shmio.segment import Attributes, BlockSpec, BlockWriter, ProcessSpec, Quali
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
 PERIOD_NS = 20_000_000
-HARD_S = 0.05  # of steps that are to fail
+HARD_S = 0.05  # for steps that must fail
 MS = 1_000_000
 
 
@@ -36,7 +36,7 @@ def built(instance: str, *blocks: BlockSpec, stepped: bool = True) -> Iterator[S
 
 
 class Participant:
-    """A source that answers each step as it is told to; ``None``: not at all."""
+    """A source that answers each step with the reason from ``answer``, or, for None, not at all."""
 
     def __init__(self, instance: str, name: str, answer: Callable[[Clock], str | None] = lambda _: "") -> None:
         self.segment = Segment.open(instance, writable=True)
@@ -75,7 +75,7 @@ class Participant:
         self.segment.close()
 
 
-def test_a_step_is_over_when_all_have_done_it(instance: str) -> None:
+def test_step_ends_when_all_sources_have_answered(instance: str) -> None:
     delivered: list[tuple[Step, Clock]] = []
     with built(instance, spec("a"), spec("b"), spec("plc", stepped=False)) as segment, ExitStack() as stack:
         coordinator = Coordinator(segment, deliver=lambda step: delivered.append((step, segment.clock.read())))
@@ -87,18 +87,22 @@ def test_a_step_is_over_when_all_have_done_it(instance: str) -> None:
         state = coordinator.read()
         assert (state.step, state.done, state.time_ns, state.stepping) == (2, 2, 70 * MS, False)
         assert state.owner == os.getpid()
-        assert [(step.number, state.done) for step, state in delivered] == [(1, 1), (2, 2)], "delivered once done"
+        assert [(step.number, state.done) for step, state in delivered] == [(1, 1), (2, 2)], (
+            "a step is delivered once it is done"
+        )
 
 
-def test_a_step_that_moves_nothing_says_so(instance: str) -> None:
+def test_step_without_a_participant_is_noted(instance: str) -> None:
     with built(instance, spec("plc", stepped=False), stepped=False) as segment:
         coordinator = Coordinator(segment)
         assert coordinator.step() == Step(1, coordinator.read().time_ns, 50 * MS)
         assert coordinator.read().note.startswith("no source uses the instance clock, so stepping has no effect; ")
-        assert coordinator.read().note.endswith("; shmio step --release returns to real time"), "not cut off"
+        assert coordinator.read().note.endswith("; shmio step --release returns to real time"), (
+            "the note is not cut off"
+        )
 
 
-def test_time_that_is_taken_over_says_how_real_time_comes_back(instance: str) -> None:
+def test_take_over_notes_how_to_return_to_real_time(instance: str) -> None:
     with built(instance, spec("a"), stepped=False) as segment, Participant(instance, "a"):
         coordinator = Coordinator(segment)
         coordinator.take_over()
@@ -112,7 +116,7 @@ def test_time_that_is_taken_over_says_how_real_time_comes_back(instance: str) ->
         assert coordinator.read().note.startswith("no source uses the instance clock")
 
 
-def test_time_that_is_released_is_real_and_never_goes_back(instance: str) -> None:
+def test_released_time_is_real_and_never_goes_back(instance: str) -> None:
     blocks = [spec("a"), spec("fast", period_ns=7 * MS), spec("slow", period_ns=1000 * MS)]
     with built(instance, *blocks, stepped=False) as segment, ExitStack() as stack:
         coordinator = Coordinator(segment)
@@ -132,7 +136,7 @@ def test_time_that_is_released_is_real_and_never_goes_back(instance: str) -> Non
             assert all(part.steps[-1][0] == number for part in parts)
 
 
-def test_time_that_is_real_is_left_as_it_is_by_a_release(instance: str) -> None:
+def test_release_of_real_time_changes_nothing(instance: str) -> None:
     with built(instance, spec("a"), stepped=False) as segment:
         coordinator, before = Coordinator(segment), segment.clock.last_written()
         coordinator.release()
@@ -145,7 +149,7 @@ def test_time_that_is_real_is_left_as_it_is_by_a_release(instance: str) -> None:
         assert segment.clock.last_written() == before
 
 
-def test_time_is_released_by_its_owner_or_by_anybody_if_it_is_nobodys(instance: str) -> None:
+def test_release_by_the_owner_or_without_an_owner(instance: str) -> None:
     with built(instance, stepped=False) as segment, Segment.open(instance, writable=True) as other:
         first, second = Coordinator(segment), Coordinator(other)
         first.set_playing(True)
@@ -159,14 +163,14 @@ def test_time_is_released_by_its_owner_or_by_anybody_if_it_is_nobodys(instance: 
             Coordinator(reader).release()
 
 
-def test_where_time_was_never_real_it_is_not_released(instance: str) -> None:
+def test_release_of_a_stepped_instance_is_refused(instance: str) -> None:
     with built(instance) as segment:
         with pytest.raises(TimeError, match=r'virtual from its start \(clock = "stepped"'):
             Coordinator(segment).release()
         assert segment.clock.read().virtual
 
 
-def test_where_real_time_never_was_no_restart_brings_it_back(instance: str) -> None:
+def test_note_of_a_stepped_instance_does_not_offer_a_release(instance: str) -> None:
     with built(instance, spec("plc", stepped=False), stepped=True) as segment:
         coordinator = Coordinator(segment)
         coordinator.step()
@@ -202,7 +206,7 @@ def test_nothing_is_stale_while_a_long_step_is_under_way(instance: str) -> None:
     assert set(qualities) == {Quality.GOOD}
 
 
-def test_the_first_step_of_a_wall_instance_goes_on_from_its_cycles(instance: str) -> None:
+def test_first_step_of_a_wall_instance_continues_its_cycle_numbers(instance: str) -> None:
     with built(instance, spec("a"), spec("slow", period_ns=10**12), stepped=False) as segment:
         segment.writer("slow").publish(bytes(4), cycle=0)
         coordinator = Coordinator(segment)
@@ -218,7 +222,7 @@ def test_the_first_step_of_a_wall_instance_goes_on_from_its_cycles(instance: str
         assert coordinator.read().time_ns == frozen + 50 * MS
 
 
-def test_a_frame_later_than_the_schedule_is_gone_on_from(instance: str) -> None:
+def test_take_over_continues_from_a_frame_ahead_of_the_schedule(instance: str) -> None:
     with built(instance, spec("a"), stepped=False) as segment:
         segment.writer("a").publish(bytes(4), cycle=10**9)
         coordinator = Coordinator(segment)
@@ -226,10 +230,8 @@ def test_a_frame_later_than_the_schedule_is_gone_on_from(instance: str) -> None:
         assert coordinator.read().step == 10**9
 
 
-def test_a_cycle_that_had_begun_when_time_was_taken_over_is_gone_on_from(
-    instance: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The page says first that time stands, so that no more cycles begin; what was under way by then counts."""
+def test_take_over_continues_from_a_cycle_under_way(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time is paused first, so that no more cycles begin; a cycle under way still counts."""
     with built(instance, spec("a"), stepped=False) as segment:
         writer, write = segment.writer("a"), segment.clock.write
         modes: list[ClockMode] = []
@@ -261,7 +263,7 @@ def test_the_step_size_is_remembered_and_checked(instance: str) -> None:
         coordinator.step(3_600_000 * MS)
 
 
-def test_a_model_that_fails_fails_the_step_by_name(instance: str) -> None:
+def test_failing_model_fails_the_step_by_name(instance: str) -> None:
     with built(instance, spec("a"), spec("b")) as segment:
 
         def raises_once(state: Clock) -> str:
@@ -279,7 +281,7 @@ def test_a_model_that_fails_fails_the_step_by_name(instance: str) -> None:
             assert (coordinator.read().done, coordinator.read().note) == (2, "")
 
 
-def test_who_does_not_answer_is_named_and_the_number_is_used_up(instance: str) -> None:
+def test_silent_sources_are_named_and_the_step_number_is_used_up(instance: str) -> None:
     silent = {1}
     with built(instance, spec("a"), spec("b"), spec("c")) as segment:
         coordinator = Coordinator(segment, soft_s=HARD_S / 2, hard_s=HARD_S)
@@ -299,7 +301,7 @@ def test_who_does_not_answer_is_named_and_the_number_is_used_up(instance: str) -
                 assert Coordinator(segment).step().number == 2
 
 
-def test_a_step_that_is_not_waited_for_to_its_end_is_broken_off(instance: str) -> None:
+def test_step_that_is_not_waited_for_is_cancelled(instance: str) -> None:
     with built(instance, spec("a")) as segment:
         stepping = Coordinator(segment).stepping()
         assert next(stepping).block is segment.blocks["a"]
@@ -315,7 +317,7 @@ def latest_cycle(segment: Segment, source: str) -> int:
     return 0 if frame is None else frame.cycle
 
 
-def test_after_the_soft_time_out_the_page_tells_whom_it_waits_for(instance: str) -> None:
+def test_note_names_the_awaited_source_after_the_soft_time_out(instance: str) -> None:
     with built(instance, spec("b"), spec("a")) as segment:
         coordinator = Coordinator(segment, soft_s=0.001, hard_s=60)
 
@@ -334,7 +336,7 @@ def test_after_the_soft_time_out_the_page_tells_whom_it_waits_for(instance: str)
         assert coordinator.read().note == ""
 
 
-def test_a_block_that_a_reload_ends_is_not_waited_for(instance: str) -> None:
+def test_block_that_a_reload_retires_is_not_waited_for(instance: str) -> None:
     with built(instance, spec("a")) as segment:
         coordinator = Coordinator(segment, hard_s=60)
         with Segment.open(instance, writable=True) as supervisor:
@@ -343,7 +345,7 @@ def test_a_block_that_a_reload_ends_is_not_waited_for(instance: str) -> None:
             assert coordinator.step().number == 2
 
 
-def test_one_program_at_a_time_moves_time(instance: str) -> None:
+def test_only_one_program_controls_time(instance: str) -> None:
     with built(instance) as segment, Segment.open(instance, writable=True) as other:
         first, second = Coordinator(segment), Coordinator(other)
         first.set_playing(True, 2.0)
@@ -366,7 +368,7 @@ def test_one_program_at_a_time_moves_time(instance: str) -> None:
         second.close()
 
 
-def test_who_is_patient_gets_time_as_soon_as_it_is_given_up(instance: str) -> None:
+def test_waiting_take_over_succeeds_when_the_owner_closes(instance: str) -> None:
     with built(instance) as segment, Segment.open(instance, writable=True) as other:
         first, second = Coordinator(segment), Coordinator(other)
         first.take_over()
@@ -388,7 +390,7 @@ def test_the_owner_is_named_if_it_is_a_process_of_the_instance(instance: str) ->
             Coordinator(segment).take_over()
 
 
-def test_a_reader_cannot_move_time(instance: str) -> None:
+def test_reader_cannot_control_time(instance: str) -> None:
     with built(instance), Segment.open(instance) as reader:
         with pytest.raises(TimeError, match="writable=True"):
             Coordinator(reader).take_over()
@@ -409,7 +411,7 @@ coordinator.step()
     with built(instance, spec("a")) as segment:
         process = subprocess.Popen([sys.executable, "-c", owner, instance])
         try:
-            while not segment.clock.read().note:  # the step waits for who is not there
+            while not segment.clock.read().note:  # the step waits for a source without a process
                 segment.clock.bell.wait(segment.clock.bell.value(), 10 * MS)
             with pytest.raises(TimeError, match=rf"pid {process.pid}"):
                 Coordinator(segment).take_over()
@@ -426,15 +428,15 @@ coordinator.step()
         assert state.note == "step 1 was not finished: the program that requested it has ended"
         with Participant(instance, "a") as part:
             assert coordinator.step() == Step(2, 100 * MS, 50 * MS)
-            assert part.steps == [(2, 100 * MS, 50 * MS)], "the one that was broken off is not done later"
+            assert part.steps == [(2, 100 * MS, 50 * MS)], "the cancelled step is not carried out later"
 
 
-def test_a_step_waits_for_the_others_that_deliver(instance: str) -> None:
+def test_step_waits_for_other_processes_that_deliver(instance: str) -> None:
     with built(instance) as segment, Segment.open(instance, writable=True) as other:
         slot = other.processes.find("grpc")
         coordinator = Coordinator(segment, hard_s=60)
         assert slot.take()
-        assert coordinator.step().number == 1, "it has not said that it delivers"
+        assert coordinator.step().number == 1, "the process has not announced that it delivers"
         other.clock.deliver(slot.index, other.clock.read().done)
         done: list[int] = []
 
@@ -455,7 +457,7 @@ def test_a_step_waits_for_the_others_that_deliver(instance: str) -> None:
         thread.join()
 
 
-def test_who_does_not_deliver_is_named(instance: str) -> None:
+def test_process_that_does_not_deliver_is_named(instance: str) -> None:
     with built(instance) as segment:
         with Segment.open(instance, writable=True) as other:
             slot = other.processes.find("grpc")
@@ -466,10 +468,10 @@ def test_who_does_not_deliver_is_named(instance: str) -> None:
             with pytest.raises(TimeError, match=r"step 1: not delivered within 0.05 s by grpc \(pid 4711\)"):
                 coordinator.step()
             assert coordinator.read().done == 1
-        assert coordinator.step().number == 2, "the dead are not waited for"
+        assert coordinator.step().number == 2, "a dead process is not waited for"
 
 
-def test_who_coordinates_does_not_wait_for_itself(instance: str) -> None:
+def test_coordinating_process_does_not_wait_for_itself(instance: str) -> None:
     with built(instance), Segment.open(instance, writable=True) as endpoint:
         slot = endpoint.processes.find("grpc")
         assert slot.take()
@@ -477,7 +479,7 @@ def test_who_coordinates_does_not_wait_for_itself(instance: str) -> None:
         assert Coordinator(endpoint, hard_s=60).step().number == 1
 
 
-def test_many_threads_take_turns(instance: str) -> None:
+def test_threads_of_one_program_take_turns(instance: str) -> None:
     with built(instance, spec("a")) as segment, Participant(instance, "a") as part:
         coordinator = Coordinator(segment)
         numbers: list[int] = []

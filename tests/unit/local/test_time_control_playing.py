@@ -1,4 +1,4 @@
-"""A local program that moves time, at a pace."""
+"""A local program that plays virtual time at a rate."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def source(segment: Segment) -> Iterator[dict[int, str]]:
-    """Answers every step; what stands here at its number makes it fail."""
+    """A source that answers every step; a reason under a step's number makes it fail."""
     failures: dict[int, str] = {}
     writer, bell = segment.writer("sim"), segment.clock.slot_bell(0)
     over = threading.Event()
@@ -64,13 +64,13 @@ def until_step(cell: Attachment, number: int) -> None:
         block.ring.wait(block.ring.doorbell(), 10 * MS)
 
 
-def test_no_step_at_all_is_refused(cell: Attachment) -> None:
+def test_step_of_count_zero_is_refused(cell: Attachment) -> None:
     with pytest.raises(ValueRangeError, match="at least 1, not 0"):
         cell.step(count=0)
     assert cell.step(count=2).step == 2
 
 
-def test_it_plays_until_it_is_paused_and_then_time_stands(cell: Attachment) -> None:
+def test_play_runs_until_pause(cell: Attachment) -> None:
     cell.play(rate=100, dt_s=0.01)
     until_step(cell, 5)
     assert (cell.clock.playing, cell.clock.rate) == (True, 100)
@@ -84,7 +84,7 @@ def test_it_plays_until_it_is_paused_and_then_time_stands(cell: Attachment) -> N
     assert (made.step, made.time_ns) == (stands.step + 1, stands.time_ns + 50 * MS)
 
 
-def test_who_plays_can_release_time(instance: str) -> None:
+def test_playing_program_can_release_time(instance: str) -> None:
     with (
         Segment.create(instance, [], []) as segment,
         Attachment(Segment.open(instance, writable=True)) as cell,
@@ -95,12 +95,12 @@ def test_who_plays_can_release_time(instance: str) -> None:
             other.release()
         cell.release()
         assert not other.clock.virtual
-        assert other.step().step > 0, "time is nobody's"
+        assert other.step().step > 0, "time has no owner"
         other.release()
         segment.unlink()
 
 
-def test_it_keeps_the_pace(cell: Attachment) -> None:
+def test_play_keeps_the_rate(cell: Attachment) -> None:
     """Never faster than asked for; how much slower depends on the machine."""
     begun_ns = cell.block().clock.read().time_ns
     watch = threading.Event()
@@ -110,7 +110,7 @@ def test_it_keeps_the_pace(cell: Attachment) -> None:
     assert cell.clock.time_ns - begun_ns == 3_600_000 * MS, "the second step is an hour away"
 
 
-def test_a_step_that_fails_ends_the_play_and_is_told_by_pause(cell: Attachment, source: dict[int, str]) -> None:
+def test_failing_step_ends_the_play_and_pause_raises_it(cell: Attachment, source: dict[int, str]) -> None:
     source[3] = "on fire"
     cell.play(rate=1000, dt_s=0.01)
     until_step(cell, 3)
@@ -120,9 +120,7 @@ def test_a_step_that_fails_ends_the_play_and_is_told_by_pause(cell: Attachment, 
     assert cell.step().step == 4
 
 
-def test_one_that_detaches_while_it_plays_leaves_time_to_others(
-    instance: str, segment: Segment, source: dict[int, str]
-) -> None:
+def test_detaching_while_playing_frees_time(instance: str, segment: Segment, source: dict[int, str]) -> None:
     with Attachment(Segment.open(instance, writable=True)) as cell:
         cell.play(rate=100)
         until_step(cell, 1)
@@ -131,7 +129,7 @@ def test_one_that_detaches_while_it_plays_leaves_time_to_others(
     assert Coordinator(segment).step().number == state.step + 1
 
 
-def test_what_cannot_be_a_rate_or_a_step_is_refused(cell: Attachment) -> None:
+def test_invalid_rate_or_step_size_is_refused(cell: Attachment) -> None:
     with pytest.raises(ValueRangeError, match="rate must be above 0"):
         cell.play(0)
     for wrong in (0, -1, 1e300, float("inf"), float("nan")):
@@ -142,7 +140,7 @@ def test_what_cannot_be_a_rate_or_a_step_is_refused(cell: Attachment) -> None:
     assert not cell.clock.playing
 
 
-def test_a_stopped_instance_is_told(cell: Attachment, segment: Segment) -> None:
+def test_stopped_instance_refuses_a_step(cell: Attachment, segment: Segment) -> None:
     segment.unlink()
     with pytest.raises(NotRunningError, match="has stopped"):
         cell.step()

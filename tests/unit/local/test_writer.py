@@ -1,4 +1,4 @@
-"""A writing program's side: values by path, and the truth about what became of them."""
+"""A writing program: values by path, and their true outcomes."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ Answer = Callable[[BlockWriter, Command], None]
 
 @pytest.fixture
 def source(writer: BlockWriter) -> Iterator[list[Answer]]:
-    """A source that answers as the test says: the first function in the list, taken out, for each command."""
+    """A source that answers each command with the next function of the list."""
     answers: list[Answer] = []
     stop = threading.Event()
 
@@ -100,13 +100,13 @@ def test_each_value_has_its_outcome_in_the_order_given(writer: BlockWriter, sour
     ]
 
 
-def test_a_rejected_command_is_rejected_for_all(writer: BlockWriter, source: list[Answer]) -> None:
+def test_rejected_command_rejects_all_values(writer: BlockWriter, source: list[Answer]) -> None:
     source.append(tell(EventKind.REJECTED, text="not connected"))
     outcomes = SourceWriter(writer.block, 5).write({"count": 7, "bits/3": True})
     assert [(o.kind, o.text) for o in outcomes] == [(OutcomeKind.REJECTED, "not connected")] * 2
 
 
-def test_a_copy_by_fork_cannot_write(writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forked_writer_cannot_write(writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
     source_writer = SourceWriter(writer.block, 5)
     monkeypatch.setattr("os.getpid", lambda: 1)
     with pytest.raises(CommandError, match="attach again"):
@@ -114,22 +114,20 @@ def test_a_copy_by_fork_cannot_write(writer: BlockWriter, monkeypatch: pytest.Mo
     assert writer.block.commands.pop(5) is None
 
 
-def test_of_a_slow_source_a_command_waits_for_some_cycles(instance: str) -> None:
+def test_time_out_for_a_slow_source_covers_several_cycles(instance: str) -> None:
     block = BlockSpec("cell", LAYOUT, 5_000_000_000, 10**11, 1 << 16)
     with Segment.create(instance, [block], PROCESSES) as segment:
         assert SourceWriter(segment.blocks["cell"], 5).timeout_s == 15
         segment.unlink()
 
 
-def test_silence_is_unknown_after_the_time_is_over(writer: BlockWriter) -> None:
+def test_silence_is_an_unknown_outcome_after_the_time_out(writer: BlockWriter) -> None:
     (outcome,) = SourceWriter(writer.block, 5).write({"count": 7}, timeout_s=-0.95)
     assert outcome.kind is OutcomeKind.UNKNOWN
     assert "gave no answer in time" in outcome.text
 
 
-def test_a_restart_of_the_source_is_told_without_waiting_for_ever(
-    writer: BlockWriter, source: list[Answer], instance: str
-) -> None:
+def test_restart_of_the_source_ends_the_wait(writer: BlockWriter, source: list[Answer], instance: str) -> None:
     def die(_: BlockWriter, command: Command) -> None:
         tell(EventKind.ACCEPTED)(writer, command)
         with Segment.open(instance, writable=True) as segment:
@@ -143,7 +141,7 @@ def test_a_restart_of_the_source_is_told_without_waiting_for_ever(
     assert time.monotonic() - began < 60
 
 
-def test_what_cannot_be_written_is_refused_before_it_is_sent(writer: BlockWriter) -> None:
+def test_invalid_values_are_refused_before_they_are_sent(writer: BlockWriter) -> None:
     source_writer = SourceWriter(writer.block, 5)
     with pytest.raises(CommandError, match=r"cell/secret is not writable; .*`writable`"):
         source_writer.submit({"count": 1, "secret": 1})
@@ -166,7 +164,7 @@ def test_a_local_program_writes_as_a_guest(writer: BlockWriter, source: list[Ans
 
 
 def test_a_register_that_is_given_twice_is_refused(writer: BlockWriter, instance: str) -> None:
-    """Before anything is sent: this source would not answer."""
+    """It is refused before anything is sent: no source would answer here."""
     twice = {"cell/count": 1, "count": 2}
     with shmio.attach(instance, writable=True) as cell:
         source_writer = SourceWriter(writer.block, 5)
@@ -191,13 +189,13 @@ def test_guests_have_four_places_and_give_them_back(writer: BlockWriter, source:
             guest.close()
 
 
-def test_who_only_reads_cannot_write(writer: BlockWriter, instance: str) -> None:
+def test_read_only_attachment_cannot_write(writer: BlockWriter, instance: str) -> None:
     with shmio.attach(instance) as cell, pytest.raises(CommandError, match="writable=True"):
         cell.write({"cell/count": 5})
 
 
 @pytest.mark.parametrize(("text", "complaint"), [("", "0"), ("ü" * 129, "258")], ids=["empty", "long"])
-def test_a_note_has_a_length_within_the_limits(writer: BlockWriter, instance: str, text: str, complaint: str) -> None:
-    """It is refused before it is sent: this source would not answer."""
+def test_length_of_a_note_is_limited(writer: BlockWriter, instance: str, text: str, complaint: str) -> None:
+    """It is refused before it is sent: no source would answer here."""
     with shmio.attach(instance, writable=True) as cell, pytest.raises(ValueRangeError, match=rf"256 .*{complaint}"):
         cell.note(text, "cell")

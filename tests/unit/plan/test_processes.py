@@ -1,4 +1,4 @@
-"""What is started for a configuration."""
+"""The processes that are started for a configuration."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_blocks_and_processes_follow_the_configuration(tmp_path: Path) -> None:
     plan = make_plan(config(tmp_path), {"cell0": LAYOUT}, PLAYED, config_file=tmp_path / "s.toml")
     [block] = plan.blocks
     assert (block.source, block.layout, block.period_ns) == ("cell0", LAYOUT, 10_000_000)
-    assert block.slots == 8, "ring_mb bounds it"
+    assert block.slots == 8, "ring_mb limits the ring"
     assert [(p.name, p.kind) for p in plan.processes] == [("plc", "emulator"), ("cell0", "source"), ("grpc", "grpc")]
     assert [job.rank for job in plan.jobs] == [0, 1, 2]
     assert plan.segment_bytes > block.size
@@ -51,9 +51,7 @@ def test_blocks_and_processes_follow_the_configuration(tmp_path: Path) -> None:
         {"mqtt": Mqtt(broker="external", host="broker.example"), "emulator": []},
     ],
 )
-def test_all_processes_are_known_by_name_before_they_are_planned(
-    tmp_path: Path, sections: dict[str, Any], mode: str
-) -> None:
+def test_process_names_agree_with_the_plan(tmp_path: Path, sections: dict[str, Any], mode: str) -> None:
     settings = msgspec.structs.replace(config(tmp_path, sources=2), **sections)
     layouts = {"cell0": LAYOUT, "cell1": LAYOUT}
     plan = make_plan(settings, layouts, PLAYED, config_file=tmp_path / "s.toml", mode=mode)
@@ -61,7 +59,7 @@ def test_all_processes_are_known_by_name_before_they_are_planned(
     assert [job.name for job in plan.jobs] == [name for name in process_names(settings) if name not in left_out]
 
 
-def test_what_is_computed_lives_on_the_clock_which_may_stand_from_the_start(tmp_path: Path) -> None:
+def test_computed_sources_use_the_instance_clock_which_may_start_paused(tmp_path: Path) -> None:
     settings = config(tmp_path, sources=2)
     layouts = {"cell0": LAYOUT, "cell1": LAYOUT}
     plan = make_plan(settings, layouts, PLAYED, config_file=tmp_path / "s.toml", computed=["cell1"])
@@ -71,7 +69,7 @@ def test_what_is_computed_lives_on_the_clock_which_may_stand_from_the_start(tmp_
     assert make_plan(settings, layouts, PLAYED, config_file=tmp_path / "s.toml").stepped
 
 
-def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
+def test_process_gets_its_configuration(tmp_path: Path) -> None:
     plan = make_plan(config(tmp_path), {"cell0": LAYOUT}, PLAYED, config_file=tmp_path / "s.toml")
     emulator, source, grpc = (json.loads(job.describe(plan.instance, 77)) for job in plan.jobs)
     assert {key: source[key] for key in ("instance", "epoch", "name", "kind")} == {
@@ -86,8 +84,8 @@ def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
     assert grpc["config"]["listen"] == ["127.0.0.1:0"]
 
 
-def test_tokens_and_clients_are_no_other_process(tmp_path: Path) -> None:
-    """So a reload does not restart the endpoint for them; what is started later gets them."""
+def test_tokens_do_not_change_the_identity_of_the_process(tmp_path: Path) -> None:
+    """A reload does not restart the endpoint for new tokens; one that starts later gets them."""
 
     def job(**changes: Any) -> Job:
         changed = config(tmp_path)
@@ -100,7 +98,7 @@ def test_tokens_and_clients_are_no_other_process(tmp_path: Path) -> None:
     assert (plain.rules, "token" in json.loads(guarded.describe("a50", 7))["config"]) == ({}, True)
 
 
-def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
+def test_log_mode_has_a_recorder_and_no_endpoint(tmp_path: Path) -> None:
     recorded = config(tmp_path)
     recorded.recorder = Recorder(directory="dumps", fsync_s=2)
     layouts = {"cell0": LAYOUT}
@@ -110,7 +108,7 @@ def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
     assert [job.kind for job in live.jobs] == ["emulator", "source", "grpc", "recorder"]
     assert [job.kind for job in log.jobs] == ["emulator", "source", "recorder"]
     recorder = log.jobs[-1]
-    assert recorder.rank < log.jobs[1].rank, "it sees the sources begin and end"
+    assert recorder.rank < log.jobs[1].rank, "the recorder starts before the sources and stops after them"
     assert recorder.config == {
         "directory": str(tmp_path / "dumps"),
         "fsync_s": 2,
@@ -126,7 +124,7 @@ def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
     }
 
 
-def test_as_many_sources_as_there_can_be_processes_fit_in_a_segment(tmp_path: Path, instance: str) -> None:
+def test_maximum_number_of_sources_fits_in_a_segment(tmp_path: Path, instance: str) -> None:
     count = MAX_PROCESSES - 2
     layouts = {f"cell{i}": LAYOUT for i in range(count)}
     plan = make_plan(config(tmp_path, count), layouts, PLAYED, config_file=tmp_path / "s.toml")
@@ -142,5 +140,5 @@ def test_too_many_processes_are_refused(tmp_path: Path) -> None:
         make_plan(config(tmp_path, count), layouts, PLAYED, config_file=tmp_path / "s.toml")
 
 
-def test_every_kind_has_its_module_and_its_place() -> None:
+def test_every_kind_has_a_module_and_a_rank() -> None:
     assert set(MODULES) == set(RANKS)

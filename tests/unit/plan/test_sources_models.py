@@ -1,4 +1,4 @@
-"""Models in a configuration: their layouts, and what is said of those that cannot run."""
+"""Models in a configuration: their layouts, and errors of models that cannot run."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def written(folder: Path, model: str) -> Path:
     return file
 
 
-def test_registers_are_those_that_the_model_declares(folder: Path) -> None:
+def test_model_declares_its_registers(folder: Path) -> None:
     prepared = prepare(written(folder, 'model = "line:Belt"\nparameters = { gain = 2 }\nseed = 4'))
     assert [register.path for register in prepared.layouts["belt"].registers] == ["speed", "position"]
     assert {block.source: block.attributes.stepped for block in prepared.plan.blocks} == {
@@ -89,13 +89,13 @@ def test_registers_are_those_that_the_model_declares(folder: Path) -> None:
     }
 
 
-def test_or_those_of_a_layout_that_has_them(folder: Path) -> None:
+def test_layout_may_place_the_registers_of_a_model(folder: Path) -> None:
     (folder / "belt.toml").write_text('[registers]\nmore = "INT"\nposition = "LREAL"\nspeed = "LREAL"\n')
     prepared = prepare(written(folder, 'model = "line:Belt"\nlayout = "belt.toml"'))
     assert [register.path for register in prepared.layouts["belt"].registers] == ["more", "position", "speed"]
 
 
-def test_a_changed_model_is_seen_by_the_next_look(folder: Path) -> None:
+def test_changed_model_is_read_again(folder: Path) -> None:
     prepare(written(folder, 'model = "line:Belt"'))
     (folder / "line.py").write_text(MODELS.replace('speed = Input("LREAL", 1.0)', 'speed = Input("REAL")'))
     prepared = prepare(folder / "supervisor.toml")
@@ -126,7 +126,7 @@ def remote(folder: Path, keys: str) -> Path:
     return file
 
 
-def test_a_source_whose_model_is_elsewhere_has_its_outputs_in_the_segment(folder: Path) -> None:
+def test_outputs_of_a_remote_model_are_in_the_segment(folder: Path) -> None:
     keys = 'outputs = ["axis"]\ninouts = ["lamps"]\nconnections = { target = "panel/limit" }\ntimeout_ms = 500'
     prepared = prepare(remote(folder, keys + '\n[grpc]\nlisten = ["127.0.0.1:8089"]\n'))
     drive, panel = prepared.plan.blocks
@@ -138,7 +138,7 @@ def test_a_source_whose_model_is_elsewhere_has_its_outputs_in_the_segment(folder
     assert job.config["options"]["timeout_ms"] == 500
 
 
-def test_without_an_endpoint_nobody_can_be_its_model(folder: Path) -> None:
+def test_remote_model_without_an_endpoint_is_a_warning(folder: Path) -> None:
     (warning,) = prepare(remote(folder, 'outputs = ["axis"]')).plan.warnings
     assert "no model can connect to drive, because there is no [grpc] section" in warning
 
@@ -161,7 +161,7 @@ def test_without_an_endpoint_nobody_can_be_its_model(folder: Path) -> None:
         ),
     ],
 )
-def test_what_is_wrong_with_it_is_said_with_its_key(folder: Path, keys: str, message: str) -> None:
+def test_fault_of_a_remote_model_is_named_by_its_key(folder: Path, keys: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         prepare(remote(folder, keys))
     assert message in str(caught.value)
@@ -193,7 +193,7 @@ def test_what_is_wrong_with_it_is_said_with_its_key(folder: Path, keys: str, mes
         ('model = "line:Belt"\nconnections = { speed = "SIMLOG://step" }', "source[0].connections.speed: "),
     ],
 )
-def test_what_is_wrong_is_said_with_its_key(folder: Path, model: str, message: str) -> None:
+def test_fault_of_a_model_is_named_by_its_key(folder: Path, model: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         prepare(written(folder, model))
     assert re.match(rf"{re.escape(str(folder / 'supervisor.toml'))}:[0-9]+: source\[0\]", str(caught.value))

@@ -1,4 +1,4 @@
-"""The memory connector behind the source's loop: what is written is there at once, and stays."""
+"""The memory connector in the source's loop: a written value is visible at once, and stays."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @contextmanager
 def running(segment: Segment) -> Iterator[SourceWriter]:
-    """A process of the source, and a writer toward it."""
+    """Run a process of the source in threads, and yield a writer toward it."""
     options = registry.convert_options("memory", {})
     memory = registry.load("memory")(options, LAYOUT)
     assert isinstance(memory, Computed)
@@ -75,39 +75,39 @@ def test_it_begins_with_the_initial_values(segment: Segment) -> None:
         assert values(segment) == {"position": 0.5, "lamps": [False] * 12, "name": "R3200", "locked": 0}
 
 
-def test_what_is_written_is_there_at_once_and_stays(segment: Segment) -> None:
+def test_written_value_is_visible_at_once_and_stays(segment: Segment) -> None:
     cursor = segment.blocks["cell"].cursor()
     cycles: list[int] = []
 
     def until(path: str, value: object) -> None:
         while (frame := cursor.next(20)) is None or values(segment, frame)[path] != value:
             assert frame is not None, f"{path} was not seen as {value}"
-        assert frame.cycle * PERIOD_NS <= frame.clock_ns, "of a cycle that has not begun"
+        assert frame.cycle * PERIOD_NS <= frame.clock_ns, "the cycle of the frame has begun"
         cycles.append(frame.cycle)
 
     with running(segment) as source_writer:
         for number in range(20):
             (outcome,) = source_writer.write({"position": number + 0.25})
             assert outcome.kind is OutcomeKind.WRITTEN
-            assert values(segment)["position"] == number + 0.25, "the outcome was told before the frame"
+            assert values(segment)["position"] == number + 0.25, "the outcome comes after the frame"
             until("position", number + 0.25)
         source_writer.write({"lamps/3": True, "name": "R800"})
         until("name", "R800")
         assert cursor.missed == 0
         assert cycles == sorted(cycles)
-        assert cycles[-1] - cycles[0] < 20, "each waited for its cycle"
-    with running(segment):  # another process
+        assert cycles[-1] - cycles[0] < 20, "the writes do not wait for a cycle each"
+    with running(segment):  # a successor process
         lamps = [place == 3 for place in range(1, 13)]
         assert values(segment) == {"position": 19.25, "lamps": lamps, "name": "R800", "locked": 0}
 
 
-def test_what_is_not_named_writable_is_not_written(segment: Segment) -> None:
+def test_register_that_is_not_writable_is_refused(segment: Segment) -> None:
     with running(segment) as source_writer:
         with pytest.raises(CommandError, match="not writable"):
             source_writer.write({"locked": 1})
         assert values(segment)["locked"] == 0
 
 
-def test_it_has_no_keys_of_its_own() -> None:
+def test_connector_has_no_options() -> None:
     with pytest.raises(ConfigError, match="host"):
         registry.convert_options("memory", {"host": "10.0.0.1"})

@@ -1,4 +1,4 @@
-"""A source whose model is elsewhere, behind the loop of what is computed; who writes for the model is a thread."""
+"""A source whose model runs in another program, which is a thread in these tests."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from tests.unit.connectors.models.test_stepped import GUEST, LAYOUT, MS, PATIENC
 
 NOBODY = "no model is connected"
 LONG_MS = 9000
-"""A time-out that does not pass."""
+"""A time-out that no test reaches."""
 Compute = Callable[[ModelRequest], bytes | str | None]
-"""An image, why it failed, or no answer."""
+"""Gives an image, the reason of a failure, or None for no answer."""
 MUTE = """
 import sys, time
 from shmio.segment import Segment
@@ -60,14 +60,14 @@ def remote(timeout_ms: float = LONG_MS, inouts: tuple[str, ...] = (), **connecti
 
 
 def add(ask: ModelRequest) -> bytes:
-    """``sum`` is one more, plus what is given; all else is what no model may change."""
+    """Add one and the inputs to ``sum``; also set the inputs, which no model may change, to 99."""
     (total,) = struct.unpack_from(">I", ask.shown)
     _, given, other = struct.unpack(">III", ask.commanded)
     return struct.pack(">III", total + 1 + given + other, 99, 99)
 
 
 class Model:
-    """A model, and who writes for it."""
+    """A model, and the thread that answers for it."""
 
     def __init__(self, instance: str, compute: Compute = add, name: str = "adder") -> None:
         self.segment = Segment.open(instance, writable=True)
@@ -76,7 +76,7 @@ class Model:
         self.link: ModelChannel = found
         self.asks: list[ModelRequest] = []
         self.reached = threading.Event()
-        """It has been asked, and has answered or not."""
+        """Set after the first request, whether the model answers it or not."""
         self._compute = compute
         self._handed = self.link.asked.head()
         self._stopping = False
@@ -115,14 +115,14 @@ class Model:
 
 
 def good(sim: Running) -> Frame:
-    """The next frame that is not bad."""
+    """Return the next frame that is not bad."""
     while (frame := sim.next()).quality is Quality.BAD:
         pass
     return frame
 
 
 def failing(step: Callable[[], object]) -> tuple[threading.Thread, list[str]]:
-    """A step that is to fail, in a thread, and how it has."""
+    """Run a step that must fail in a thread; return the thread and the list for its error."""
     errors: list[str] = []
 
     def run() -> None:
@@ -138,7 +138,7 @@ def failing(step: Callable[[], object]) -> tuple[threading.Thread, list[str]]:
 # ---- steps -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_model_elsewhere_computes_its_outputs_and_nothing_else(instance: str) -> None:
+def test_remote_model_computes_only_its_outputs(instance: str) -> None:
     with built(instance) as segment, Running(segment, "sim", remote()) as sim, Model(instance) as model:
         first = good(sim)
         assert (first.cycle, summed(first), first.provenance) == (0, 0, Provenance.SIMULATED)
@@ -147,7 +147,9 @@ def test_a_model_elsewhere_computes_its_outputs_and_nothing_else(instance: str) 
         assert struct.unpack(">III", latest(segment, "sim").raw) == (1, 0, 0)
         (outcome,) = source_writer.write({"given": 7})
         assert outcome.kind is OutcomeKind.WRITTEN
-        assert struct.unpack(">III", latest(segment, "sim").raw) == (1, 0, 0), "shown from the next step on"
+        assert struct.unpack(">III", latest(segment, "sim").raw) == (1, 0, 0), (
+            "a written input is shown from the next step on"
+        )
         coordinator.step(30 * MS)
         assert struct.unpack(">III", latest(segment, "sim").raw) == (9, 7, 0)
         (outcome,) = source_writer.write({"sum": 7})
@@ -160,7 +162,7 @@ def test_a_model_elsewhere_computes_its_outputs_and_nothing_else(instance: str) 
         ]
 
 
-def test_what_is_in_out_has_two_ends(instance: str) -> None:
+def test_inout_register_has_a_commanded_and_a_shown_value(instance: str) -> None:
     def halve(ask: ModelRequest) -> bytes:
         (given,) = struct.unpack_from(">I", ask.commanded, 4)
         return struct.pack(">III", 0, given // 2, 0)
@@ -181,7 +183,7 @@ def test_what_is_in_out_has_two_ends(instance: str) -> None:
         assert [struct.unpack_from(">I", ask.shown, 4) for ask in model.asks] == [(0,), (4,)]
 
 
-def test_without_a_model_each_step_fails_at_once_and_the_next_works_when_one_has_joined(instance: str) -> None:
+def test_steps_fail_at_once_until_a_model_joins(instance: str) -> None:
     with built(instance) as segment, Running(segment, "sim", remote()) as sim:
         begin = sim.next()
         assert (begin.cycle, begin.quality) == (0, Quality.BAD)
@@ -192,7 +194,7 @@ def test_without_a_model_each_step_fails_at_once_and_the_next_works_when_one_has
                 coordinator.step()
         with Model(instance):
             joined = good(sim)
-            assert (joined.cycle, summed(joined)) == (2, 0), "between two steps it says so at once"
+            assert (joined.cycle, summed(joined)) == (2, 0), "the source is good as soon as a model has joined"
             coordinator.step()
             assert summed(latest(segment, "sim")) == 1
         while sim.next().quality is not Quality.BAD:
@@ -202,10 +204,10 @@ def test_without_a_model_each_step_fails_at_once_and_the_next_works_when_one_has
         with Model(instance):
             good(sim)
             coordinator.step()
-            assert summed(latest(segment, "sim")) == 2, "it goes on from what was shown"
+            assert summed(latest(segment, "sim")) == 2, "the model continues from the shown value"
 
 
-def test_a_model_that_fails_fails_its_step_with_the_reason(instance: str) -> None:
+def test_failing_model_fails_the_step_with_its_reason(instance: str) -> None:
     def fails(ask: ModelRequest) -> bytes | str:
         return {2: "no solution", 3: ""}.get(ask.step, "") if ask.step in (2, 3) else add(ask)
 
@@ -222,7 +224,7 @@ def test_a_model_that_fails_fails_its_step_with_the_reason(instance: str) -> Non
         assert summed(latest(segment, "sim")) == 2
 
 
-def test_a_late_answer_is_taken_for_no_other_step(instance: str) -> None:
+def test_late_answer_is_not_used_for_another_step(instance: str) -> None:
     late = threading.Event()
     hold = threading.Event()
 
@@ -242,13 +244,13 @@ def test_a_late_answer_is_taken_for_no_other_step(instance: str) -> None:
             assert late.wait(PATIENCE_S)
             while model.link.answered.head() == 0:
                 model.link.answered.wait(model.link.answered.doorbell(), 1 * MS)
-            with suppress(TimeError):  # a busy machine
+            with suppress(TimeError):  # it may also time out, on a busy machine
                 number = coordinator.step().number
                 assert summed(latest(segment, "sim")) == 1000 * number
         assert all(summed(frame) != 1000 for frame in sim.frames())
 
 
-def test_a_model_that_leaves_within_a_step_fails_it(instance: str) -> None:
+def test_model_that_leaves_within_a_step_fails_the_step(instance: str) -> None:
     with built(instance) as segment, Running(segment, "sim", remote()) as sim:
         coordinator = Coordinator(segment)
         with Model(instance, lambda _: None) as model:
@@ -265,7 +267,7 @@ def test_a_model_that_leaves_within_a_step_fails_it(instance: str) -> None:
             assert summed(latest(segment, "sim")) == 1
 
 
-def test_another_that_joins_within_a_step_is_not_taken_for_the_one_that_was_asked(instance: str) -> None:
+def test_model_that_joins_within_a_step_does_not_replace_the_one_that_was_asked(instance: str) -> None:
     with built(instance) as segment, Running(segment, "sim", remote()) as sim, ExitStack() as stack:
         coordinator = Coordinator(segment)
         with Model(instance, lambda _: None) as model:
@@ -280,7 +282,7 @@ def test_another_that_joins_within_a_step_is_not_taken_for_the_one_that_was_aske
         assert [ask.step for ask in other.asks] == [2]
 
 
-def test_who_writes_for_it_is_killed_within_a_step(instance: str) -> None:
+def test_killed_model_fails_the_step(instance: str) -> None:
     with built(instance) as segment, Running(segment, "sim", remote()) as sim:
         with subprocess.Popen([sys.executable, "-c", MUTE, instance], stdout=subprocess.PIPE, text=True) as process:
             try:
@@ -296,7 +298,7 @@ def test_who_writes_for_it_is_killed_within_a_step(instance: str) -> None:
         assert "model 'mute' disconnected before it answered" in errors[0]
 
 
-def test_a_successor_asks_anew_and_goes_on_with_the_registers(instance: str) -> None:
+def test_successor_of_the_source_continues_with_the_registers(instance: str) -> None:
     with built(instance) as segment, Model(instance) as model:
         coordinator = Coordinator(segment)
         with Running(segment, "sim", remote()) as sim:
@@ -310,7 +312,7 @@ def test_a_successor_asks_anew_and_goes_on_with_the_registers(instance: str) -> 
         assert [ask.step for ask in model.asks] == [1, 2, 3]
 
 
-def test_a_source_that_is_stopped_waits_for_no_answer(instance: str) -> None:
+def test_stopping_source_waits_for_no_answer(instance: str) -> None:
     source = remote()
     with built(instance) as segment, Model(instance, lambda _: None) as model:
         with Running(segment, "sim", source) as sim:
@@ -322,7 +324,7 @@ def test_a_source_that_is_stopped_waits_for_no_answer(instance: str) -> None:
         assert errors == ["step 1: sim: the source was stopped"]
 
 
-def test_connected_inputs_reach_the_model_and_so_does_doubt(instance: str) -> None:
+def test_connected_inputs_and_their_doubt_reach_the_model(instance: str) -> None:
     with (
         built(instance) as segment,
         Running(segment, "sim", remote(other="cell/sum")) as sim,
@@ -343,7 +345,7 @@ def test_connected_inputs_reach_the_model_and_so_does_doubt(instance: str) -> No
 # ---- wall time -------------------------------------------------------------------------------------------------------
 
 
-def test_in_wall_time_it_is_asked_once_a_period(instance: str) -> None:
+def test_model_is_asked_once_a_period_in_wall_time(instance: str) -> None:
     with built(instance, stepped=False) as segment, Running(segment, "sim", remote()) as sim:
         assert sim.next().reason.startswith(NOBODY)
         with Model(instance) as model:
@@ -369,7 +371,7 @@ def test_in_wall_time_it_is_asked_once_a_period(instance: str) -> None:
         ({"outputs": "sum"}, "outputs"),
     ],
 )
-def test_options_that_cannot_be_are_refused(options: dict[str, Any], message: str) -> None:
+def test_invalid_options_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         registry.load("remote")(registry.convert_options("remote", options), LAYOUT)
     assert str(caught.value).startswith(message)

@@ -1,4 +1,4 @@
-"""The loop of what is computed: by period in wall time, step by step in virtual time, one clock for all."""
+"""The loop of computed sources: by period in wall time, step by step in virtual time."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ PATIENCE_S = 20
 
 
 class Adder(Computed):
-    """``sum`` is the steps so far, plus what is given, plus the connected ``other``; ``trouble`` may raise or wait."""
+    """Each step adds 1, ``given`` and ``other`` to ``sum``; ``trouble`` may raise or wait."""
 
     Options = msgspec.Struct
 
@@ -94,7 +94,7 @@ class Adder(Computed):
 
 
 class VirtualClock:
-    """CLOCK_MONOTONIC of a test: moves only by waiting; ends after ``end_ns``."""
+    """A clock that moves only by waiting, and stops the loop after ``end_ns``."""
 
     def __init__(self, begin_ns: int, end_ns: int) -> None:
         self.time_ns, self.end_ns = begin_ns, begin_ns + end_ns
@@ -103,7 +103,7 @@ class VirtualClock:
         return self.time_ns
 
     def nudge(self) -> None:
-        """No wait of this clock is under way when another thread runs."""
+        """Do nothing: no wait of this clock is ever under way."""
 
     def wait_ns(self, duration_ns: int | None) -> bool:
         assert duration_ns is not None
@@ -126,7 +126,7 @@ def built(instance: str, *names: str, stepped: bool = True, device: bool = False
 
 
 class Running:
-    """The process of one source, in threads."""
+    """The process of one source, run in threads."""
 
     def __init__(
         self, segment: Segment, name: str, source: Computed, writer_of: type[BlockWriter] = BlockWriter
@@ -157,7 +157,7 @@ class Running:
         return frame
 
     def frames(self) -> list[Frame]:
-        """What was published since."""
+        """Return the frames that were published since the last call."""
         found = []
         while (frame := self.cursor.poll()) is not None:
             found.append(frame)
@@ -187,7 +187,7 @@ def latest(segment: Segment, name: str) -> Frame:
 # ---- wall time -------------------------------------------------------------------------------------------------------
 
 
-def test_in_wall_time_it_runs_by_its_period(instance: str) -> None:
+def test_model_runs_once_a_period_in_wall_time(instance: str) -> None:
     with built(instance, "sim", stepped=False) as segment:
         source, cursor = Adder(), segment.blocks["sim"].cursor()
         clock = VirtualClock(segment.header.started_ns, 6 * PERIOD_NS)
@@ -201,7 +201,7 @@ def test_in_wall_time_it_runs_by_its_period(instance: str) -> None:
     assert (loop.counters.polls, loop.counters.overruns) == (5, 0)
 
 
-def test_a_step_after_cycles_that_were_too_late_is_as_long_as_all_of_them(instance: str) -> None:
+def test_step_after_missed_cycles_covers_their_time(instance: str) -> None:
     def slow(call: int) -> None:
         clock.time_ns += 5 * PERIOD_NS // 2 if call == 2 else 0
 
@@ -220,7 +220,7 @@ def test_a_step_after_cycles_that_were_too_late_is_as_long_as_all_of_them(instan
     assert loop.counters.overruns == 1
 
 
-def test_in_wall_time_a_failure_is_one_bad_frame_and_each_cycle_tries_again(instance: str) -> None:
+def test_failure_in_wall_time_is_one_bad_frame_and_each_cycle_tries_again(instance: str) -> None:
     def fails(call: int) -> None:
         if 3 <= call <= 5:
             raise ConnectorError("the model is on fire")
@@ -244,7 +244,7 @@ def test_in_wall_time_a_failure_is_one_bad_frame_and_each_cycle_tries_again(inst
 # ---- virtual time ----------------------------------------------------------------------------------------------------
 
 
-def test_time_stands_until_it_is_stepped_and_each_step_is_one_frame(instance: str) -> None:
+def test_each_step_of_virtual_time_is_one_frame(instance: str) -> None:
     with built(instance, "sim") as segment:
         source = Adder()
         with Running(segment, "sim", source) as sim:
@@ -265,7 +265,7 @@ def test_time_stands_until_it_is_stepped_and_each_step_is_one_frame(instance: st
         assert segment.blocks["sim"].assess(frames[-1]) == (Quality.GOOD, "")
 
 
-def test_who_takes_time_over_stops_what_ran_freely_and_its_cycles_go_on(instance: str) -> None:
+def test_take_over_stops_free_running_and_cycle_numbers_continue(instance: str) -> None:
     with built(instance, "sim", stepped=False) as segment, Running(segment, "sim", Adder()) as sim:
         while sim.next().cycle < 3:
             pass
@@ -282,7 +282,7 @@ def test_who_takes_time_over_stops_what_ran_freely_and_its_cycles_go_on(instance
         assert cycles == sorted(set(cycles))
 
 
-def test_real_time_that_is_released_goes_on_where_virtual_time_stood(instance: str) -> None:
+def test_released_time_continues_from_virtual_time(instance: str) -> None:
     with built(instance, "sim", stepped=False) as segment:
         source, coordinator, frames = Adder(), Coordinator(segment), []
 
@@ -291,11 +291,13 @@ def test_real_time_that_is_released_goes_on_where_virtual_time_stood(instance: s
             while (frame := sim.next()).cycle < released.step + 3:
                 frames.append(frame)
             frames.append(frame)
-            assert 0 <= frame.age_ns(segment.blocks["sim"].now_ns()) < 3_600_000 * MS, "by the same clock"
+            assert 0 <= frame.age_ns(segment.blocks["sim"].now_ns()) < 3_600_000 * MS, (
+                "frame and block use the same clock"
+            )
 
         with Running(segment, "sim", source) as sim:
             frames.append(sim.next())
-            for dt_ms in (*[1] * 30, 3_600_000):  # numbers go beyond what periods have counted, time beyond the host's
+            for dt_ms in (*[1] * 30, 3_600_000):  # more steps than periods have passed, then more time
                 coordinator.step(dt_ms * MS)
             stepped = len(source.calls)
             coordinator.release()
@@ -317,7 +319,7 @@ def test_real_time_that_is_released_goes_on_where_virtual_time_stood(instance: s
 
 
 class SlowToAccept(BlockWriter):
-    """Once it has told that a write is accepted it rests, until a step was made without that, or could have been."""
+    """Waits after each event ACCEPTED until a step could have been made without that write."""
 
     def event(self, record: Record, *, quality: Quality | None = None, at: Stamp | None = None) -> int:
         number = super().event(record, quality=quality, at=at)
@@ -329,7 +331,7 @@ class SlowToAccept(BlockWriter):
         return number
 
 
-def test_what_was_accepted_before_a_step_is_carried_out_in_it(instance: str) -> None:
+def test_write_accepted_before_a_step_is_carried_out_in_it(instance: str) -> None:
     with built(instance, "sim") as segment, Running(segment, "sim", Adder(), SlowToAccept) as sim:
         sim.next()
         coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["sim"], GUEST)
@@ -344,7 +346,7 @@ def test_what_was_accepted_before_a_step_is_carried_out_in_it(instance: str) -> 
             assert summed(latest(segment, "sim")) == expected, f"what was accepted before step {given} was not in it"
 
 
-def test_a_write_has_its_end_while_time_stands(instance: str) -> None:
+def test_write_has_its_outcome_while_time_is_paused(instance: str) -> None:
     with built(instance, "sim") as segment, Running(segment, "sim", Adder()) as sim:
         sim.next()
         coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["sim"], GUEST)
@@ -353,13 +355,13 @@ def test_a_write_has_its_end_while_time_stands(instance: str) -> None:
         (outcome,) = source_writer.write({"given": 7})
         assert outcome.kind is OutcomeKind.WRITTEN
         told = [event for event in iter(events.poll, None) if event.kind == EventKind.WRITTEN]
-        assert [(event.cycle, event.clock_ns) for event in told] == [(1, 10 * MS)], "events have the page's time"
-        assert summed(latest(segment, "sim")) == 1, "a model shows what is written with its next step"
+        assert [(event.cycle, event.clock_ns) for event in told] == [(1, 10 * MS)], "events have the instance's time"
+        assert summed(latest(segment, "sim")) == 1, "a model shows a written value with its next step"
         coordinator.step(10 * MS)
         assert summed(latest(segment, "sim")) == 9
 
 
-def test_a_model_that_fails_fails_its_step_by_name_and_the_next_tries_again(instance: str) -> None:
+def test_failing_model_fails_the_step_by_name_and_the_next_step_tries_again(instance: str) -> None:
     def fails(call: int) -> None:
         if call in (2, 3):
             raise ConnectorError(f"no solution in call {call}")
@@ -382,7 +384,7 @@ def test_a_model_that_fails_fails_its_step_by_name_and_the_next_tries_again(inst
         assert (latest(segment, "other").cycle, summed(latest(segment, "other"))) == (4, 4)
 
 
-def test_one_that_cannot_even_begin_says_so(instance: str) -> None:
+def test_model_that_cannot_begin_gives_a_bad_frame(instance: str) -> None:
     class Broken(Adder):
         def begin(self) -> bytes:
             raise ConnectorError("no start")
@@ -392,7 +394,7 @@ def test_one_that_cannot_even_begin_says_so(instance: str) -> None:
         assert (frame.cycle, frame.quality, frame.reason) == (0, Quality.BAD, "no start")
 
 
-def test_a_successor_goes_on_with_the_image(instance: str) -> None:
+def test_successor_continues_with_the_image(instance: str) -> None:
     with built(instance, "sim") as segment:
         coordinator = Coordinator(segment)
         with Running(segment, "sim", Adder()):
@@ -406,7 +408,7 @@ def test_a_successor_goes_on_with_the_image(instance: str) -> None:
             assert summed(latest(segment, "sim")) == 3
 
 
-def test_a_process_that_dies_within_a_step_fails_it_and_its_successor_goes_on_with_the_next(instance: str) -> None:
+def test_process_that_dies_within_a_step_fails_it_and_its_successor_takes_part_in_the_next(instance: str) -> None:
     with built(instance, "sim", "other") as segment, ExitStack() as stack:
         coordinator = Coordinator(segment, hard_s=60)
         reached, errors = threading.Event(), list[TimeError]()
@@ -430,7 +432,7 @@ def test_a_process_that_dies_within_a_step_fails_it_and_its_successor_goes_on_wi
         assert source.calls == [(150 * MS, 50 * MS)]
 
 
-def test_one_that_comes_late_for_the_first_time_takes_part(instance: str) -> None:
+def test_source_that_starts_within_a_step_takes_part_in_it(instance: str) -> None:
     with built(instance, "sim") as segment:
         coordinator = Coordinator(segment, soft_s=0.001, hard_s=60)
         thread = threading.Thread(target=coordinator.step)
@@ -442,7 +444,7 @@ def test_one_that_comes_late_for_the_first_time_takes_part(instance: str) -> Non
             assert [(f.cycle, summed(f)) for f in sim.frames()] == [(1, 1)]
 
 
-def test_one_that_slept_through_steps_goes_on_with_the_present_one(instance: str) -> None:
+def test_source_that_missed_steps_continues_with_the_current_one(instance: str) -> None:
     hold, held = threading.Event(), threading.Event()
 
     def stopped(call: int) -> None:
@@ -469,8 +471,8 @@ def test_one_that_slept_through_steps_goes_on_with_the_present_one(instance: str
 # ---- connected inputs ------------------------------------------------------------------------------------------------
 
 
-def test_models_read_each_other_as_they_were_before_the_step(instance: str) -> None:
-    """Whoever is faster: in turns one of them waits until the other has published."""
+def test_models_read_each_others_values_from_before_the_step(instance: str) -> None:
+    """In turns, each model waits until the other has published."""
     with built(instance, "a", "b") as segment, ExitStack() as stack:
 
         def after(name: str, turn: int) -> Callable[[int], None]:
@@ -499,7 +501,7 @@ def test_a_source_may_be_connected_to_itself(instance: str) -> None:
             assert summed(latest(segment, "a")) == expected
 
 
-def test_of_a_device_the_newest_frame_counts_and_one_that_is_bad_is_not_used(instance: str) -> None:
+def test_input_from_a_device_uses_the_newest_frame_unless_it_is_bad(instance: str) -> None:
     with built(instance, "a", device=True) as segment:
         cell = segment.writer("cell")
         with Running(segment, "a", Adder(other="cell/sum")) as sim:
@@ -524,7 +526,7 @@ def test_of_a_device_the_newest_frame_counts_and_one_that_is_bad_is_not_used(ins
         ]
 
 
-def test_a_source_that_a_reload_has_removed_is_named(instance: str) -> None:
+def test_removed_source_of_an_input_is_named(instance: str) -> None:
     with built(instance, "a", device=True) as segment, Running(segment, "a", Adder(other="cell/sum")):
         segment.change(retire=["cell"])
         Coordinator(segment).step()
@@ -538,7 +540,7 @@ def test_a_source_that_a_reload_has_removed_is_named(instance: str) -> None:
 # ---- memory ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_memory_shows_at_once_what_is_written_with_the_time_that_stands(instance: str) -> None:
+def test_memory_shows_a_write_at_once_while_time_is_paused(instance: str) -> None:
     with built(instance, "panel") as segment, Running(segment, "panel", Memory(Memory.Options(), LAYOUT)) as panel:
         panel.next()
         coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["panel"], GUEST)
@@ -554,7 +556,7 @@ def test_a_memory_shows_at_once_what_is_written_with_the_time_that_stands(instan
         assert (frame.raw[7], frame.cycle) == (3, 2)
 
 
-def test_a_model_reads_of_a_memory_what_was_written_before_the_step(instance: str) -> None:
+def test_model_reads_from_a_memory_what_was_written_before_the_step(instance: str) -> None:
     with built(instance, "a", "panel") as segment, ExitStack() as stack:
         stack.enter_context(Running(segment, "panel", Memory(Memory.Options(), LAYOUT))).next()
         stack.enter_context(Running(segment, "a", Adder(other="panel/given"))).next()

@@ -1,4 +1,4 @@
-"""What the tests of replays share: recordings made to measure, and the process of a replay in threads."""
+"""Helpers for tests of replays: make recordings, and run a replay's process in threads."""
 
 from __future__ import annotations
 
@@ -44,22 +44,22 @@ PATIENCE_S = 20.0
 
 
 def image(count: int, other: int = 0) -> bytes:
-    """An image of LAYOUT."""
+    """Return an image of LAYOUT."""
     return struct.pack(">HH", count, other)
 
 
 class Recorded:
-    """An instance that is recorded, at times of the test's own."""
+    """A source of a recorded instance; the test gives the time of each frame and event."""
 
     def __init__(self, segment: Segment, source: str, take: Callable[[], object]) -> None:
         self._segment = segment
         self.take = take
-        """Have the recorder take what there is."""
+        """Let the recorder write what was published so far."""
         self.writer = BlockWriter(segment.blocks[source], segment.clock_ns)
         self.cycle = 5_000
 
     def stamp(self, clock_ns: int) -> Stamp:
-        """A moment of the recorded instance's clock."""
+        """Return the stamp of a time of the recorded instance."""
         return Stamp(self._segment.header.started_ns + clock_ns, clock_ns, 7_000 * S + clock_ns)
 
     def frame(self, clock_ns: int, raw: bytes, **told: Any) -> None:
@@ -69,14 +69,14 @@ class Recorded:
         self.writer.publish(raw, cycle=self.cycle, source_ns=clock_ns, asked_ns=at.publish_ns - 3000, at=at, **told)
 
     def event(self, clock_ns: int, record: Record, quality: Quality = Quality.GOOD) -> None:
-        """Tell an event."""
+        """Publish an event."""
         self.writer.cycle = self.cycle
         self.writer.event(record, quality=quality, at=self.stamp(clock_ns))
 
 
 @contextmanager
 def recorded(folder: Path, instance: str, *sources: str, name: str = "") -> Iterator[list[Recorded]]:
-    """An instance whose recording is in the folder afterwards; it began long before the recording."""
+    """Record an instance to the folder; it began long before the recording."""
     specs = [BlockSpec(source, LAYOUT, PERIOD_NS, 500 * MS, 1 << 22) for source in sources or ("cell",)]
     origin = Origin(BEGIN_NS - S, 7_000 * S)
     with Segment.create(f"{instance}{name}-recorded", specs, [], origin=origin) as segment:
@@ -87,7 +87,7 @@ def recorded(folder: Path, instance: str, *sources: str, name: str = "") -> Iter
 
 
 def record(folder: Path, instance: str, *sources: str, frames: int = 20) -> Path:
-    """A recording of sources that count in step, by default of one; ``other`` is 1 from the tenth frame on."""
+    """Record sources that count from 0, by default one; ``other`` is 1 from count 10 on."""
     folder.mkdir(exist_ok=True)
     with recorded(folder, instance, *sources) as all_of_them:
         for number in range(frames):
@@ -99,7 +99,7 @@ def record(folder: Path, instance: str, *sources: str, frames: int = 20) -> Path
 
 @contextmanager
 def built(instance: str, *names: str, stepped: bool = True, origin: Origin | None = None) -> Iterator[Segment]:
-    """The segment of an instance that replays."""
+    """Create the segment of an instance that replays."""
     attributes = Attributes("replay", ("count",), stepped=True, replay=True)
     blocks = [BlockSpec(name, LAYOUT, PERIOD_NS, 500 * MS, 1 << 22, attributes) for name in names or ("cell",)]
     processes = [*(ProcessSpec(block.source, "source") for block in blocks), ProcessSpec("grpc", "grpc")]
@@ -109,7 +109,7 @@ def built(instance: str, *names: str, stepped: bool = True, origin: Origin | Non
 
 
 class Playing:
-    """The process of a replay, in threads."""
+    """The process of a replay, run in threads."""
 
     def __init__(self, segment: Segment, file: Path | list[str], name: str = "cell", **options: Any) -> None:
         self._stack = ExitStack()
@@ -137,7 +137,7 @@ class Playing:
             thread.start()
 
     def next(self, where: Callable[[Frame], bool] = lambda _: True) -> Frame:
-        """The next frame of which this is so."""
+        """Return the next frame for which ``where`` is true."""
         while True:
             frame = self.cursor.next(PATIENCE_S)
             assert frame is not None, "no frame"
@@ -145,26 +145,26 @@ class Playing:
                 return frame
 
     def frames(self) -> list[Frame]:
-        """What was published since."""
+        """Return the frames that were published since the last call."""
         return list(iter(self.cursor.poll, None))
 
     def happened(self) -> list[Event]:
-        """What was told since, of processes nothing."""
+        """Return the events since the last call, without STARTED and STOPPED."""
         told = list(iter(self.events.poll, None))
         return [event for event in told if event.kind not in (EventKind.STARTED, EventKind.STOPPED)]
 
     def until(self, condition: Callable[[], bool]) -> None:
-        """Wait for what the process brings about, which rings the doorbell."""
+        """Wait for a condition that becomes true when the process rings the doorbell."""
         until_s = time.monotonic() + PATIENCE_S
         while True:
             seen = self.block.ring.doorbell()
             if condition():
                 return
-            assert time.monotonic() < until_s, "not seen"
+            assert time.monotonic() < until_s, "the condition is not true"
             self.block.ring.wait(seen, round(PATIENCE_S * 1e9))
 
     def stop(self) -> None:
-        """End it in good order."""
+        """Stop the process and wait for its end."""
         self.clock.stop()
         for thread in self._threads:
             thread.join()
@@ -178,5 +178,5 @@ class Playing:
 
 
 def counts(frames: list[Frame]) -> list[int]:
-    """The register ``count`` of frames."""
+    """Return the register ``count`` of each frame."""
     return [int.from_bytes(frame.raw[:2], "big") for frame in frames]

@@ -1,4 +1,4 @@
-"""A replay is moved by a local program: it stands, goes on, seeks, and plays to what is looked for."""
+"""A local program controls a replay: pause, play, seek, play to a change, an event or a time."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ def file(tmp_path: Path, instance: str) -> Path:
 
 
 @pytest.fixture
-def here(instance: str, file: Path) -> Iterator[tuple[Playing, Attachment]]:
+def paused_replay(instance: str, file: Path) -> Iterator[tuple[Playing, Attachment]]:
     with (
         built(instance, stepped=False) as segment,
         Playing(segment, file, paused=True) as playing,
         attach(instance, writable=True) as attachment,
     ):
-        assert counts([playing.next()]) == [0], "what is there at the beginning is seen"
+        assert counts([playing.next()]) == [0], "the first frame is shown at once"
         yield playing, attachment
 
 
-def test_it_stands_until_it_is_played(here: tuple[Playing, Attachment]) -> None:
-    playing, attachment = here
+def test_replay_stays_paused_until_it_is_played(paused_replay: tuple[Playing, Attachment]) -> None:
+    playing, attachment = paused_replay
     [status] = attachment.replay.status()
     assert (status.source, status.paused, status.position_s, status.length_s) == ("cell", True, 0.0, 0.4)
     assert attachment.read("cell/count").quality is Quality.GOOD
@@ -56,11 +56,11 @@ def test_it_stands_until_it_is_played(here: tuple[Playing, Attachment]) -> None:
     [status] = attachment.replay.status()
     assert (status.over, status.paused, status.position_s) == (True, True, 0.4)
     attachment.replay.play()
-    assert counts([playing.next() for _ in range(20)]) == list(range(20)), "from the end it goes on at the beginning"
+    assert counts([playing.next() for _ in range(20)]) == list(range(20)), "play at the end begins anew"
 
 
-def test_it_seeks_and_shows_what_was_there(here: tuple[Playing, Attachment]) -> None:
-    playing, attachment = here
+def test_seek_shows_the_recorded_frame(paused_replay: tuple[Playing, Attachment]) -> None:
+    playing, attachment = paused_replay
     for position_s, count in ((0.2, 10), (0.35, 17), (0.05, 2), (0.0, 0)):
         [status] = attachment.replay.seek(position_s)
         assert status.position_s == position_s
@@ -71,8 +71,8 @@ def test_it_seeks_and_shows_what_was_there(here: tuple[Playing, Attachment]) -> 
     assert (status.position_s, status.time_s) == (0.1, 7100.1)
 
 
-def test_it_plays_to_the_next_change_and_pauses(here: tuple[Playing, Attachment]) -> None:
-    playing, attachment = here
+def test_play_to_the_next_change_and_pause(paused_replay: tuple[Playing, Attachment]) -> None:
+    playing, attachment = paused_replay
     attachment.replay.to_change("cell/other")
     frames = [playing.next() for _ in range(10)]
     assert counts(frames) == list(range(1, 11))
@@ -86,7 +86,7 @@ def test_it_plays_to_the_next_change_and_pauses(here: tuple[Playing, Attachment]
     assert (status.position_s, status.paused) == (0.2, True)
 
 
-def test_it_plays_to_the_next_event(tmp_path: Path, instance: str) -> None:
+def test_play_to_the_next_event(tmp_path: Path, instance: str) -> None:
     with recorded(tmp_path, instance) as [cell]:
         for number in range(10):
             cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
@@ -108,8 +108,8 @@ def test_it_plays_to_the_next_event(tmp_path: Path, instance: str) -> None:
 
 
 @pytest.mark.parametrize(("injections", "at"), [("keep", 3), ("leave out", 6)])
-def test_it_plays_to_the_next_event_whatever_it_is(tmp_path: Path, instance: str, injections: str, at: int) -> None:
-    """One that is not told again is none."""
+def test_play_to_the_next_event_of_any_kind(tmp_path: Path, instance: str, injections: str, at: int) -> None:
+    """An event that the replay leaves out does not count."""
     kinds = {1: EventKind.STARTED, 3: EventKind.INJECTED, 6: EventKind.NOTED}
     with recorded(tmp_path, instance) as [cell]:
         for number in range(10):
@@ -126,7 +126,7 @@ def test_it_plays_to_the_next_event_whatever_it_is(tmp_path: Path, instance: str
         assert counts(playing.frames())[-1] == at
 
 
-def test_what_lies_behind_the_end_of_what_is_played_is_not_found(tmp_path: Path, instance: str) -> None:
+def test_search_stops_at_the_end_of_the_played_part(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with (
         built(instance, stepped=False) as segment,
@@ -149,14 +149,16 @@ def test_what_lies_behind_the_end_of_what_is_played_is_not_found(tmp_path: Path,
         (lambda replay: replay.status(["none"]), PathError),
     ],
 )
-def test_what_cannot_be_is_refused(here: tuple[Playing, Attachment], what: object, error: type[ShmioError]) -> None:
-    playing, attachment = here
+def test_invalid_requests_are_refused(
+    paused_replay: tuple[Playing, Attachment], what: object, error: type[ShmioError]
+) -> None:
+    playing, attachment = paused_replay
     with pytest.raises(error):
         what(attachment.replay)  # type: ignore[operator]
     assert playing.frames() == []
 
 
-def test_without_a_replay_there_is_nothing_to_move(instance: str) -> None:
+def test_instance_without_a_replay_refuses_control(instance: str) -> None:
     with built(instance), attach(instance) as attachment:
         with pytest.raises(CommandError, match="plays no recording"):
             attachment.replay.status()
@@ -185,8 +187,8 @@ def test_sources_of_one_recording_move_together(tmp_path: Path, instance: str) -
         assert {status.position_s for status in attachment.replay.status()} == {0.2}
 
 
-def test_a_time_that_is_past_is_not_played_to(here: tuple[Playing, Attachment]) -> None:
-    playing, attachment = here
+def test_play_until_a_past_time_is_refused(paused_replay: tuple[Playing, Attachment]) -> None:
+    playing, attachment = paused_replay
     attachment.replay.seek(0.2)
     playing.next()
     with pytest.raises(
@@ -201,8 +203,8 @@ def test_a_time_that_is_past_is_not_played_to(here: tuple[Playing, Attachment]) 
 
 
 @contextmanager
-def without_its_other(folder: Path, instance: str) -> Iterator[tuple[Path, Segment, Playing, Attachment]]:
-    """A replay of two sources that stands; the other's process has ended, and is not waited for long."""
+def replay_without_other(folder: Path, instance: str) -> Iterator[tuple[Path, Segment, Playing, Attachment]]:
+    """A paused replay of two sources, one of which has no process; time-outs are short."""
     file = record(folder, instance, "cell", "other")
     with (
         built(instance, "cell", "other", stepped=False) as segment,
@@ -217,7 +219,7 @@ def without_its_other(folder: Path, instance: str) -> Iterator[tuple[Path, Segme
 
 
 def test_a_source_that_missed_requests_catches_up(tmp_path: Path, instance: str) -> None:
-    with without_its_other(tmp_path, instance) as (file, segment, cell, attachment):
+    with replay_without_other(tmp_path, instance) as (file, segment, cell, attachment):
         with pytest.raises(CommandError, match="does not answer"):
             attachment.replay.seek(0.1)
         cell.until(lambda: attachment.replay.status(["cell"])[0].position_s == 0.1)
@@ -230,7 +232,7 @@ def test_a_source_that_missed_requests_catches_up(tmp_path: Path, instance: str)
             assert counts([cell.next(lambda frame: frame.raw[1] == 5)]) == [5]
 
 
-def test_a_source_that_joins_others_at_the_end_is_there_as_they_are(tmp_path: Path, instance: str) -> None:
+def test_source_that_starts_when_others_are_at_the_end_is_there_too(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance, "cell", "other")
     with (
         built(instance, "cell", "other", stepped=False) as segment,
@@ -245,8 +247,8 @@ def test_a_source_that_joins_others_at_the_end_is_there_as_they_are(tmp_path: Pa
     assert [(frame.quality, frame.reason) for frame in shown] == [(Quality.GOOD, ""), (Quality.BAD, OVER)]
 
 
-def test_a_source_that_catches_up_with_others_at_the_end_is_there_as_they_are(tmp_path: Path, instance: str) -> None:
-    with without_its_other(tmp_path, instance) as (file, segment, cell, attachment):
+def test_source_that_missed_requests_catches_up_with_others_at_the_end(tmp_path: Path, instance: str) -> None:
+    with replay_without_other(tmp_path, instance) as (file, segment, cell, attachment):
         with pytest.raises(CommandError, match="does not answer"):
             attachment.replay.seek(0.3)
         with pytest.raises(CommandError, match="does not answer"):
@@ -259,7 +261,7 @@ def test_a_source_that_catches_up_with_others_at_the_end_is_there_as_they_are(tm
     assert [(frame.quality, frame.reason) for frame in shown] == [(Quality.GOOD, ""), (Quality.BAD, OVER)]
 
 
-def test_a_replay_that_stands_is_good_again_when_its_process_is(tmp_path: Path, instance: str) -> None:
+def test_paused_replay_is_good_again_after_a_restart(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
         with Playing(segment, file, paused=True):
@@ -271,11 +273,11 @@ def test_a_replay_that_stands_is_good_again_when_its_process_is(tmp_path: Path, 
             told = [(event.kind, event.quality, event.text) for event in cell.happened()]
             assert told == [(EventKind.QUALITY, Quality.GOOD, GOES_ON)]
             attachment.replay.seek(0.3)
-            assert counts(cell.frames()) == [15], "it was told once"
+            assert counts(cell.frames()) == [15], "the frame is shown once"
 
 
-def held_up(segment: Segment, for_ns: int) -> tuple[Playhead, int]:
-    """Have it play since so long, and stand from now on: its next process finds both, and answers to the number."""
+def play_and_request_pause(segment: Segment, for_ns: int) -> tuple[Playhead, int]:
+    """Set the playhead as if it had played for a time; request a pause, which the next process answers."""
     head = segment.blocks["cell"].playhead
     assert head is not None
     play, now_ns = head.read(), segment.clock.present_ns()
@@ -285,21 +287,21 @@ def held_up(segment: Segment, for_ns: int) -> tuple[Playhead, int]:
         return head, head.ask(MoveRequest(now_ns, paused=True))
 
 
-def test_a_request_of_the_next_round_waits_until_this_one_is_played(tmp_path: Path, instance: str) -> None:
-    """A source that was held up shows what is at the place where it is to stand, and nothing twice before."""
+def test_request_in_the_next_round_waits_for_the_end_of_this_one(tmp_path: Path, instance: str) -> None:
+    """A delayed source plays up to the place of the pause, and shows no frame twice."""
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
         with Playing(segment, file, loop=True, paused=True):
             attachment.replay.seek(0.3)
-        held_up(segment, 200 * MS)
+        play_and_request_pause(segment, 200 * MS)
         with Playing(segment, file) as cell:
             assert counts([cell.next() for _ in range(10)]) == [16, 17, 18, 19, 0, 1, 2, 3, 4, 5]
             [status] = attachment.replay.seek(0.2)
-            assert (status.paused, counts(cell.frames())) == (True, [10]), "it stood"
+            assert (status.paused, counts(cell.frames())) == (True, [10]), "the replay is still paused"
 
 
-def test_a_request_that_was_read_late_is_done_as_of_its_moment(here: tuple[Playing, Attachment]) -> None:
-    playing, _ = here
+def test_late_request_takes_effect_at_its_own_time(paused_replay: tuple[Playing, Attachment]) -> None:
+    playing, _ = paused_replay
     head = playing.block.playhead
     assert head is not None
     now_ns = playing.block.clock.present_ns()
@@ -311,20 +313,20 @@ def test_a_request_that_was_read_late_is_done_as_of_its_moment(here: tuple[Playi
     assert playing.next(lambda frame: frame.quality is Quality.BAD).reason == "replay: the recording is over"
 
 
-def test_what_was_due_before_a_request_is_seen_before_its_answer(tmp_path: Path, instance: str) -> None:
-    """Who is told that it stands finds what is there, and nothing comes any more."""
+def test_frames_due_before_a_request_come_before_its_answer(tmp_path: Path, instance: str) -> None:
+    """After the answer to a pause, all frames are there and no more come."""
     file = record(tmp_path, instance, frames=400)
     with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
         with Playing(segment, file, paused=True):
             attachment.replay.seek(0.1)
-        head, number = held_up(segment, 6 * S)
+        head, number = play_and_request_pause(segment, 6 * S)
         with Playing(segment, file) as cell:
             cell.until(lambda: head.found(number) is not None)
             assert counts(cell.frames()) == list(range(6, 306))
 
 
-def test_a_request_of_a_moment_just_behind_a_wrap_is_done_in_the_next_round(tmp_path: Path, instance: str) -> None:
-    """Who asks may have looked at the clock after the source did."""
+def test_request_just_after_a_wrap_takes_effect_in_the_next_round(tmp_path: Path, instance: str) -> None:
+    """The requesting program may have read the clock after the source did."""
     file = record(tmp_path, instance)
     with (
         built(instance, stepped=False) as segment,
@@ -345,8 +347,8 @@ def test_a_request_of_a_moment_just_behind_a_wrap_is_done_in_the_next_round(tmp_
         assert counts(cell.frames())[-1] == 0
 
 
-def test_a_request_of_a_moment_just_before_a_wrap_is_done_in_that_round(tmp_path: Path, instance: str) -> None:
-    """Its source may have begun the next one, others of its recording not."""
+def test_request_just_before_a_wrap_takes_effect_in_that_round(tmp_path: Path, instance: str) -> None:
+    """This source may have begun the next round, while others of its recording have not."""
     file = record(tmp_path, instance)
     with (
         built(instance, stepped=False) as segment,

@@ -1,4 +1,4 @@
-"""Edges of a replay: several recordings, a source that is not there from the begin, files that lie."""
+"""Edge cases of a replay: several recordings, a source that begins late, invalid times."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from shmio.segment import Block
 
 
-def test_a_source_that_begins_later_is_bad_in_each_round_of_a_loop_until_it_does(tmp_path: Path, instance: str) -> None:
+def test_source_that_begins_late_is_bad_until_then_in_each_round(tmp_path: Path, instance: str) -> None:
     with recorded(tmp_path, instance, "cell", "late") as [cell, late]:
         for number in range(100):
             cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
@@ -61,7 +61,7 @@ def test_a_source_that_begins_later_is_bad_in_each_round_of_a_loop_until_it_does
         coordinator.close()
 
 
-def test_an_event_is_looked_for_in_one_recording(tmp_path: Path, instance: str) -> None:
+def test_search_for_an_event_needs_a_single_recording(tmp_path: Path, instance: str) -> None:
     files: list[Path] = []
     for name, later_ns in (("a", 0), ("b", 5 * S)):
         (tmp_path / name).mkdir()
@@ -81,7 +81,7 @@ def test_an_event_is_looked_for_in_one_recording(tmp_path: Path, instance: str) 
         assert [status.position_s for status in attachment.replay.status()] == [0.0, 0.0]
 
 
-def test_a_successor_begins_while_others_wait_for_its_answer(tmp_path: Path, instance: str) -> None:
+def test_successor_starts_while_the_playhead_is_locked(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance) as segment, Segment.open(instance, writable=True) as other:
         with Playing(segment, file) as playing:
@@ -96,7 +96,7 @@ def test_a_successor_begins_while_others_wait_for_its_answer(tmp_path: Path, ins
     ("period_ns", "stale_ns"),
     [(0, S), (-PERIOD_NS, S), (1, S), (10**30, 10**30), (PERIOD_NS, 0), (PERIOD_NS, -1), (PERIOD_NS, 10**30)],
 )
-def test_a_cycle_that_makes_no_sense_is_told(tmp_path: Path, period_ns: int, stale_ns: int) -> None:
+def test_invalid_period_or_stale_time_is_refused(tmp_path: Path, period_ns: int, stale_ns: int) -> None:
     file = tmp_path / "some.mem"
     work = Build(file)
     work.writer.attach(f"layouts/{LAYOUT.hash.hex()}.json", "application/json", LAYOUT.to_json(), START_NS)
@@ -109,7 +109,7 @@ def test_a_cycle_that_makes_no_sense_is_told(tmp_path: Path, period_ns: int, sta
         Replay(Replay.Options(file=str(file)), "cell")
 
 
-def test_a_gap_at_a_time_that_makes_no_sense_harms_nothing(tmp_path: Path, instance: str) -> None:
+def test_gap_with_an_invalid_time_is_harmless(tmp_path: Path, instance: str) -> None:
     file = tmp_path / "some.mem"
     work = Build(file)
     work.block("cell", LAYOUT)
@@ -125,13 +125,13 @@ def test_a_gap_at_a_time_that_makes_no_sense_harms_nothing(tmp_path: Path, insta
         coordinator.close()
 
 
-def test_a_successor_tells_no_event_again(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_successor_repeats_no_event(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with recorded(tmp_path, instance) as [cell]:
         for number in range(10):
             cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
             cell.event(BEGIN_NS + number * PERIOD_NS + MS, Record(EventKind.NOTED, str(number)))
     [file] = tmp_path.glob("*.mem")
-    monkeypatch.setattr(Player, "end", lambda *_: None)  # one that is killed publishes no last frame
+    monkeypatch.setattr(Player, "end", lambda *_: None)  # as if killed: no last frame is published
     with built(instance) as segment, attach(instance, writable=True) as attachment:
         events = segment.blocks["cell"].events.cursor()
         with Playing(segment, file):
@@ -144,10 +144,10 @@ def test_a_successor_tells_no_event_again(tmp_path: Path, instance: str, monkeyp
     assert [event.text for event in told] == ["0", "1", "2"]
 
 
-def test_what_a_process_that_was_held_up_leaves_out_is_not_read(
+def test_delayed_process_does_not_read_the_frames_that_it_skips(
     tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else it would be later still when it has come to the end of that."""
+    """Reading them would delay it even more."""
     with recorded(tmp_path, instance) as [cell]:
         for number in range(2000):
             cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
@@ -176,7 +176,7 @@ def test_what_a_process_that_was_held_up_leaves_out_is_not_read(
     assert playing.loop.counters.overruns >= 1400
 
 
-def test_what_is_asked_for_within_a_step_is_done_behind_it(tmp_path: Path, instance: str) -> None:
+def test_request_within_a_step_takes_effect_after_it(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with (
         built(instance) as segment,
@@ -202,18 +202,18 @@ def test_what_is_asked_for_within_a_step_is_done_behind_it(tmp_path: Path, insta
         assert (status.paused, status.position_s) == (True, 0.1)
 
 
-def test_a_search_can_be_given_up(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_search_can_be_cancelled(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     file = record(tmp_path, instance)
-    monkeypatch.setattr(Search, "go_on", lambda _: None)  # one that takes for ever
+    monkeypatch.setattr(Search, "go_on", lambda _: None)  # a search that never ends
     with built(instance, stepped=False) as segment, Playing(segment, file), attach(instance, writable=True) as attached:
         asked = []
 
-        def given_up() -> bool:
+        def cancelled() -> bool:
             asked.append(True)
             return len(asked) > 1
 
         with pytest.raises(CommandError, match="source cell has not answered in time"):
-            attached.replay.change(ReplayRequest(event="noted"), given_up)
+            attached.replay.change(ReplayRequest(event="noted"), cancelled)
         [status] = attached.replay.seek(0.1)
         assert status.position_s == 0.1, "another request takes its place"
 

@@ -1,4 +1,4 @@
-"""A recording is played: each frame and event as it was, at its time, in wall time and step by step."""
+"""Playing a recording: frames and events as recorded, at their times, live and step by step."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from tests.unit.connectors.replay.harness import (
 GUEST = 0
 
 
-def took(source_writer: SourceWriter, value: int) -> str:
+def outcome_of_write(source_writer: SourceWriter, value: int) -> str:
     [outcome] = source_writer.write({"count": value})
     return f"{outcome.kind}: {outcome.text}"
 
 
-def test_frames_come_as_they_were_at_their_times(tmp_path: Path, instance: str) -> None:
-    """Beside live sources they have the instance's clock when they were due, without a jitter."""
+def test_frames_are_replayed_unchanged_at_their_times(tmp_path: Path, instance: str) -> None:
+    """The instance's clock in each frame is the time at which the frame was due, without jitter."""
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, Playing(segment, file, speed=4) as cell:
         first = cell.next()
@@ -54,7 +54,7 @@ def test_frames_come_as_they_were_at_their_times(tmp_path: Path, instance: str) 
     assert last.publish_ns - frames[-1].publish_ns == PERIOD_NS
 
 
-def test_none_comes_before_its_time(tmp_path: Path, instance: str) -> None:
+def test_no_frame_comes_before_its_time(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, Playing(segment, file) as cell:
         for _ in range(20):
@@ -62,7 +62,7 @@ def test_none_comes_before_its_time(tmp_path: Path, instance: str) -> None:
             assert segment.clock.present_ns() >= frame.clock_ns
 
 
-def test_the_instance_may_have_the_recordings_time(tmp_path: Path, instance: str) -> None:
+def test_instance_may_use_the_recordings_clock(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     origin = Origin(BEGIN_NS, 7_000 * S)
     with built(instance, stepped=False, origin=origin) as segment, Playing(segment, file, own_clock=True) as cell:
@@ -72,7 +72,7 @@ def test_the_instance_may_have_the_recordings_time(tmp_path: Path, instance: str
     assert [segment.clock_ns(frame.publish_ns) for frame in frames] == [frame.clock_ns for frame in frames]
 
 
-def test_events_are_told_again_as_nobodys(tmp_path: Path, instance: str) -> None:
+def test_events_are_replayed_without_an_owner(tmp_path: Path, instance: str) -> None:
     with recorded(tmp_path, instance) as [cell]:
         cell.frame(BEGIN_NS, image(0))
         cell.event(BEGIN_NS + MS, Record(EventKind.ACCEPTED, "", 3, 77, 1, 1, 0, 0, 2, b"\0\5"))
@@ -101,11 +101,11 @@ def test_events_are_told_again_as_nobodys(tmp_path: Path, instance: str) -> None
         (Quality.GOOD, ""),
         (Quality.UNCERTAIN, "doubt"),
         (Quality.BAD, "gone"),
-    ], "a recording that ends badly needs no frame that says that it is over"
+    ], "after a bad last frame, no frame says that the recording is over"
 
 
 @pytest.mark.parametrize("injections", ["keep", "leave out"])
-def test_injections_of_the_recording_are_seen_or_not(tmp_path: Path, instance: str, injections: str) -> None:
+def test_recorded_injections_are_kept_or_left_out(tmp_path: Path, instance: str, injections: str) -> None:
     with recorded(tmp_path, instance) as [cell]:
         cell.frame(BEGIN_NS, image(1), effective=image(99))
         cell.event(BEGIN_NS, Record(EventKind.INJECTED, "mine", 3, 5, 0, 1, injection=5))
@@ -122,24 +122,26 @@ def test_injections_of_the_recording_are_seen_or_not(tmp_path: Path, instance: s
         number = source_writer.inject(["other"])
         source_writer.shadow(number, {"other": 7})
         shown = playing.next(lambda frame: frame.image[2:] == b"\0\7")
-        assert (shown.raw, shown.image) == (image(1), image(99 if kept else 1, 7)), "ours lies over theirs"
+        assert (shown.raw, shown.image) == (image(1), image(99 if kept else 1, 7)), (
+            "the new injection is outside the recorded one"
+        )
         source_writer.lift(number)
         assert playing.next(lambda frame: frame.image[2:] == b"\0\0").image == frame.image
         coordinator.close()
 
 
-def test_nothing_is_written(tmp_path: Path, instance: str) -> None:
+def test_replay_refuses_writes(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance) as segment, Playing(segment, file) as cell:
-        cell.next()  # it accepts by now
+        cell.next()  # the process accepts commands now
         source_writer = SourceWriter(segment.blocks["cell"], GUEST)
-        assert took(source_writer, 5) == "refused: source cell replays a recording: it cannot be written"
+        assert outcome_of_write(source_writer, 5) == "refused: source cell replays a recording: it cannot be written"
         kinds = [event.kind for event in cell.happened()]
     assert kinds == [EventKind.ACCEPTED, EventKind.REFUSED]
 
 
-def test_what_is_missing_is_bad_until_it_goes_on(tmp_path: Path, instance: str) -> None:
-    """The ring turned faster than the recorder: the gap is in the recording, and in the replay."""
+def test_gap_is_bad_until_the_recording_continues(tmp_path: Path, instance: str) -> None:
+    """The source overtook the recorder, so the recording has a gap."""
     with recorded(tmp_path, instance) as [cell]:
         slots = cell.writer.block.ring.slot_count
         for number in range(slots + 10):
@@ -164,11 +166,11 @@ def test_what_is_missing_is_bad_until_it_goes_on(tmp_path: Path, instance: str) 
 # ---- virtual time ----------------------------------------------------------------------------------------------------
 
 
-def test_a_step_plays_what_lies_in_it(tmp_path: Path, instance: str) -> None:
+def test_step_plays_the_frames_within_it(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance, origin=Origin(BEGIN_NS, 0)) as segment, Playing(segment, file, own_clock=True) as cell:
         coordinator = Coordinator(segment)
-        assert counts([cell.next()]) == [0], "what is there at the beginning is seen before the first step"
+        assert counts([cell.next()]) == [0], "the first frame is shown before the first step"
         by_step = []
         for _ in range(10):
             step = coordinator.step(50 * MS)
@@ -178,10 +180,10 @@ def test_a_step_plays_what_lies_in_it(tmp_path: Path, instance: str) -> None:
         coordinator.close()
     assert by_step[:4] == [[1, 2], [3, 4, 5], [6, 7], [8, 9, 10]]
     assert [count for step in by_step for count in step][:19] == list(range(1, 20))
-    assert by_step[-1] == [], "when the recording is over, steps are answered all the same"
+    assert by_step[-1] == [], "steps are answered after the end of the recording, too"
 
 
-def test_steps_give_the_same_each_time(tmp_path: Path, instance: str) -> None:
+def test_steps_are_reproducible(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     runs = []
     for number in range(2):
@@ -197,7 +199,7 @@ def test_steps_give_the_same_each_time(tmp_path: Path, instance: str) -> None:
     assert len(cycles) > 30
 
 
-def test_a_step_plays_each_round_of_a_loop(tmp_path: Path, instance: str) -> None:
+def test_long_step_plays_each_round_of_a_loop(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance) as segment, Playing(segment, file, loop=True) as cell:
         coordinator = Coordinator(segment)
@@ -207,8 +209,8 @@ def test_a_step_plays_each_round_of_a_loop(tmp_path: Path, instance: str) -> Non
         assert counts(cell.frames()) == (5 * list(range(20)))[1:]
 
 
-def test_what_came_before_a_step_is_known_though_a_loop_begins_anew_in_it(tmp_path: Path, instance: str) -> None:
-    """A model that computes the step is to see that, whoever is faster."""
+def test_frames_before_a_step_are_known_though_the_loop_restarts_within_it(tmp_path: Path, instance: str) -> None:
+    """A model that computes the step must see them, whichever process is faster."""
     file = record(tmp_path, instance)
     with built(instance) as segment, Playing(segment, file, loop=True) as cell:
         coordinator = Coordinator(segment)
@@ -223,12 +225,12 @@ def test_what_came_before_a_step_is_known_though_a_loop_begins_anew_in_it(tmp_pa
         assert counts([frame for frame in frames if not cell.block.came_with(frame, 2)]) == list(range(16))
         for _ in stepping:
             pass
-        assert not any(cell.block.came_with(frame, 2) for frame in frames), "all may be seen from now on"
+        assert not any(cell.block.came_with(frame, 2) for frame in frames), "after the step, all frames are visible"
         coordinator.close()
 
 
-def test_a_loop_leaves_out_what_is_a_round_late(tmp_path: Path, instance: str) -> None:
-    """What it shows is always of the round that its position is in."""
+def test_loop_skips_frames_of_earlier_rounds(tmp_path: Path, instance: str) -> None:
+    """The shown frame is always of the current round."""
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, Playing(segment, file, loop=True, paused=True) as cell:
         cell.next()
@@ -242,7 +244,7 @@ def test_a_loop_leaves_out_what_is_a_round_late(tmp_path: Path, instance: str) -
         cell.until(lambda: cell.loop.counters.overruns >= 200)
 
 
-def test_two_of_one_recording_stay_in_step(tmp_path: Path, instance: str) -> None:
+def test_sources_of_one_recording_stay_synchronous(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance, "cell", "other")
     with (
         built(instance, "cell", "other", stepped=False) as segment,
@@ -253,7 +255,7 @@ def test_two_of_one_recording_stay_in_step(tmp_path: Path, instance: str) -> Non
     assert all(one == two for one, two in pairs)
 
 
-def test_a_step_goes_on_with_time_that_was_taken_over(tmp_path: Path, instance: str) -> None:
+def test_step_continues_after_a_take_over(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, Playing(segment, file, speed=0.1) as cell:
         first = cell.next()
@@ -265,10 +267,10 @@ def test_a_step_goes_on_with_time_that_was_taken_over(tmp_path: Path, instance: 
         coordinator.close()
 
 
-# ---- the process is another's successor ------------------------------------------------------------------------------
+# ---- releases and successors -----------------------------------------------------------------------------------------
 
 
-def test_it_goes_on_with_real_time_that_is_released(tmp_path: Path, instance: str) -> None:
+def test_replay_continues_after_a_release(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, Playing(segment, file, speed=0.1) as cell:
         frames = [cell.next()]
@@ -282,12 +284,12 @@ def test_it_goes_on_with_real_time_that_is_released(tmp_path: Path, instance: st
         coordinator.release()
         while frames[-1].quality is Quality.GOOD:
             frames.append(cell.next())
-    assert counts(frames[:-1]) == list(range(20)), "each once"
+    assert counts(frames[:-1]) == list(range(20)), "each frame once"
     assert frames[-1].reason == OVER
     assert [frame.clock_ns for frame in frames] == sorted(frame.clock_ns for frame in frames)
 
 
-def test_a_successor_goes_on_and_leaves_nothing_out(tmp_path: Path, instance: str) -> None:
+def test_successor_continues_without_a_gap(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance) as segment:
         coordinator = Coordinator(segment)
@@ -299,10 +301,10 @@ def test_a_successor_goes_on_and_leaves_nothing_out(tmp_path: Path, instance: st
             coordinator.step(10 * S)
         coordinator.close()
         frames = [frame for frame in iter(cursor.poll, None) if frame.quality is Quality.GOOD]
-    assert [count for count, _ in groupby(counts(frames))] == list(range(20)), "what is there may be shown again"
+    assert [count for count, _ in groupby(counts(frames))] == list(range(20)), "the last frame may be shown again"
 
 
-def test_a_successor_shows_what_is_there_while_time_stands(tmp_path: Path, instance: str) -> None:
+def test_successor_shows_the_last_frame_while_time_is_paused(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance) as segment:
         coordinator = Coordinator(segment)
@@ -319,20 +321,20 @@ def test_a_successor_shows_what_is_there_while_time_stands(tmp_path: Path, insta
         coordinator.close()
 
 
-def test_another_recording_begins_anew_in_the_same_block(tmp_path: Path, instance: str) -> None:
+def test_another_recording_starts_from_its_beginning(tmp_path: Path, instance: str) -> None:
     files = [record(tmp_path / name, f"{instance}{name}") for name in "ab"]
     with built(instance) as segment:
         coordinator = Coordinator(segment)
         with Playing(segment, files[0]) as cell:
             coordinator.step(300 * MS)
         with Playing(segment, files[1], start=0.1) as cell:
-            assert counts([cell.next()]) == [4], "what was there before the start"
+            assert counts([cell.next()]) == [4], "the frame before the start"
             coordinator.step(100 * MS)
             assert counts(cell.frames()) == [5, 6, 7, 8, 9, 10]
         coordinator.close()
 
 
-def test_what_was_asked_of_another_recording_is_not_done_again(tmp_path: Path, instance: str) -> None:
+def test_requests_for_an_earlier_recording_are_ignored(tmp_path: Path, instance: str) -> None:
     files = [record(tmp_path / name, f"{instance}{name}") for name in "ab"]
     with built(instance) as segment, attach(instance, writable=True) as attachment:
         with Playing(segment, files[0]):
@@ -343,13 +345,13 @@ def test_what_was_asked_of_another_recording_is_not_done_again(tmp_path: Path, i
             assert counts(cell.frames()) == [5, 6]
 
 
-def test_age_is_the_recordings(tmp_path: Path, instance: str) -> None:
-    """A slow replay does not go stale, and one that stands does not either."""
+def test_age_is_in_recorded_time(tmp_path: Path, instance: str) -> None:
+    """A slow replay does not become stale."""
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, Playing(segment, file, speed=0.01) as cell:
         frame = cell.next()
         begun_s = time.monotonic()
-        while time.monotonic() - begun_s < 0.7:  # more than `stale`, and less than till the next frame
+        while time.monotonic() - begun_s < 0.7:  # longer than the stale time, shorter than the wait for the next frame
             age_ns = frame.age_ns(cell.block.now_ns())
             assert age_ns < 20 * MS
         assert cell.block.assess(frame)[0] is Quality.GOOD

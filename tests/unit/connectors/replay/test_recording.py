@@ -1,4 +1,4 @@
-"""What can be played of a recording, and what is said of one that cannot."""
+"""The parts of a recording that can be played, and errors of recordings that cannot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.unit.connectors.replay.harness import (
 )
 
 
-def test_a_part_is_played_from_what_was_there_before(tmp_path: Path, instance: str) -> None:
+def test_part_begins_with_the_frame_before_its_start(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance) as segment, Playing(segment, file, start=0.105, end=0.3) as cell:
         coordinator = Coordinator(segment)
@@ -45,7 +45,7 @@ def test_a_part_is_played_from_what_was_there_before(tmp_path: Path, instance: s
         (None, "9999-12-31T23:59:59+00:00", ""),
     ],
 )
-def test_what_is_no_part_is_told(
+def test_invalid_part_is_refused(
     tmp_path: Path, instance: str, start: Moment | None, end: Moment | None, error: str
 ) -> None:
     with Recording([record(tmp_path, instance)]) as recording:
@@ -56,7 +56,7 @@ def test_what_is_no_part_is_told(
             recording.span(start, end)
 
 
-def test_a_source_that_is_not_there_is_told(tmp_path: Path, instance: str) -> None:
+def test_missing_source_is_refused(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with pytest.raises(ConfigError, match=r"source: .* has no frames of a source 'arm'; it has: cell"):
         Replay(Replay.Options(file=str(file)), "arm")
@@ -65,7 +65,7 @@ def test_a_source_that_is_not_there_is_told(tmp_path: Path, instance: str) -> No
     named.close()
 
 
-def test_a_recording_without_frames_is_told(tmp_path: Path, instance: str) -> None:
+def test_recording_without_frames_is_refused(tmp_path: Path, instance: str) -> None:
     with recorded(tmp_path, instance):
         pass
     [file] = tmp_path.glob("*.mem")
@@ -73,7 +73,7 @@ def test_a_recording_without_frames_is_told(tmp_path: Path, instance: str) -> No
         Replay(Replay.Options(file=str(file)), "cell")
 
 
-def test_times_that_make_no_sense_are_told(tmp_path: Path, instance: str) -> None:
+def test_invalid_times_are_refused(tmp_path: Path, instance: str) -> None:
     with recorded(tmp_path, instance) as [cell]:
         cell.frame(1 << 62, image(0))
     [file] = tmp_path.glob("*.mem")
@@ -81,14 +81,14 @@ def test_times_that_make_no_sense_are_told(tmp_path: Path, instance: str) -> Non
         Replay(Replay.Options(file=str(file)), "cell")
 
 
-def test_files_of_different_runs_are_not_one(tmp_path: Path, instance: str) -> None:
+def test_files_of_different_runs_are_refused(tmp_path: Path, instance: str) -> None:
     files = [str(record(tmp_path / name, f"{instance}{name}")) for name in "ab"]
     with pytest.raises(ConfigError, match="come from different runs"):
         Replay(Replay.Options(file=files), "cell")
 
 
 @pytest.mark.parametrize("text", [b"", b"\x89MCAP0\r\n", b"no recording at all"])
-def test_what_is_no_recording_is_told(tmp_path: Path, text: bytes) -> None:
+def test_file_that_is_no_recording_is_refused(tmp_path: Path, text: bytes) -> None:
     file = tmp_path / "some.mem"
     file.write_bytes(text)
     with pytest.raises(ConfigError, match=f"file: {file}"):
@@ -97,7 +97,7 @@ def test_what_is_no_recording_is_told(tmp_path: Path, text: bytes) -> None:
         Replay(Replay.Options(file=str(tmp_path / "none.mem")), "cell")
 
 
-def test_a_damaged_place_is_bad_and_what_follows_is_played(tmp_path: Path, instance: str) -> None:
+def test_damaged_chunk_is_bad_and_the_rest_is_played(tmp_path: Path, instance: str) -> None:
     with recorded(tmp_path, instance) as [cell]:
         for number in range(45_000):
             cell.frame(BEGIN_NS + number * PERIOD_NS, image(number % 30000, number * 7919 % 30000))

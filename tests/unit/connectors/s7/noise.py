@@ -1,4 +1,4 @@
-"""Answers that pass every check of their headers, and are wrong behind them."""
+"""Answers with correct headers and faulty contents."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 
 def answer(kind: int, parameters: bytes, data: bytes) -> bytes:
-    """A frame whose lengths are right. ``kind``: the ROSCTR; userdata, 7, has no error in its header."""
+    """Return a frame with correct lengths; ``kind`` is its ROSCTR (7, userdata, has no error field)."""
     header = struct.pack(">BBHHHH", 0x32, kind, 0, 7, len(parameters), len(data)) + (b"" if kind == 7 else b"\0\0")
     payload = b"\x02\xf0\x80" + header + parameters + data
     return struct.pack(">BxH", 3, 4 + len(payload)) + payload
@@ -19,5 +19,5 @@ def _torn(whole: bytes) -> st.SearchStrategy[bytes]:
 
 
 def answers(kind: int, parameters: bytes, data: bytes) -> st.SearchStrategy[bytes]:
-    """Frames with right headers, whose parameters and data are such as these, cut short, and some noise."""
+    """Generate frames with correct headers, but truncated parameters and data, and some noise."""
     return st.builds(answer, st.just(kind), _torn(parameters), _torn(data))

@@ -1,4 +1,4 @@
-"""Any order of answers, any split, any size: the block comes out whole, or not at all."""
+"""Reading a block with answers in any split and order: it is complete, or refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shmio.errors import ConnectorError
 
 
 def answer(request: bytes, block: bytes) -> memoryview:
-    """What a faultless controller answers."""
+    """Return the answer of a faultless controller."""
     reference, count, place = struct.unpack_from(">11xH10xH2xI", request)
     start = (place & 0xFFFFFF) // 8
     data = block[start : start + count]
@@ -34,7 +34,7 @@ def split(requests: memoryview) -> list[bytes]:
     first=st.integers(0, 65535),
     data=st.data(),
 )
-def test_answers_in_any_order_make_the_block(block: bytes, chunk: int, first: int, data: st.DataObject) -> None:
+def test_answers_in_any_order_give_the_block(block: bytes, chunk: int, first: int, data: st.DataObject) -> None:
     reading = BlockRead(201, len(block), chunk)
     for _ in range(2):
         reading.begin(0)
@@ -67,7 +67,7 @@ def test_refuses_less_or_more_data_than_asked() -> None:
             reading.accept(0, answer(bytes(other), bytes(range(10))))
 
 
-def test_a_refusal_ends_the_pass_and_only_that() -> None:
+def test_refusal_ends_only_the_current_read() -> None:
     reading = BlockRead(7, 10, 4)
     request = split(reading.take(3, 0))[0]
     frame = bytearray(answer(request, bytes(10)))

@@ -1,4 +1,4 @@
-"""The size of a block is found, whatever it is, with few jobs."""
+"""The size of a block is found with few jobs."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ def test_finds_the_size(sizes: tuple[int, int], pdu_size: int) -> None:
     assert rounds <= (4 if pdu_size >= 240 else 7)
 
 
-def test_reads_which_bytes_are_there() -> None:
+def test_readable_bytes_are_recognised() -> None:
     assert parse_readable(memoryview(ANSWER), 3) == [True, True, False]
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
-def test_answers_for_other_items(count: int) -> None:
+def test_answer_with_another_number_of_items_is_refused(count: int) -> None:
     with pytest.raises(ConnectorError, match=f"not an answer to a read of {count} items"):
         parse_readable(memoryview(ANSWER), count)
 
 
 @pytest.mark.parametrize("data", ["ff04000855 00 ff040008aa 00 0500", "ff04000855 00 ff040008aa 00 05000000 0000"])
-def test_answers_of_a_wrong_length(data: str) -> None:
+def test_answer_of_a_wrong_length_is_refused(data: str) -> None:
     items = bytes.fromhex(data)
     head = struct.pack(">BxH3sBBHHHHHBB", 3, 21 + len(items), b"\x02\xf0\x80", 0x32, 3, 0, 7, 2, len(items), 0, 4, 3)
     with pytest.raises(ConnectorError, match=r"ends before item 3|belong to its items"):

@@ -1,4 +1,4 @@
-"""Whatever is written, in whatever order the jobs of a wave are served: as if it had been written one by one."""
+"""Writes in waves, whose jobs are served in any order, have the effect of single writes."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ WRITES = st.lists(
 
 @settings(max_examples=60)
 @given(writes=WRITES, pdu_size=st.sampled_from([100, 101, 240, 480, 960]), data=st.data())
-def test_as_if_written_one_by_one(writes: list[Write], pdu_size: int, data: st.DataObject) -> None:
+def test_waves_have_the_effect_of_single_writes(writes: list[Write], pdu_size: int, data: st.DataObject) -> None:
     block = bytearray(range(200)) * 2
     wanted = bytearray(block)
     plc = controller(block, pdu_size)
@@ -98,12 +98,12 @@ def test_many_small_writes_go_in_few_jobs() -> None:
     (wave,) = waves(201, 960, writes, [""] * 60)
     assert wave.count == 3  # twenty items each
     (wave,) = waves(201, 960, [Write(place, 1 << bit, b"\1") for place in range(2) for bit in range(8)], [""] * 16)
-    assert wave.count == 1  # bits of one byte are not in each other's way
+    assert wave.count == 1  # writes of different bits of a byte fit into one wave
     assert len(list(waves(201, 960, [Write(0, 0, b"ab"), Write(1, 4, b"\4"), Write(1, 4, b"\0")], [""] * 3))) == 3
 
 
 def items(requests: bytes) -> list[tuple[int, bool]]:
-    """First bit, and whether it is a write of a bit, of each item of these jobs, as they are sent."""
+    """Return (first bit, writes a single bit) for each item, in the order of sending."""
     found = []
     for request in split(requests):
         places = range(19, 19 + 12 * request[18], 12)
@@ -113,8 +113,8 @@ def items(requests: bytes) -> list[tuple[int, bool]]:
 
 @settings(max_examples=30)
 @given(order=st.permutations(range(90)), pdu_size=st.sampled_from([100, 240, 960]), size=st.sampled_from([1, 3, 300]))
-def test_data_before_their_strobe(order: list[int], pdu_size: int, size: int) -> None:
-    """The order of the writes is that within a job and from job to job, wherever in the block they are."""
+def test_data_are_sent_before_their_strobe(order: list[int], pdu_size: int, size: int) -> None:
+    """Writes keep their order within a job and from job to job, whatever their offsets are."""
     writes: list[Write] = []
     wanted = []
     for data, strobe in zip(order[:45], order[45:], strict=True):
@@ -123,7 +123,7 @@ def test_data_before_their_strobe(order: list[int], pdu_size: int, size: int) ->
         wanted += [(8 * part, False) for part in range(at, at + size, pdu_size - 28)]
         wanted.append((8 * strobe + strobe % 8, True))
     (wave,) = waves(201, pdu_size, writes, [""] * len(writes))
-    assert items(wave.take(2, 0) + wave.take(wave.count - 2, 2)) == wanted  # as the controller has room for jobs
+    assert items(wave.take(2, 0) + wave.take(wave.count - 2, 2)) == wanted  # in two parts, as for a busy controller
 
 
 def test_a_refused_item_among_good_ones() -> None:
@@ -136,7 +136,7 @@ def test_a_refused_item_among_good_ones() -> None:
     assert block == b"good" + bytes(5) + b"\2" + bytes(SIZE - 10)
 
 
-def test_a_long_write_that_fails_at_its_end_says_so_once() -> None:
+def test_long_write_that_fails_at_its_end_has_one_reason() -> None:
     outcomes = outcomes_of(controller(bytearray(SIZE), 100), 100, [Write(0, 0, bytes(SIZE + 1)), Write(0, 0, b"x")])
     assert f"no byte {SIZE} " in outcomes[0]
     assert outcomes[1] == ""
@@ -156,20 +156,20 @@ def test_a_job_that_is_refused_as_a_whole_refuses_each_of_its_writes() -> None:
         (0, 0, None, Lost.UNSENT, Lost.UNSENT),
         (2, 0, None, Lost.UNKNOWN, Lost.UNSENT),
         (2, 1, None, Lost.UNKNOWN, Lost.UNSENT),
-        (2, 2, None, Lost.UNKNOWN, Lost.UNSENT),  # done in part: neither written nor surely not
+        (2, 2, None, Lost.UNKNOWN, Lost.UNSENT),  # partly written
         (5, 4, None, Lost.UNKNOWN, Lost.UNKNOWN),
         (5, 5, None, "", ""),
         (2, 2, Fault.WRITE_PROTECTED, "access denied", Lost.UNSENT),
         (2, 1, Fault.WRITE_PROTECTED, Lost.UNKNOWN, Lost.UNSENT),
     ],
 )
-def test_what_is_known_of_a_write_of_several_jobs_when_the_session_is_lost(
+def test_outcomes_of_a_write_of_several_jobs_after_a_lost_session(
     sent: int, answered: int, fault: Fault | None, first: str | Lost, second: str | Lost
 ) -> None:
     plc = controller(bytearray(SIZE), 100, fault)
     outcomes = ["", ""]
     (wave,) = waves(201, 100, [Write(0, 0, bytes(300)), Write(350, 0, b"xy")], outcomes)
-    assert wave.count == 5, "the second is in the last job, with the end of the first"
+    assert wave.count == 5, "the second write is in the last job, with the end of the first"
     for index, request in enumerate(split(wave.take(sent, 0))[:answered]):
         wave.accept(index, framed(plc.answer(memoryview(request)[7:])))
     for told, wanted in zip(ends(outcomes, [wave]), (first, second), strict=True):
@@ -235,13 +235,13 @@ def test_refuses_a_wrong_answer(frame: memoryview, text: str) -> None:
         parse_write_answer(frame, 3)
 
 
-def test_codes_for_other_items_than_written() -> None:
+def test_wrong_number_of_codes_is_refused() -> None:
     with pytest.raises(ConnectorError, match="3 return codes, 2 items were written"):
         parse_write_answer(memoryview(ANSWER), 2)
 
 
 @pytest.mark.parametrize("head", ["32 02 0000 0007 0000 0000", "32 03 0000 0007 0000 0000"])
-def test_a_job_that_is_refused_as_a_whole(head: str) -> None:
+def test_answer_may_refuse_the_whole_job(head: str) -> None:
     frame = bytes.fromhex("03000013 02f080" + head + "83 04")
     with pytest.raises(RefusedError, match=r"0x8304.*PUT/GET"):
         parse_write_answer(memoryview(frame), 3)

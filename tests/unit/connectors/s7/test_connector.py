@@ -1,4 +1,4 @@
-"""Through real sockets: every way a controller or a wire can fail, and that the next ``connect`` mends it."""
+"""The client over real sockets: after any fault, the next ``connect`` recovers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Scripted = Callable[..., S7Client]
 
 @pytest.fixture
 def scripted() -> Iterator[Scripted]:
-    """Make a client of a peer that sends one given answer to each thing it receives, then closes."""
+    """Makes a client of a peer that sends one answer for each thing that it receives, then closes."""
     with ExitStack() as stack:
 
         def make(*answers: bytes, timeout: int = 60_000, size: int = SIZE) -> S7Client:
@@ -36,7 +36,7 @@ def scripted() -> Iterator[Scripted]:
 
             def play() -> None:
                 peer, _ = listener.accept()
-                with peer, suppress(OSError):  # a client that has closed takes no more
+                with peer, suppress(OSError):  # the client may have closed
                     peer.settimeout(10)
                     for answer in answers:
                         peer.recv(4096)
@@ -89,7 +89,7 @@ def test_reads_over_ipv6() -> None:
 
 
 def test_answers_in_any_order(plc: Plc) -> None:
-    """The proxy holds all but the last of three answers back, then lets them go."""
+    """The proxy collects three answers, and passes them on in reverse order."""
     client = plc.client()
     client.connect()
     answers: list[bytes] = []
@@ -103,7 +103,7 @@ def test_answers_in_any_order(plc: Plc) -> None:
 
 
 class Segmented(socket.socket):
-    """A connection that gives and takes a few bytes at a time, as TCP may."""
+    """A connection that sends and receives a few bytes at a time, as TCP may."""
 
     MOST = 1
 
@@ -116,7 +116,7 @@ class Segmented(socket.socket):
 
 @pytest.mark.parametrize("most", [1, 3, 4, 7, 26, 500, 967, 968, 1500])
 def test_answers_in_segments_of_any_size(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
-    """Answers, and requests, end anywhere in a segment; two may be in one."""
+    """Answers and requests may end anywhere within a segment, and two may be in one segment."""
     monkeypatch.setattr(Segmented, "MOST", most)
     monkeypatch.setattr(socket, "socket", Segmented)
     block = bytearray(range(256)) * 8
@@ -134,10 +134,10 @@ def test_answers_in_segments_of_any_size(monkeypatch: pytest.MonkeyPatch, most: 
             assert block[3:1003] == b"\7" * 1000
 
 
-# -- nobody there ------------------------------------------------------------------------------------------------------
+# -- no connection -----------------------------------------------------------------------------------------------------
 
 
-def test_refused() -> None:
+def test_connection_refused() -> None:
     with reserved_port() as address:
         client = S7Client(S7Options(host=address.host, port=address.port), 201, SIZE)
         with pytest.raises(ConnectorError, match=f"^connection refused by {address}$"):
@@ -145,7 +145,7 @@ def test_refused() -> None:
         assert not client.connected
 
 
-def test_refused_later_and_back_again(plc: Plc) -> None:
+def test_recovery_after_refused_connections(plc: Plc) -> None:
     client = plc.client()
     client.connect()
     plc.proxy.refuse()
@@ -183,8 +183,8 @@ def test_frozen_in_a_session(plc: Plc) -> None:
     assert_recovers(plc, client)
 
 
-def test_peer_that_drips_is_late_all_the_same(plc: Plc) -> None:
-    """Each byte comes in time, the whole does not: the limit is of the operation."""
+def test_dripping_peer_times_out(plc: Plc) -> None:
+    """Each byte comes in time, but the time-out is that of the whole operation."""
     client = plc.client(packetSize=1, maxJobs=1, timeout=400)
     client.connect()
     plc.proxy.delay(0.0, 0.01)  # 2180 times 10 ms
@@ -194,7 +194,7 @@ def test_peer_that_drips_is_late_all_the_same(plc: Plc) -> None:
     assert not client.connected
 
 
-# -- a wire that fails -------------------------------------------------------------------------------------------------
+# -- faults of the network ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("reset", [False, True])
@@ -217,14 +217,14 @@ def test_cut_in_the_middle_of_an_answer(plc: Plc, count: int) -> None:
     assert_recovers(plc, client)
 
 
-def test_late_answer_is_never_taken_for_the_next(plc: Plc) -> None:
+def test_late_answer_is_never_used_for_the_next_request(plc: Plc) -> None:
     client = plc.client(timeout=500)
     client.connect()
     plc.proxy.hold()
     with pytest.raises(ConnectorError, match="no answer within 500 ms"):
         client.read()
     assert plc.proxy.wait_held()
-    plc.proxy.edit(lambda frame: frame)  # let the session through, keep what is held
+    plc.proxy.edit(lambda frame: frame)  # pass the new session, keep the held answers
     client.connect()
     plc.block[:] = bytes(SIZE)
     plc.proxy.release()  # the old answers, on the new connection
@@ -251,7 +251,7 @@ def test_answer_sent_twice(plc: Plc) -> None:
     assert_recovers(plc, client)
 
 
-def test_more_than_was_asked_for(plc: Plc) -> None:
+def test_extra_bytes_after_an_answer(plc: Plc) -> None:
     client = plc.client()
     client.connect()
     answers = 0
@@ -263,7 +263,7 @@ def test_more_than_was_asked_for(plc: Plc) -> None:
 
     plc.proxy.edit(append)
 
-    def read_twice() -> None:  # if the byte comes after the rest, it spoils the next read
+    def read_twice() -> None:  # a byte that comes late spoils the second read
         client.read()
         client.read()
 
@@ -332,7 +332,9 @@ def test_no_such_block(plc: Plc) -> None:
 
 CONFIRM = bytes.fromhex("0300000b 06 d0 0001 0007 00")
 GRANT = bytes.fromhex("0300001b 02f080 32 03 0000 0000 0008 0000 00 00 f0 00 0001 0001 00f0")
-NO_MODE = bytes.fromhex("03000013 02f080 32 02 0000 0001 0000 0000 81 04")  # to the question for the operating mode
+NO_MODE = bytes.fromhex(
+    "03000013 02f080 32 02 0000 0001 0000 0000 81 04"
+)  # the answer to the query for the operating mode
 DENIAL = bytes.fromhex("03000013 02f080 32 02 0000 0002 0000 0000 81 04")
 
 
@@ -359,7 +361,7 @@ def test_access_denied(scripted: Scripted) -> None:
         ([bytes.fromhex("030003ff")], "frame of 1023 bytes"),
     ],
 )
-def test_no_session(scripted: Scripted, answers: list[bytes], text: str) -> None:
+def test_refused_session(scripted: Scripted, answers: list[bytes], text: str) -> None:
     client = scripted(*answers)
     with pytest.raises(ConnectorError, match=text):
         client.connect()
@@ -402,7 +404,7 @@ def confirm(parameters: bytes, *, kind: int = 0xD0, indicator: int | None = None
         (confirm(b"\xc0\x01\x06"), "TPDU size code 6"),
         (confirm(b"\xc0\x01\x11"), "TPDU size code 17"),
         (confirm(b"\xc0\x01\xff"), "TPDU size code 255"),
-        (confirm(b"\xc1\xff\x00"), "closed the connection during set-up"),  # a parameter that is longer than all of it
+        (confirm(b"\xc1\xff\x00"), "closed the connection during set-up"),  # a parameter that is longer than the frame
         (confirm(b"\xc0\x00\xc0\x02\x0a\x0a\xc0"), "closed the connection during set-up"),
         (confirm(b"") * 50, "ROSCTR|not an answer|too short|unexpected"),
         (b"\x00" * 4000, "not ISO-on-TCP"),
@@ -416,7 +418,7 @@ def test_a_hostile_connection_confirm(scripted: Scripted, answer: bytes, text: s
 
 
 @given(st.binary(max_size=80), st.booleans())
-def test_any_connection_confirm_is_refused_or_good(parameters: bytes, framed: bool) -> None:
+def test_any_connection_confirm_is_refused_or_valid(parameters: bytes, framed: bool) -> None:
     answer = confirm(parameters) if framed else b"\x03\x00" + struct.pack(">H", 4 + len(parameters)) + parameters
     if len(answer) < FRAME_OVERHEAD:
         return
@@ -447,8 +449,8 @@ def test_a_peer_that_falls_silent_at_any_point_of_the_set_up(answers: tuple[byte
         thread.join()
 
 
-def test_a_peer_that_sends_without_end_while_the_session_is_set_up(scripted: Scripted) -> None:
-    """What comes beyond a confirm waits in the kernel; nothing of it is kept here."""
+def test_endless_input_during_the_set_up_takes_no_memory(scripted: Scripted) -> None:
+    """Bytes after the confirm stay in the kernel's buffer."""
     client = scripted(CONFIRM + bytes.fromhex("03000007 02f080") * 200_000)
     tracemalloc.start()
     with pytest.raises(ConnectorError):

@@ -1,4 +1,4 @@
-"""Several reads under way: each image whole, in order, of its own answers, in its own time."""
+"""Several reads under way: each image is complete, in order, and of its own answers."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_depth_follows_what_was_granted(
         assert [image(client) for _ in range(depth)] == [plc.block] * depth
 
 
-def test_images_come_in_order_and_are_of_their_own_time(wide: Plc) -> None:
+def test_images_come_in_order_with_the_values_of_their_time(wide: Plc) -> None:
     client = wide.connected()
     answers = Answers(wide)
     for generation in range(4):
@@ -106,10 +106,10 @@ def test_no_image_yet(wide: Plc) -> None:
     assert image(client) == wide.block
 
 
-def test_half_an_image_is_none(wide: Plc) -> None:
+def test_incomplete_image_is_not_returned(wide: Plc) -> None:
     client = wide.connected()
     answers = Answers(wide)
-    wide.proxy.hold()  # counts no more
+    wide.proxy.hold()  # replaces the counting
     client.submit()
     assert wide.proxy.wait_held()
     assert client.collect(in_ns(0.01)) is None
@@ -119,7 +119,7 @@ def test_half_an_image_is_none(wide: Plc) -> None:
 
 
 def test_each_read_has_its_own_time_out(wide: Plc) -> None:
-    """The first has its answer; the second, asked for later, is late, though the connection stands."""
+    """The first read has its answer; the second times out, though the connection is open."""
     client = wide.connected(timeout=300)
     client.submit()
     assert image(client) == wide.block
@@ -131,7 +131,7 @@ def test_each_read_has_its_own_time_out(wide: Plc) -> None:
 
 
 def test_an_answer_in_time_counts_even_if_it_is_collected_late(wide: Plc) -> None:
-    """A write took in the answers of the read under way; that it took long does not spoil them."""
+    """The write receives the answers of the read under way; its duration does not make them late."""
     client = wide.connected(timeout=200)
     client.submit()
     Answers(wide)
@@ -153,7 +153,7 @@ def test_an_answer_of_a_read_that_is_complete_is_refused(wide: Plc) -> None:
     client.submit()
     client.submit()
 
-    def both() -> None:  # it may come together with the first, or after
+    def both() -> None:  # the answer may come with the first image, or after it
         image(client)
         image(client)
 
@@ -178,7 +178,7 @@ def test_the_connection_is_lost_with_reads_under_way(wide: Plc) -> None:
     assert_recovers(wide, client)
 
 
-def test_more_than_depth_and_none_are_defects_of_the_caller(wide: Plc) -> None:
+def test_too_many_or_no_reads_under_way_are_errors_of_the_caller(wide: Plc) -> None:
     client = wide.connected(maxJobs=5)
     with pytest.raises(RuntimeError, match="no read is under way"):
         client.collect(in_ns(10))

@@ -1,4 +1,4 @@
-"""What the client finds out about a controller that does not give what it should."""
+"""The client's diagnosis of a controller that refuses reads, or does not run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
         (Traits(block_size=1234, max_pdu_size=240, max_jobs=24), r"DB201 has no 2180 bytes but 1234 bytes"),
     ],
 )
-def test_a_controller_that_refuses_says_what_to_do(make_plc: MakePlc, traits: Traits, text: str) -> None:
+def test_refusal_is_reported_with_a_remedy(make_plc: MakePlc, traits: Traits, text: str) -> None:
     client = make_plc(traits).connected()
     for _ in range(client.depth):
         client.submit()
@@ -36,7 +36,7 @@ def test_a_controller_that_refuses_says_what_to_do(make_plc: MakePlc, traits: Tr
     assert not client.connected
 
 
-def test_if_the_size_cannot_be_found_the_refusal_is_told(make_plc: MakePlc) -> None:
+def test_refusal_is_reported_if_the_size_cannot_be_found(make_plc: MakePlc) -> None:
     plc = make_plc(Traits(block_size=500))
     client = plc.connected(timeout=300)
     answers = 0
@@ -71,7 +71,7 @@ def read_until(client: S7Client, *, doubt: bool) -> str:
 
 @pytest.mark.usefixtures("often")
 @pytest.mark.parametrize("jobs", [1, 8])
-def test_stop_is_noticed_and_run_again(make_plc: MakePlc, jobs: int) -> None:
+def test_stop_and_run_are_noticed(make_plc: MakePlc, jobs: int) -> None:
     plc = make_plc(Traits(max_jobs=jobs))
     client = plc.connected()
     peer = snap7.Client()
@@ -98,7 +98,7 @@ def test_stop_is_known_before_the_first_image(plc: Plc) -> None:
     peer.destroy()
 
 
-def test_is_not_asked_with_every_read(plc: Plc) -> None:
+def test_mode_is_not_asked_with_every_read(plc: Plc) -> None:
     asked = 0
 
     def count(frame: bytes) -> bytes:
@@ -114,14 +114,14 @@ def test_is_not_asked_with_every_read(plc: Plc) -> None:
 
 
 class Ignorant(S7Server):
-    """Knows no system status lists, and says so."""
+    """A controller that answers that it has no system status lists."""
 
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
         return None
 
 
 class Touchy(S7Server):
-    """Ends the connection of who asks for what it does not know."""
+    """A controller that closes the connection on an unknown request."""
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
         return None
@@ -160,8 +160,8 @@ def test_a_controller_that_is_silent_when_asked(plc: Plc) -> None:
         assert client.read() == plc.block
 
 
-def test_a_question_that_is_never_answered_ends_the_session(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has answered before, so the connection is not what it was; the reads alone would not show it."""
+def test_unanswered_mode_query_ends_the_session(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has answered before, so the connection must be faulty. Reads alone would not show that."""
     client = plc.connected(timeout=200)
     monkeypatch.setattr(mode, "INTERVAL_NS", 0)
     plc.proxy.edit(lambda frame: None if frame[8] == 7 else frame)
@@ -177,8 +177,8 @@ def test_a_question_that_is_never_answered_ends_the_session(plc: Plc, monkeypatc
     assert client.read() == plc.block
 
 
-def test_an_answer_that_waited_through_a_long_period_is_in_time(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody looked into the socket between two reads; the clock is set on, beyond the time-out."""
+def test_mode_answer_that_waited_through_a_long_period_is_in_time(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client does not receive between two reads, while the clock moves beyond the time-out."""
     monkeypatch.setattr(mode, "INTERVAL_NS", 0)
     client = plc.connected()
     answered = threading.Event()
@@ -196,7 +196,7 @@ def test_an_answer_that_waited_through_a_long_period_is_in_time(plc: Plc, monkey
     assert client.read() == plc.block
 
 
-def test_wrong_answers_to_the_question(plc: Plc) -> None:
+def test_wrong_answer_to_the_mode_query(plc: Plc) -> None:
     plc.proxy.edit(lambda frame: frame[:22] + b"\x44" + frame[23:] if frame[8] == 7 else frame)
     with closing(plc.client()) as client, pytest.raises(ConnectorError, match="not an answer to 'read SZL'"):
         client.connect()

@@ -1,4 +1,4 @@
-"""Writing through real sockets: what was written is there, what was not is said, and a doubt ends the connection."""
+"""Writing over real sockets: each outcome is true, and any doubt ends the connection."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc, assert_recovers
 
 
 class Clock:
-    """The real one, moved on by hand: answers come seconds apart, and nobody waits for them."""
+    """The real clock plus an offset: answers seem to come seconds apart without any waiting."""
 
     def __init__(self) -> None:
         self._moved_ns = 0
@@ -31,10 +31,10 @@ class Clock:
         self._moved_ns += by_s * 10**9
 
     def slow_down(self, plc: Plc, answer_s: int) -> None:
-        """Have each answer to a write take so long; to others none, for one of these may come at any time."""
+        """Let answers to writes seem to take so long; others, which come at any time, take none."""
 
         def pass_on(frame: bytes) -> bytes:
-            if frame[8] == 3 and frame[19] == 5:  # the answer to a job; its function
+            if frame[8] == 3 and frame[19] == 5:  # an answer to a job, which writes
                 self.move(answer_s)
             return frame
 
@@ -57,7 +57,7 @@ def image(client: S7Client) -> bytes:
 
 @pytest.mark.parametrize("pdu_size", [240, 480, 960])
 @pytest.mark.parametrize("jobs", [1, 3, 24])
-def test_what_is_written_is_read_back(make_plc: MakePlc, pdu_size: int, jobs: int) -> None:
+def test_written_values_are_read_back(make_plc: MakePlc, pdu_size: int, jobs: int) -> None:
     plc = make_plc(Traits(max_pdu_size=pdu_size, max_jobs=jobs))
     client = plc.connected()
     whole = bytes(range(256)) * 8 + bytes(SIZE - 2048)
@@ -73,8 +73,8 @@ def test_nothing_to_write(plc: Plc) -> None:
     assert plc.connected().write([]) == []
 
 
-def test_a_bit_leaves_its_neighbours_to_the_program(plc: Plc) -> None:
-    """The program counts in the other bits of the byte, all the time: not one count may be lost."""
+def test_bit_write_leaves_the_other_bits_to_the_program(plc: Plc) -> None:
+    """The program counts in the other bits of the byte all the time. No count may be lost."""
     client = plc.connected()
     plc.block[7] = 0
     stopping = threading.Event()
@@ -111,7 +111,7 @@ def test_a_write_passes_between_reads_under_way(make_plc: MakePlc) -> None:
 
 
 def test_a_refused_item_among_good_ones(plc: Plc) -> None:
-    """The layout is longer than the block; whoever may write there is told so, and the others are served."""
+    """A write beyond the end of the block is refused; the others are carried out."""
     client = plc.connected(size=SIZE)
     outcomes = client.write([Write(0, 0, b"one"), Write(SIZE, 0, b"two"), Write(9, 2, b"\2")])
     assert [outcomes[0], outcomes[2]] == ["", ""]
@@ -123,7 +123,7 @@ def test_a_refused_item_among_good_ones(plc: Plc) -> None:
 @pytest.mark.parametrize(
     ("fault", "text"), [(Fault.WRITE_PROTECTED, r"0x03.*'Full access'"), (Fault.PUT_GET_OFF, r"0x8104.*PUT/GET")]
 )
-def test_a_controller_that_takes_no_writes(make_plc: MakePlc, fault: Fault, text: str) -> None:
+def test_controller_that_refuses_writes(make_plc: MakePlc, fault: Fault, text: str) -> None:
     plc = make_plc(Traits(fault=fault))
     before = bytes(plc.block)
     client = plc.connected()
@@ -153,17 +153,17 @@ def test_an_answer_for_fewer_items(plc: Plc) -> None:
     assert_recovers(plc, client)
 
 
-def test_a_late_answer_is_never_taken_for_the_next(plc: Plc) -> None:
+def test_late_answer_is_never_used_for_the_next_request(plc: Plc) -> None:
     client = plc.connected(timeout=300)
     plc.proxy.hold()
     with pytest.raises(ConnectorError, match="no answer within 300 ms"):
         client.write([Write(0, 0, b"x")])
     assert plc.proxy.wait_held()
-    plc.proxy.edit(lambda frame: frame)  # let the session through, keep what is held
+    plc.proxy.edit(lambda frame: frame)  # pass the new session, keep the held answer
     client.connect()
     plc.proxy.release()  # the old confirmation, on the new connection
     with pytest.raises(ConnectorError, match="not under way"):
-        client.write([Write(SIZE, 0, b"y")])  # which would be refused
+        client.write([Write(SIZE, 0, b"y")])  # this write would be refused
     assert_recovers(plc, client)
 
 
@@ -183,8 +183,8 @@ def test_the_connection_is_lost_in_mid_write(make_plc: MakePlc, count: int) -> N
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_of_each_write_it_is_known_what_a_lost_connection_did_to_it(make_plc: MakePlc, jobs: int) -> None:
-    """Jobs go out as others are answered: what is after those under way was never sent, and never comes."""
+def test_outcome_of_each_write_after_a_lost_connection(make_plc: MakePlc, jobs: int) -> None:
+    """Each answer lets the next job be sent, so the jobs after those under way were never sent."""
     plc = make_plc(Traits(max_pdu_size=240, max_jobs=jobs))
     client = plc.connected(timeout=300)
     writes = [Write(SIZE, 0, b"?"), *(Write(at, 0, b"\xee" * 200) for at in range(0, 2000, 200))]  # a job each
@@ -208,7 +208,7 @@ def test_of_each_write_it_is_known_what_a_lost_connection_did_to_it(make_plc: Ma
     assert plc.block[unsent:] == before[unsent:]
 
 
-def test_what_a_dead_connection_does_not_even_take_was_not_sent(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writes_on_a_reset_connection_were_not_sent(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
     client = plc.connected()
     before = bytes(plc.block)
 
@@ -224,7 +224,7 @@ def test_what_a_dead_connection_does_not_even_take_was_not_sent(plc: Plc, monkey
     assert plc.block == before
 
 
-def test_a_job_that_went_out_in_part_may_have_been_carried_out(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partly_sent_job_has_an_unknown_outcome(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
     client = plc.connected()
     send = socket.socket.send
     sent: list[int] = []
@@ -249,8 +249,8 @@ def test_without_a_session_nothing_is_sent(plc: Plc) -> None:
     assert lost.value.outcomes == (Lost.UNSENT,) * 2
 
 
-def test_a_read_that_is_refused_does_not_spoil_a_write(make_plc: MakePlc) -> None:
-    """What became of the write is known, so it is told; the read then ends the connection."""
+def test_refused_read_does_not_affect_a_write(make_plc: MakePlc) -> None:
+    """The outcome of the write is known and returned; the read then ends the connection."""
     plc = make_plc(Traits(block_size=1000))
     client = plc.connected()
     client.submit()
@@ -263,16 +263,18 @@ def test_a_read_that_is_refused_does_not_spoil_a_write(make_plc: MakePlc) -> Non
 SCATTERED = [Write(2 * place, 1 << place % 8, b"\xff") for place in range(60)]  # three jobs
 
 
-def test_a_slow_controller_is_not_a_dead_one(make_plc: MakePlc, clock: Clock) -> None:
-    """Each answer has the whole time-out; reads and the operating mode, which waited behind them, are not late."""
+def test_slow_controller_does_not_time_out(make_plc: MakePlc, clock: Clock) -> None:
+    """Each answer has the whole time-out; reads that wait behind the writes are not late."""
     plc = make_plc(Traits(max_jobs=1))
     client = plc.connected(timeout=5000)
     clock.slow_down(plc, 4)
     clock.move(2)
-    client.submit()  # three jobs more, of which one is under way, and the question for the operating mode
+    client.submit()  # three more jobs, of which one is under way, and the query for the operating mode
     assert client.write(SCATTERED) == [""] * 60
     submitted = threading.Event()
-    plc.proxy.edit(lambda frame: frame if frame[8] != 7 or submitted.wait(10) else None)  # 7: that of the mode
+    plc.proxy.edit(
+        lambda frame: frame if frame[8] != 7 or submitted.wait(10) else None
+    )  # 7: the answer to the query for the mode
     assert client.collect(clock.monotonic_ns() + 10**10) is not None
     client.submit()
     submitted.set()
@@ -281,8 +283,8 @@ def test_a_slow_controller_is_not_a_dead_one(make_plc: MakePlc, clock: Clock) ->
 
 
 @pytest.mark.parametrize(("timeout_s", "most_s"), [(5, 20), (30, 30)])
-def test_a_batch_does_not_take_for_ever(make_plc: MakePlc, clock: Clock, timeout_s: int, most_s: int) -> None:
-    """The process of a source is taken for hung when a call does not return."""
+def test_duration_of_a_batch_is_bounded(make_plc: MakePlc, clock: Clock, timeout_s: int, most_s: int) -> None:
+    """The supervisor takes a source's process for hung if a call does not return."""
     plc = make_plc(Traits(max_jobs=1))
     client = plc.connected(timeout=1000 * timeout_s)
     clock.slow_down(plc, 4)
@@ -292,6 +294,6 @@ def test_a_batch_does_not_take_for_ever(make_plc: MakePlc, clock: Clock, timeout
 
 
 @pytest.mark.parametrize(("timeout", "longest_s"), [(2000, 20), (20_500, 20.5)])
-def test_the_connector_tells_how_long_a_batch_may_take(timeout: int, longest_s: float) -> None:
+def test_timeout_of_the_connector_covers_a_batch(timeout: int, longest_s: float) -> None:
     layout = Layout("DB201", 201, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
     assert S7Connector(S7Options(host="192.0.2.1", timeout=timeout), layout).timeout_s == longest_s

@@ -22,16 +22,16 @@ from shmio.segment._atomics import REASON_SIZE
         (0x77, "no text known"),
     ],
 )
-def test_items_that_are_read(code: int, text: str) -> None:
+def test_refused_reads(code: int, text: str) -> None:
     assert re.search(text, explain.explain_read(code, 201, 2180))
 
 
-def test_items_that_are_written() -> None:
+def test_refused_writes() -> None:
     assert re.search(r"^DB201 has no byte 99 .*export it again", explain.explain_write(0x05, 201, 99))
     assert re.search("access denied .*PUT/GET", explain.explain_write(0x03, 201, 99))
 
 
-def test_the_size_of_a_block() -> None:
+def test_wrong_block_sizes() -> None:
     assert re.search(r"no 2180 bytes but 100 bytes .*export it again$", explain.explain_size(201, 2180, 100))
     assert re.search("optimized, clear 'Optimized block access'", explain.explain_size(201, 2180, 0))
 
@@ -46,12 +46,12 @@ def test_the_size_of_a_block() -> None:
         (0xEEEE, "no text known"),
     ],
 )
-def test_jobs(error: int, text: str) -> None:
+def test_refused_jobs(error: int, text: str) -> None:
     assert re.search(text, explain.explain_error(error))
 
 
-def test_all_fit_the_reason_of_a_frame() -> None:
-    """What is cut off there is the remedy."""
+def test_every_text_fits_into_the_reason_of_a_frame() -> None:
+    """A longer text would be cut off at its end, the remedy."""
     texts = [explain.explain_error(error) for error in (0x8104, 0x8304, 0xD241, *range(0x8000, 0x8800))]
     for code in range(256):
         texts += [explain.explain_read(code, 65535, 65536), explain.explain_write(code, 65535, 65535)]

@@ -1,4 +1,4 @@
-"""The operating mode: what is said of it, and what of a controller that does not tell it."""
+"""The operating mode: its query, the resulting doubt, and controllers that do not answer."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_request() -> None:
         (0x0D, "DEFECTIVE"),
     ],
 )
-def test_what_is_said_of_each_mode(mode: int, doubt: str) -> None:
+def test_doubt_of_each_mode(mode: int, doubt: str) -> None:
     question = ModeQuery()
     question.begin(0, 10)
     question.accept(0, answer(mode))
@@ -54,11 +54,11 @@ def test_what_is_said_of_each_mode(mode: int, doubt: str) -> None:
     assert re.search(doubt or "^$", question.doubt)
 
 
-def test_is_asked_once_an_interval_and_is_due_in_time() -> None:
+def test_mode_is_asked_once_an_interval() -> None:
     question = ModeQuery()
     assert question.due(5)
     question.begin(5, 100)
-    assert not question.due(5 + INTERVAL_NS)  # while it is open
+    assert not question.due(5 + INTERVAL_NS)  # while the query is under way
     assert [question.overdue(now) for now in (99, 100)] == [False, True]
     question.accept(0, answer())
     assert not question.overdue(100)
@@ -77,8 +77,8 @@ def test_is_asked_once_an_interval_and_is_due_in_time() -> None:
         memoryview(bytes.fromhex("03000013 02f080 32 02 0000 0001 0000 0000 81 04")),
     ],
 )
-def test_a_controller_that_does_not_know_it(unknown: memoryview, caplog: pytest.LogCaptureFixture) -> None:
-    """It is said once, to those who look for it, and not asked again."""
+def test_controller_without_a_mode_is_not_asked_again(unknown: memoryview, caplog: pytest.LogCaptureFixture) -> None:
+    """It is logged once, at level DEBUG, and the query is not repeated."""
     caplog.set_level(logging.DEBUG, "shmio.source")
     question = ModeQuery()
     question.begin(0, 10)
@@ -89,7 +89,7 @@ def test_a_controller_that_does_not_know_it(unknown: memoryview, caplog: pytest.
     assert [record.levelname for record in caplog.records] == ["DEBUG"]
 
 
-def test_a_controller_that_ends_the_connection_when_asked() -> None:
+def test_controller_that_closes_the_connection_is_not_asked_again() -> None:
     question = ModeQuery()
     for attempt in range(2):
         assert question.due(0), attempt
@@ -98,14 +98,14 @@ def test_a_controller_that_ends_the_connection_when_asked() -> None:
     assert not question.due(10 * INTERVAL_NS)
 
 
-def test_lost_connections_are_no_reason_to_stop_asking_who_has_answered() -> None:
+def test_controller_that_has_answered_is_asked_again_after_lost_connections() -> None:
     question = ModeQuery()
     question.begin(0, 10)
     question.accept(0, answer(0x84))
     assert question.doubt
     for _ in range(5):
         question.lost()
-        assert question.doubt == ""  # nobody knows now
+        assert question.doubt == ""  # the mode is unknown now
         assert question.due(0)
         question.begin(0, 10)
 

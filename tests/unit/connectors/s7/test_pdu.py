@@ -1,4 +1,4 @@
-"""Against bytes written down by hand from the protocol's description, and against noise."""
+"""PDUs, compared with bytes written by hand from the protocol's description, and noise."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_refuses_a_wrong_confirm(frame: memoryview, text: str) -> None:
         pdu.parse_connect_confirm(frame)
 
 
-def test_session_is_the_lesser_of_both_sides() -> None:
+def test_session_has_the_lower_limits_of_both_sides() -> None:
     asked = pdu.Session(960, 8)
     assert pdu.parse_setup_answer(memoryview(GRANT), 9, asked) == pdu.Session(480, 3)
     assert pdu.parse_setup_answer(changed(GRANT, _25=0xFF, _22=0, _24=0), 9, asked) == pdu.Session(960, 1)

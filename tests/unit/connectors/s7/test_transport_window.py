@@ -1,4 +1,4 @@
-"""Each answer goes to the one who asked, once."""
+"""Each answer goes once, to the operation that asked for it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Asker:
         self.answered.append(index)
 
 
-def test_at_most_the_granted_jobs_and_no_reference_twice() -> None:
+def test_window_has_at_most_the_granted_jobs_and_no_reference_twice() -> None:
     window = Window(3, 65534)
     first, second, urgent = Asker(4), Asker(2), Asker(1)
     window.add(first)
@@ -64,7 +64,7 @@ def test_at_most_the_granted_jobs_and_no_reference_twice() -> None:
     assert window.reference == 5
 
 
-def test_answers_that_nobody_waits_for() -> None:
+def test_unexpected_answers_are_refused() -> None:
     window = Window(2, 10)
     window.add(Asker(3))
     window.due()
@@ -72,7 +72,7 @@ def test_answers_that_nobody_waits_for() -> None:
     for reference in (10, 9, 12, 65535):  # answered, older, not sent, never
         with pytest.raises(ConnectorError, match=rf"not under way \(reference {reference}\)"):
             window.accept(frame(reference))
-    with pytest.raises(ConnectorError, match="PUT/GET"):  # what it says is worth more than whom it was for
+    with pytest.raises(ConnectorError, match="PUT/GET"):  # its error says more than that it is unexpected
         window.accept(frame(77, error=0x8104))
     with pytest.raises(ConnectorError, match="too short"):
         window.accept(frame(10)[:16])

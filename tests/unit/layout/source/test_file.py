@@ -1,4 +1,4 @@
-"""The encodings of a source, and files of other kinds: one line says what they are, and what to do."""
+"""Encodings of a source, and files of other kinds, which are refused in one line with a remedy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CSV = "Name,Path,Data Type,Logical Address,Comment\nStart,Default,Bool,%I0.0,go\
 
 
 def workbook() -> bytes:
-    """Always the same bytes: they are in the name of a test, which all processes of pytest-xdist must agree on."""
+    """Return the same bytes in each process of pytest-xdist: they are in the name of a test."""
     with zipfile.ZipFile(buffer := io.BytesIO(), "w") as archive:
         archive.writestr(zipfile.ZipInfo("xl/workbook.xml"), "<workbook/>" * 1000)
     return buffer.getvalue()
@@ -55,7 +55,7 @@ def test_a_file_of_another_kind_is_one_fault_with_its_remedy(name: str, data: by
         "(* a, b, c\n d, e, f *)\nDATA_BLOCK DB1 STRUCT a,b,c : Int; END_STRUCT; BEGIN END_DATA_BLOCK\n",
     ],
 )
-def test_a_source_is_none_of_these(text: str) -> None:
+def test_source_with_separators_is_no_table(text: str) -> None:
     for encoding in ("utf-8-sig", "utf-16"):
         assert compile_sources([Source("x.db", text.encode(encoding))]).layouts
 
@@ -89,7 +89,7 @@ def test_unicode(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "latin-1"])
-def test_what_is_not_utf8_is_windows_with_a_warning(encoding: str) -> None:
+def test_other_encodings_are_read_as_windows_1252_with_a_warning(encoding: str) -> None:
     compiled = compile_bytes(TEXT.encode(encoding))
     assert compiled.layouts[0].registers[0].comment == "für É"
     (warning,) = compiled.warnings
@@ -97,20 +97,20 @@ def test_what_is_not_utf8_is_windows_with_a_warning(encoding: str) -> None:
     assert "save the file as UTF-8" in warning.message
 
 
-def test_characters_that_only_windows_has() -> None:
+def test_characters_that_only_windows_1252_has() -> None:
     assert compile_bytes(TEXT.replace("É", "€ „x“").encode("cp1252")).layouts[0].registers[0].comment == "für € „x“"
 
 
-def test_bytes_without_a_character_in_windows_are_kept() -> None:
+def test_bytes_without_a_character_in_windows_1252_are_kept() -> None:
     compiled = compile_bytes(b'DATA_BLOCK "b" STRUCT a : Int; // \xff \x81\nEND_STRUCT; END_DATA_BLOCK')
     assert compiled.layouts[0].registers[0].comment == "ÿ \x81"
 
 
 @pytest.mark.parametrize("data", [codecs.BOM_UTF16_LE + b"a\0\n\0\x00\xdc", codecs.BOM_UTF16_BE + b"\0a\0\n\0"])
-def test_a_mark_that_lies_names_the_place_and_the_remedy(data: bytes) -> None:
+def test_wrong_utf16_byte_order_mark_is_refused_with_a_remedy(data: bytes) -> None:
     with pytest.raises(LayoutError, match=r"^x\.db:2:1: error: expected UTF-16-.E, .* export the source again"):
         compile_bytes(data)
 
 
-def test_a_utf8_mark_that_lies_is_windows() -> None:
+def test_wrong_utf8_byte_order_mark_is_read_as_windows_1252() -> None:
     assert "read as Windows-1252" in compile_bytes(codecs.BOM_UTF8 + TEXT.encode("cp1252")).warnings[0].message

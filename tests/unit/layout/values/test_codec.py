@@ -110,7 +110,7 @@ def test_little_endian() -> None:
 @pytest.mark.parametrize(
     ("type_", "data"),
     [
-        ("STRING[4]", "040561626364"),  # longer than it can be
+        ("STRING[4]", "040561626364"),  # longer than its maximum
         ("STRING[4]", "ffff61626364"),
         ("WSTRING[1]", "000100020061"),
         ("S5TIME", "0a00"),
@@ -118,7 +118,7 @@ def test_little_endian() -> None:
         ("S5TIME", "000a"),
         ("TIME_OF_DAY", "05265c00"),
         ("LTOD", "00004e94914f0000"),
-        ("DATE_AND_TIME", "00" * 8),  # no month 0
+        ("DATE_AND_TIME", "00" * 8),  # month 0
         ("DATE_AND_TIME", "9313250812345677"),
         ("DATE_AND_TIME", "9302300812345677"),
         ("DATE_AND_TIME", "93122508123456a7"),
@@ -134,15 +134,15 @@ def test_little_endian() -> None:
         ("DTL", "07b10c1f050c2238075bcd15"),  # 1969
     ],
 )
-def test_bytes_that_are_no_value_decode_to_none(type_: str, data: str) -> None:
+def test_invalid_bytes_decode_to_none(type_: str, data: str) -> None:
     assert codec(register(type_)).decode(bytes.fromhex(data)) is None
     element = register(type_).element
     pair = bytes.fromhex(data).ljust(element.stride, b"\0") + bytes.fromhex(data)
     assert codec(register(type_, ((0, 1),))).decode(pair) == [None, None]
 
 
-def test_what_controllers_leave_in_place_is_read() -> None:
-    assert codec(register("STRING[4]")).decode(bytes.fromhex("000261620000")) == "ab"  # greatest length not set
+def test_irregular_bytes_of_controllers_are_read() -> None:
+    assert codec(register("STRING[4]")).decode(bytes.fromhex("000261620000")) == "ab"  # maximum length not set
     assert codec(register("DATE_AND_TIME")).decode(bytes.fromhex("9312250812345670")) == "1993-12-25T08:12:34.567"
     assert codec(register("DTL")).decode(bytes.fromhex("07e8021d000c2238075bcd15")) == "2024-02-29T12:34:56.123456789"
     assert codec(register("WCHAR")).decode(bytes.fromhex("d83d")) == "\ufffd"
@@ -184,14 +184,14 @@ def test_values_that_do_not_fit_write_nothing(type_: str, value: object) -> None
         assert frame == b"\x55" * r.size
 
 
-def test_numbers_of_other_kinds_are_taken() -> None:
+def test_numbers_of_other_types_are_accepted() -> None:
     assert encode(5.0, register("INT")) == encode(np.int16(5), register("INT")) == b"\x00\x05"
     assert encode(2, register("REAL")) == encode(np.float32(2), register("REAL")) == b"\x40\x00\x00\x00"
     assert encode(1, register("BOOL")) == encode(np.True_, register("BOOL")) == b"\x01"
 
 
 @pytest.mark.parametrize("bit", range(8))
-def test_bool_touches_its_bit_alone(bit: int) -> None:
+def test_bool_changes_only_its_bit(bit: int) -> None:
     r = register("BOOL", offset=1, bit=bit)
     assert encode(True, r) == bytes([0, 1 << bit])
     assert encode(False, r, fill=0xFF) == bytes([0xFF, 0xFF & ~(1 << bit)])
@@ -204,7 +204,7 @@ def test_rows_of_bits() -> None:
     value: list[Value] = [[True, *[False] * 7, True], [False, True, *[False] * 7]]
     assert encode(value, r).hex() == "01010200"
     assert codec(r).decode(bytes.fromhex("01010200")) == value
-    assert encode(value, r, fill=0xFF).hex() == "01ff02fe"  # padding bits stay as they are
+    assert encode(value, r, fill=0xFF).hex() == "01ff02fe"  # padding bits are unchanged
 
 
 def test_arrays() -> None:
@@ -272,7 +272,7 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
 
 @pytest.mark.parametrize("type_", VALUES)
 @given(data=st.data(), byte_order=st.sampled_from(["big", "little"]))
-def test_every_value_comes_back(type_: str, data: st.DataObject, byte_order: Any) -> None:
+def test_every_value_survives_a_round_trip(type_: str, data: st.DataObject, byte_order: Any) -> None:
     value = data.draw(VALUES[type_])
     r = register(type_, offset=2)
     assert codec(r, byte_order).decode(encode(value, r, byte_order, fill=0xAA)) == value
@@ -280,7 +280,7 @@ def test_every_value_comes_back(type_: str, data: st.DataObject, byte_order: Any
 
 @pytest.mark.parametrize("type_", VALUES)
 @given(data=st.data())
-def test_arrays_come_back_and_touch_nothing_else(type_: str, data: st.DataObject) -> None:
+def test_arrays_survive_a_round_trip_and_change_nothing_else(type_: str, data: st.DataObject) -> None:
     r = register(type_, ((-1, 0), (1, 3)), offset=4)
     value = data.draw(st.lists(st.lists(VALUES[type_], min_size=3, max_size=3), min_size=2, max_size=2))
     frame = bytearray(b"\x99" * (r.offset + r.size + 4))

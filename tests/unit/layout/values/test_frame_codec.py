@@ -1,4 +1,4 @@
-"""The vectorised codec against the scalar one, which has its own fixed bytes."""
+"""The vectorised codec, compared with the scalar one."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MS, NS = np.timedelta64(1, "ms"), np.timedelta64(1, "ns")
 
 
 def expected(value: Any, register: Register) -> Any:
-    """What the vectorised codec makes of a scalar codec's value."""
+    """Return what the vectorised codec must give for a value of the scalar codec."""
     if isinstance(value, list):
         return [expected(item, register) for item in value]
     base = register.element.base
@@ -63,7 +63,7 @@ def same(found: Any, wanted: Any) -> bool:
     return bool(found.tobytes() == wanted) if isinstance(wanted, bytes) else bool(found == wanted)
 
 
-# Bytes that make BCD digits, short lengths and small fields likely, so that good and bad values both come.
+# Bytes that make BCD digits, short lengths and small fields likely, so that both valid and invalid values occur.
 likely = st.one_of(st.integers(0, 255), st.sampled_from([0, 1, 2, 5, 0x07, 0xB2, 0x12, 0x31, 0x59, 0x99, 0xD8, 0xDC]))
 
 

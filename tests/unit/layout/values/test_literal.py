@@ -101,7 +101,7 @@ def test_literals(text: str, type_: str, value: Value) -> None:
         ('"CONSTANT"', "INT"),
     ],
 )
-def test_no_literals_of_the_type(text: str, type_: str) -> None:
+def test_invalid_literals_are_refused(text: str, type_: str) -> None:
     with pytest.raises(ValueRangeError) as caught:
         read(text, type_)
     assert len(str(caught.value)) < 200
@@ -191,7 +191,7 @@ def test_every_type_has_a_default(type_: str) -> None:
         assert codec.decode(codec.encode(value), 0) == value
 
 
-def test_a_bool_says_what_it_takes() -> None:
+def test_error_for_a_bool_lists_the_valid_texts() -> None:
     with pytest.raises(ValueRangeError, match="BOOL: expected TRUE, FALSE, 1 or 0, found"):
         parse_literal("yes", Register("run", "BOOL", (), 0, 0, 1, 1))
 
@@ -214,7 +214,7 @@ def test_a_bool_says_what_it_takes() -> None:
         ("2026-11-22T10:20:30.000000001", "LDT", "LDT#2026-11-22-10:20:30.000000001"),
     ],
 )
-def test_times_as_people_read_them_are_read_back(value: Value, type_: str, text: str) -> None:
+def test_literal_texts_of_times_are_read_back(value: Value, type_: str, text: str) -> None:
     register = Register("r", type_, (), 0, None, 0, 1)
     assert literal_text(value, register) == text
     assert parse_literal(text, register) == value
@@ -223,7 +223,7 @@ def test_times_as_people_read_them_are_read_back(value: Value, type_: str, text:
     assert parse_literal(f"[{text},{text}]", row) == [value, value]
 
 
-def test_what_is_no_time_is_read_as_ever() -> None:
+def test_literal_texts_of_other_values() -> None:
     assert literal_text(0.1, Register("r", "REAL", (), 0, None, 0, 1)) == "0.1"
     assert literal_text(None, Register("r", "DATE", (), 0, None, 0, 1)) == ""
     assert literal_text([None, "2026-11-22"], array("DATE", ((0, 1),), 2)) == "[null,D#2026-11-22]"

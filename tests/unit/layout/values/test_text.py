@@ -68,7 +68,7 @@ def test_real_is_the_shortest_text(value: float) -> None:
 
 
 @given(st.floats(allow_nan=False))
-def test_lreal_comes_back(value: float) -> None:
+def test_lreal_survives_a_round_trip(value: float) -> None:
     assert from_text(to_text(value, register("LREAL")), register("LREAL")) == value
 
 
@@ -93,7 +93,7 @@ def test_lreal_comes_back(value: float) -> None:
         ("0", "BOOL", False),
     ],
 )
-def test_what_java_and_others_print(text: str, type_: str, value: Value) -> None:
+def test_numbers_as_java_and_others_print_them(text: str, type_: str, value: Value) -> None:
     found = from_text(text, register(type_))
     assert (found, type(found)) == (value, type(value))
 

@@ -1,4 +1,4 @@
-"""From a register's new value to the bytes and bits that change, and no others."""
+"""A register's new value as writes of its bytes and bits, and of no others."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def apply(image: bytes, *writes: Write) -> bytes:
         ]
     ),
 )
-def test_the_register_has_the_value_and_nothing_else_moved(before: bytes, case: tuple[str, object]) -> None:
+def test_encoded_value_changes_only_the_register(before: bytes, case: tuple[str, object]) -> None:
     path, value = case
     register = find(LAYOUT, path)
     after = apply(before, *encode(register, value))
@@ -68,7 +68,7 @@ def test_the_register_has_the_value_and_nothing_else_moved(before: bytes, case: 
     reference = bytearray(before)
     codec(register).encode_into(value, reference)
     if path == "bits":
-        reference[7] &= 0b111  # what fills the row up belongs to nobody
+        reference[7] &= 0b111  # the padding bits belong to no register
     assert after == bytes(reference)
 
 
@@ -112,7 +112,7 @@ def test_a_wrong_pattern_is_an_error() -> None:
 
 
 @given(st.binary(min_size=12, max_size=12), st.lists(st.sampled_from([0, 0xFF, 0x80, 0x7E]), min_size=12, max_size=12))
-def test_merged_writes_do_what_image_and_mask_say(image: bytes, mask: list[int]) -> None:
+def test_merged_writes_have_the_effect_of_image_and_mask(image: bytes, mask: list[int]) -> None:
     before = bytes(range(100, 112))
     after = apply(before, *merge(image, bytes(mask), [(6, 12), (0, 7)]))
     assert after == bytes(old & ~m | new & m for old, new, m in zip(before, image, mask, strict=True))
