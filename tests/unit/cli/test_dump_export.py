@@ -162,9 +162,7 @@ def test_registers_named_like_other_columns(tmp_path: Path, capsys: pytest.Captu
     assert len(set(heading)) == len(heading)
 
 
-def test_selection_by_time_source_and_register_and_raw_values(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_for_time_source_registers_and_raw_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     varied(tmp_path / "a.mem")
     some = ["--from", "0.1", "--to", "0.3", "--only", "cell/count", "press/row"]
     assert main(["export", "a.mem", "-o", "out", *some]) == 0

@@ -287,7 +287,7 @@ def test_step_needs_consent_if_a_source_has_a_device(segment: Segment, capsys: p
         assert remote("step", "--pause", "--yes")[0] == 0
         assert remote("step", "--pause")[0] == 0, "consent is needed only once"
 
-    with Segment.open(segment.instance, writable=True) as opened:  # a mapping of its own, as another process has
+    with Segment.open(segment.instance, writable=True) as opened:  # mapped again, as by another process
         both(opened, capsys, test)
 
 

@@ -54,7 +54,7 @@ def served(grpc: Grpc) -> list[tuple[set[str], bool, bool]]:
         ),
     ],
 )
-def test_each_address_gives_its_roles(tmp_path: Path, text: str, expected: list[tuple[set[str], bool, bool]]) -> None:
+def test_roles_of_each_address(tmp_path: Path, text: str, expected: list[tuple[set[str], bool, bool]]) -> None:
     assert served(read(tmp_path, text)) == expected
 
 

@@ -284,7 +284,7 @@ def test_any_text_is_read_or_refused(folder: Path, text: str) -> None:
         ("localhost.evil.example:1", False),
     ],
 )
-def test_address_knows_if_it_is_loopback(text: str, loopback: bool) -> None:
+def test_loopback_addresses(text: str, loopback: bool) -> None:
     address = Address.parse(text)
     assert (str(address), address.loopback) == (text, loopback)
 

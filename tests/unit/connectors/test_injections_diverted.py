@@ -39,7 +39,7 @@ def local(rig: Rig) -> Iterator[Attachment]:
 
 
 def diverted_to(rig: Rig, number: int, until: EventKind) -> list[tuple[int, bytes]]:
-    """Return (offset, data) of what is diverted to an injection before the next event of a kind."""
+    """Return (offset, data) of what is diverted to an injection until the next event of a kind."""
     found = []
     while (event := rig.events.next(20)) is None or event.kind != until:
         assert event is not None

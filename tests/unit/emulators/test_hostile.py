@@ -90,7 +90,7 @@ def plc(tmp_path: Path) -> Iterator[Plc]:
     assert "Traceback" not in log.read_text()
 
 
-# -- what they send ----------------------------------------------------------------------------------------------------
+# -- what the peers send -----------------------------------------------------------------------------------------------
 
 byte, word = st.integers(0, 0xFF), st.integers(0, 0xFFFF)
 

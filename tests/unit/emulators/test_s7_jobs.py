@@ -137,7 +137,7 @@ def test_a_job_must_fit_the_pdu_too(block: bytearray) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 65535])
-def test_any_pdu_size_may_be_asked_for(block: bytearray, size: int) -> None:
+def test_any_pdu_size_may_be_requested(block: bytearray, size: int) -> None:
     jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
     answer = jobs.answer(job(struct.pack(">BxHHH", 0xF0, 0, 65535, size)))
     assert answer is not None

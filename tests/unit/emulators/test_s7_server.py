@@ -1,4 +1,4 @@
-"""The server through real sockets, with python-snap7's own client as the independent peer."""
+"""The server over real sockets; the client of python-snap7 is the independent peer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a declared injection is active, over sequences of times and conditions."""
+"""The times and conditions at which a declared injection is active."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def test_documented_object(layout: Layout) -> None:
     assert document["registers"][0]["dims"] is None
 
 
-def test_hash_tells_layouts_apart(layout: Layout) -> None:
+def test_different_layouts_have_different_hashes(layout: Layout) -> None:
     other = compile_sources([Source("x.db", TEXT.replace("// of c", "// of d").encode())]).layouts[0]
     assert other.hash != layout.hash
 

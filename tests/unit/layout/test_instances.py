@@ -135,14 +135,14 @@ def test_many_unfinished_function_blocks_end_in_an_error() -> None:
     assert "has no END_FUNCTION_BLOCK" in error('FUNCTION_BLOCK "f" VAR a : Int; END_VAR ' * 20_000)
 
 
-def test_a_constant_is_computed_where_it_is_declared() -> None:
+def test_constant_uses_the_constants_at_its_declaration() -> None:
     fb = 'FUNCTION_BLOCK "f" VAR CONSTANT N : Int := 9; END_VAR VAR a : Array[1..LAST] of Byte; END_VAR '
     fb += "END_FUNCTION_BLOCK "
     given = "VAR CONSTANT N : Int := 2; LAST : Int := N + 1; END_VAR "
     assert layout_of(given + fb + f'DATA_BLOCK "d" "f" BEGIN {END}').registers[0].count == 3
 
 
-def test_a_function_block_matters_only_if_it_has_an_instance() -> None:
+def test_faults_of_a_function_block_count_only_with_an_instance() -> None:
     faulty = 'FUNCTION_BLOCK "odd" VAR_INPUT a : ; b : Nope; END_VAR x := 1; END_FUNCTION_BLOCK '
     assert layout_of(faulty + block("a : Int;")).size == 2
     assert "0.scl:1:36: error: expected a type" in error(f'{faulty} DATA_BLOCK "d" "odd" BEGIN {END}')

@@ -30,7 +30,7 @@ def test_every_structure_is_a_type_of_tag_tables_and_is_recognised(shape: str) -
     assert recognise("zones", layout.registers) is None
 
 
-def test_a_trajectory_has_as_many_joints_and_points_as_it_says() -> None:
+def test_trajectory_has_the_declared_joints_and_points() -> None:
     inside = members("JointTrajectory[2, 3]")
     assert inside is not None
     assert inside["joint_names"] == "ARRAY[0..1] OF STRING[80]"

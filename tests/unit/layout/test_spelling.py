@@ -74,6 +74,6 @@ def test_with_a_source(text: str, path: str) -> None:
 
 
 @given(st.text(alphabet='Axes[123].%X0"Vel/,*in', max_size=24))
-def test_any_text_is_a_path_or_stays_as_it_is(text: str) -> None:
+def test_conversion_of_any_text_is_idempotent(text: str) -> None:
     path = topic_path(text, LAYOUTS, "cell")
     assert topic_path(path, LAYOUTS, "cell") == path

@@ -1,4 +1,4 @@
-"""Tag tables: where registers are placed, and what is refused, with its line."""
+"""Tag tables: the placement of registers, and errors with their lines."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def cell(instance: str, writer: BlockWriter) -> Iterator[Attachment]:
         yield cell
 
 
-def test_each_method_says_that_the_instance_has_stopped(instance: str, writer: BlockWriter) -> None:
+def test_every_method_reports_a_stopped_instance(instance: str, writer: BlockWriter) -> None:
     with shmio.attach(instance, writable=True) as cell:
         Path(f"/dev/shm/shmio-{instance}").unlink()
         calls: list[Callable[[], object]] = [

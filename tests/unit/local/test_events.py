@@ -173,7 +173,7 @@ def test_an_injection_whose_end_is_lost_is_forgotten(segment: Segment, cell: Att
         while (event := next(events)).number < newest:
             pass
         assert (event.kind, event.injection, event.paths) == ("lifted", 8, ("cell/a",)), (
-            "the event of its end is not lost"
+            "the event of its end is not lost, and names its register"
         )
         writer.event(NOTE)
         next(events)

@@ -161,7 +161,7 @@ def test_a_process_that_does_not_run(cell: Cell, instance: str, phase: Phase) ->
     assert status.state == "degraded"
 
 
-def test_a_silent_supervisor_is_degraded(cell: Cell, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_supervisor_degrades_the_instance(cell: Cell, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     cell.run("cell")
     cell.run("grpc")
     cell.segment.set_state(os.getpid(), State.RUNNING)
@@ -180,7 +180,7 @@ def test_a_predecessors_pid_is_not_shown(cell: Cell, instance: str) -> None:
     assert source_of(instance).pid is None
 
 
-def test_a_dead_supervisor_with_living_processes_is_degraded(cell: Cell, instance: str) -> None:
+def test_dead_supervisor_with_living_processes_degrades_the_instance(cell: Cell, instance: str) -> None:
     cell.run("cell")
     cell.supervisor_dies()
     status = read_status(instance)

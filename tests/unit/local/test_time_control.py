@@ -397,7 +397,7 @@ def test_reader_cannot_control_time(instance: str) -> None:
         assert Coordinator(reader).read().step == 0
 
 
-def test_a_killed_owner_leaves_time_to_the_next(instance: str) -> None:
+def test_time_is_free_after_its_owner_was_killed(instance: str) -> None:
     owner = """
 import sys
 from dataclasses import replace

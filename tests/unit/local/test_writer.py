@@ -174,7 +174,7 @@ def test_a_register_that_is_given_twice_is_refused(writer: BlockWriter, instance
                 write(twice)
 
 
-def test_guests_have_four_places_and_give_them_back(writer: BlockWriter, source: list[Answer], instance: str) -> None:
+def test_at_most_four_guests_write_at_a_time(writer: BlockWriter, source: list[Answer], instance: str) -> None:
     source += [tell(EventKind.WRITTEN)] * 5
     guests = [shmio.attach(instance, writable=True) for _ in range(5)]
     try:

@@ -67,7 +67,7 @@ def values(segment: Segment, frame: Frame | None = None) -> dict[str, object]:
     return {r.path: reading(block, r, frame or block.latest()).value for r in LAYOUT.registers}
 
 
-def test_it_begins_with_the_initial_values(segment: Segment) -> None:
+def test_memory_begins_with_the_initial_values(segment: Segment) -> None:
     with running(segment):
         frame = segment.blocks["cell"].latest()
         assert frame is not None

@@ -343,7 +343,7 @@ def test_write_accepted_before_a_step_is_carried_out_in_it(instance: str) -> Non
                 assert event is not None
             coordinator.step()
             expected += 1 + given
-            assert summed(latest(segment, "sim")) == expected, f"what was accepted before step {given} was not in it"
+            assert summed(latest(segment, "sim")) == expected, f"the write before step {given} is in it"
 
 
 def test_write_has_its_outcome_while_time_is_paused(instance: str) -> None:

@@ -56,7 +56,7 @@ def test_replay_stays_paused_until_it_is_played(paused_replay: tuple[Playing, At
     [status] = attachment.replay.status()
     assert (status.over, status.paused, status.position_s) == (True, True, 0.4)
     attachment.replay.play()
-    assert counts([playing.next() for _ in range(20)]) == list(range(20)), "play at the end begins anew"
+    assert counts([playing.next() for _ in range(20)]) == list(range(20)), "play at the end starts from the beginning"
 
 
 def test_seek_shows_the_recorded_frame(paused_replay: tuple[Playing, Attachment]) -> None:
@@ -232,7 +232,7 @@ def test_a_source_that_missed_requests_catches_up(tmp_path: Path, instance: str)
             assert counts([cell.next(lambda frame: frame.raw[1] == 5)]) == [5]
 
 
-def test_source_that_starts_when_others_are_at_the_end_is_there_too(tmp_path: Path, instance: str) -> None:
+def test_source_that_starts_late_joins_the_others_at_the_end(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance, "cell", "other")
     with (
         built(instance, "cell", "other", stepped=False) as segment,

@@ -57,7 +57,7 @@ def test_answers_in_any_order_give_the_block(block: bytes, chunk: int, first: in
         first = first + reading.count & 0xFFFF
 
 
-def test_refuses_less_or_more_data_than_asked() -> None:
+def test_answer_with_less_or_more_data_is_refused() -> None:
     reading = BlockRead(201, 10, 4)
     requests = split(reading.take(3, 0))
     for count in (3, 5):

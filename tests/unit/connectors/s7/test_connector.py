@@ -461,6 +461,6 @@ def test_endless_input_during_the_set_up_takes_no_memory(scripted: Scripted) -> 
 
 
 @pytest.mark.parametrize(("db_number", "size"), [(0, 1), (65536, 1), (1, 0), (1, 65537)])
-def test_refuses_what_s7_cannot_address(db_number: int, size: int) -> None:
+def test_block_outside_the_address_range_is_refused(db_number: int, size: int) -> None:
     with pytest.raises(ConfigError, match=f"^DB{db_number}"):
         S7Client(S7Options(host="plc"), db_number, size)

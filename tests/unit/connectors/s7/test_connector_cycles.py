@@ -32,7 +32,7 @@ def wide(make_plc: MakePlc) -> Plc:
 
 
 class Answers:
-    """Counts what the controller has answered."""
+    """Counts the answers of the controller."""
 
     def __init__(self, plc: Plc) -> None:
         self._count = 0
@@ -54,7 +54,7 @@ class Answers:
     ("pdu_size", "jobs", "most", "depth"),
     [(480, 4, None, 1), (480, 9, None, 1), (480, 10, None, 2), (480, 24, None, 4), (960, 24, None, 4), (960, 24, 7, 2)],
 )
-def test_depth_follows_what_was_granted(
+def test_depth_follows_the_granted_jobs_and_pdu_size(
     make_plc: MakePlc, pdu_size: int, jobs: int, most: int | None, depth: int
 ) -> None:
     plc = make_plc(Traits(max_pdu_size=pdu_size, max_jobs=jobs))
@@ -109,7 +109,7 @@ def test_no_image_yet(wide: Plc) -> None:
 def test_incomplete_image_is_not_returned(wide: Plc) -> None:
     client = wide.connected()
     answers = Answers(wide)
-    wide.proxy.hold()  # replaces the counting
+    wide.proxy.hold()  # ends the counting
     client.submit()
     assert wide.proxy.wait_held()
     assert client.collect(in_ns(0.01)) is None

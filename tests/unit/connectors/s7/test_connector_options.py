@@ -57,7 +57,7 @@ def test_slot_follows_the_model_unless_given(model: str | None, slot: int) -> No
         {"model": ""},
     ],
 )
-def test_refuses_what_is_out_of_range_or_unknown(wrong: dict[str, object]) -> None:
+def test_invalid_options_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert({"host": "plc", **wrong}, S7Options, strict=False)
 

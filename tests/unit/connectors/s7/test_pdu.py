@@ -80,7 +80,7 @@ def test_refuses_a_wrong_answer(frame: memoryview, text: str) -> None:
         pdu.parse_read_answer(frame)
 
 
-def test_bare_error_as_s7_1200_sends_it() -> None:
+def test_bare_error_pdu_of_an_s7_1200() -> None:
     with pytest.raises(ConnectorError, match="enable 'Permit access with PUT/GET"):
         pdu.parse_read_answer(memoryview(bytes.fromhex("03000013 02f080 32 02 0000 0001 0000 0000 81 04")))
 

@@ -96,7 +96,7 @@ def test_a_value_that_does_not_fit_is_refused() -> None:
         (["nothing"], ()),
     ],
 )
-def test_what_patterns_cover(patterns: list[str], covered: range) -> None:
+def test_cover_of_patterns(patterns: list[str], covered: range) -> None:
     assert cover(LAYOUT, patterns) == bytes(0xFF if at in covered else 0 for at in range(24))
 
 
