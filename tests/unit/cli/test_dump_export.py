@@ -131,7 +131,7 @@ def test_mcap_for_viewers(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_registers_named_like_other_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each has a column of its own, and replaces none of a frame's own columns."""
+    """Each such register has a column, and replaces none of the frame's own columns."""
     names = ("time", "source_time", "number", "cycle", "quality", "provenance", "what", "frame/number")
     layout = Layout("DB2", 2, 16, False, tuple(Register(n, "INT", (), 2 * i, None, 2, 1) for i, n in enumerate(names)))
     with build(tmp_path / "names.mem") as work:

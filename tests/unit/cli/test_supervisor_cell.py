@@ -222,7 +222,7 @@ def serve_on(cell: Cell, address: str) -> None:
 
 
 def test_failed_start_reports_the_reason_and_leaves_nothing(cell: Cell) -> None:
-    serve_on(cell, "192.0.2.1:8089")  # RFC 5737: nobody's address
+    serve_on(cell, "192.0.2.1:8089")  # an address reserved by RFC 5737
     error = cell.run("up", "--detach", status=1).stderr
     assert error.startswith("grpc: ")
     assert "192.0.2.1:8089" in error

@@ -264,7 +264,7 @@ def test_each_item_of_a_lost_batch_has_its_known_outcome(bench: Bench) -> None:
 
 
 def test_partly_written_item_is_unknown_not_expired(bench: Bench) -> None:
-    """Its first two bytes are written; a later item, which is not sent, supersedes the others."""
+    """The first two bytes are written; a later item, which is not sent, supersedes the others."""
     bench.accepted(Write(6, 0, b"abcd"))
     bench.accepted(Write(8, 0, b"xy"))
 

@@ -15,7 +15,7 @@ from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
 from shmio.simulation.a50 import ACTUATORS, AXIS_LIMITS, CYCLE_S, STEPS
 
-PERIOD_S = 0.02  # of the sampling in these tests
+PERIOD_S = 0.02  # sampling period of these tests
 MAX_DEG_PER_S = 123.0
 
 

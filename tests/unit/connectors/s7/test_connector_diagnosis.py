@@ -161,7 +161,7 @@ def test_a_controller_that_is_silent_when_asked(plc: Plc) -> None:
 
 
 def test_unanswered_mode_query_ends_the_session(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It has answered before, so the connection must be faulty. Reads alone would not show that."""
+    """The controller has answered before: the connection is faulty, and reads alone do not show it."""
     client = plc.connected(timeout=200)
     monkeypatch.setattr(mode, "INTERVAL_NS", 0)
     plc.proxy.edit(lambda frame: None if frame[8] == 7 else frame)

@@ -78,7 +78,7 @@ def test_mode_is_asked_once_an_interval() -> None:
     ],
 )
 def test_controller_without_a_mode_is_not_asked_again(unknown: memoryview, caplog: pytest.LogCaptureFixture) -> None:
-    """It is logged once, at level DEBUG, and the query is not repeated."""
+    """The missing mode is logged once, at level DEBUG, and the query is not repeated."""
     caplog.set_level(logging.DEBUG, "shmio.source")
     question = ModeQuery()
     question.begin(0, 10)
