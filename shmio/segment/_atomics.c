@@ -1,7 +1,7 @@
 /* Python binding of ring.h, relay.h and queue.h (limited API: one build serves CPython 3.11 and later).
  *
- * Everything here holds the GIL except the wait on a doorbell and the relay. A Ring keeps its buffer
- * exported, so that the mapping cannot be closed while it exists.
+ * All functions hold the GIL, except during the wait on a doorbell and in the relay. A Ring keeps its
+ * buffer exported, so that the mapping cannot be closed while the Ring exists.
  */
 #include <Python.h>
 #include <stdlib.h>
@@ -35,7 +35,7 @@ static int Ring_init(Ring *self, PyObject *args, PyObject *kwargs)
     PyObject *object;
     Py_ssize_t offset, size;
     if (self->buffer.obj) {
-        PyErr_SetString(PyExc_TypeError, "a Ring is opened once");
+        PyErr_SetString(PyExc_TypeError, "a Ring can be opened only once");
         return -1;
     }
     if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Onn", names, &object, &offset, &size)) return -1;
@@ -77,7 +77,7 @@ static PyObject *Ring_begin(Ring *self, PyObject *args)
     a32 *stored = &ring_head(&self->ring)->incarnation;
     unsigned int incarnation = 0;
     if (!PyArg_ParseTuple(args, "|I", &incarnation) || !Ring_writable(self)) return NULL;
-    /* Only the writer changes this offset; readers see it in frames. */
+    /* Only the writer changes this word; readers have the incarnation of each frame in the frame. */
     if (!incarnation) incarnation = atomic_load_explicit(stored, memory_order_relaxed) + 1;
     self->incarnation = incarnation;
     atomic_store_explicit(stored, incarnation, memory_order_relaxed);
@@ -98,7 +98,7 @@ static PyObject *Ring_publish(Ring *self, PyObject *args)
     if (effective_object != Py_None && PyObject_GetBuffer(effective_object, &effective, PyBUF_SIMPLE) < 0) goto done;
     if (!Ring_writable(self)) goto done;
     if (self->incarnation == 0) {
-        PyErr_SetString(PyExc_ValueError, "begin() comes before the first publish()");
+        PyErr_SetString(PyExc_ValueError, "call begin() before the first publish()");
         goto done;
     }
     if (raw.len != self->ring.frame_size || (effective.obj && effective.len != self->ring.frame_size)) {
@@ -202,8 +202,8 @@ static PyObject *Ring_wake(Ring *self, PyObject *unused)
     Py_RETURN_NONE;
 }
 
-/* Waits with the GIL released and returns the word's value. A signal ends the wait, too, after its
- * Python handler has run. */
+/* Waits without the GIL, and returns the word's value. A signal also ends the wait; its Python handler
+ * runs first. */
 static PyObject *wait_on(const a32 *word, unsigned int seen, long long timeout_ns)
 {
     int error;
@@ -232,7 +232,7 @@ static relay *relay_in(PyObject *object, Py_buffer *buffer)
     if (PyObject_GetBuffer(object, buffer, PyBUF_WRITABLE) < 0) return NULL;
     if (buffer->len == sizeof(relay) && (uintptr_t)buffer->buf % _Alignof(relay) == 0) return buffer->buf;
     PyBuffer_Release(buffer);
-    PyErr_Format(PyExc_ValueError, "a relay has %zu bytes, and is aligned", sizeof(relay));
+    PyErr_Format(PyExc_ValueError, "a relay needs %zu aligned bytes", sizeof(relay));
     return NULL;
 }
 
@@ -274,30 +274,30 @@ static PyObject *Ring_incarnation(Ring *self, void *unused)
 }
 
 static PyGetSetDef Ring_fields[] = {
-    FIELD(slot_count, "Frames that the ring holds."),
-    FIELD(frame_size, "Bytes of one image."),
-    FIELD(period_ns, "Time between two cycles of the source."),
-    FIELD(stale_ns, "Age from which a frame is no longer good."),
-    {"incarnation", (getter)Ring_incarnation, NULL, "Processes that have written here, one after another.", NULL},
+    FIELD(slot_count, "Number of frames for which the ring has room."),
+    FIELD(frame_size, "Size of an image in bytes."),
+    FIELD(period_ns, "Time between two cycles of the source, in ns."),
+    FIELD(stale_ns, "Age above which a frame is bad, in ns."),
+    {"incarnation", (getter)Ring_incarnation, NULL, "Number of the process that writes the ring, counted from 1.", NULL},
     {0},
 };
 
 #define METHOD(type, name, flags, doc) {#name, (PyCFunction)(void (*)(void))type##_##name, flags, doc}
 static PyMethodDef Ring_methods[] = {
-    METHOD(Ring, begin, METH_VARARGS, "Take the writer's part under a new incarnation, or the one given."),
-    METHOD(Ring, publish, METH_VARARGS, "Write the next frame and wake all who wait."),
-    METHOD(Ring, head, METH_NOARGS, "Number of the newest whole frame; 0: none yet."),
-    METHOD(Ring, latest, METH_NOARGS, "A validated copy of the newest frame, or None."),
-    METHOD(Ring, read, METH_O, "A validated copy of one frame, or None when it is not in the ring."),
-    METHOD(Ring, doorbell, METH_NOARGS, "Value of the futex word; read it before looking for news."),
-    METHOD(Ring, wake, METH_NOARGS, "Ring the doorbell without a frame: there is other news."),
-    METHOD(Ring, wait, METH_VARARGS, "Wait until the doorbell differs from `seen`, at most `timeout_ns`."),
-    METHOD(Ring, relay, METH_VARARGS, "Tell an event loop of each ring of the doorbell, until it is stopped."),
+    METHOD(Ring, begin, METH_VARARGS, "Start to write with the next incarnation, or the given one; return it."),
+    METHOD(Ring, publish, METH_VARARGS, "Write the next frame, wake all waiters, and return the frame's number."),
+    METHOD(Ring, head, METH_NOARGS, "Return the number of the newest complete frame; 0: there is none yet."),
+    METHOD(Ring, latest, METH_NOARGS, "Return a validated copy of the newest frame, or None."),
+    METHOD(Ring, read, METH_O, "Return a validated copy of one frame; None if it is not in the ring."),
+    METHOD(Ring, doorbell, METH_NOARGS, "Return the value of the futex word. Read it before you check for changes."),
+    METHOD(Ring, wake, METH_NOARGS, "Ring the doorbell without a new frame, for another change."),
+    METHOD(Ring, wait, METH_VARARGS, "Wait until the doorbell is not `seen`, at most `timeout_ns`; return its value."),
+    METHOD(Ring, relay, METH_VARARGS, "Signal each ring of the doorbell to an event loop, until stopped."),
     {0},
 };
 
 static PyType_Slot Ring_slots[] = {
-    {Py_tp_doc, "One frame ring in a mapped segment."},
+    {Py_tp_doc, "A ring of frames or events in a mapped segment."},
     {Py_tp_init, Ring_init},
     {Py_tp_dealloc, Ring_dealloc},
     {Py_tp_methods, Ring_methods},
@@ -510,7 +510,7 @@ static PyObject *atomics_queue_pop(PyObject *module, PyObject *args)
         break;
     case QUEUE_BROKEN:
         queue_clear(queue);
-        PyErr_SetString(PyExc_ValueError, "the queue contradicted itself and was emptied");
+        PyErr_SetString(PyExc_ValueError, "the queue was corrupt and has been emptied");
     }
 done:
     PyBuffer_Release(&buffer);
@@ -525,7 +525,7 @@ typedef struct {
     uint32_t offset;
     uint32_t size;
     uint32_t mask;  /* bits of the one byte to compare; 0: compare all bytes */
-    uint32_t index; /* what to report; entries with the same index are adjacent */
+    uint32_t index; /* number to report; entries with the same index are adjacent */
 } scan_entry;
 
 static bool entry_changed(const scan_entry *entry, const uint8_t *old, const uint8_t *new, const uint8_t *dirty)
@@ -593,17 +593,17 @@ done:
 static PyMethodDef functions[] = {
     METHOD(atomics, load64, METH_VARARGS, "Acquire load of an aligned 64-bit word."),
     METHOD(atomics, store64, METH_VARARGS, "Release store of an aligned 64-bit word."),
-    METHOD(atomics, cell_write, METH_VARARGS, "Write a cell; one writer."),
-    METHOD(atomics, cell_read, METH_VARARGS, "A consistent copy of a cell, or None while it is being written."),
-    METHOD(atomics, bell, METH_VARARGS, "Value of a futex word; read it before looking for news."),
-    METHOD(atomics, bell_ring, METH_VARARGS, "Bump a futex word and wake all who wait on it."),
-    METHOD(atomics, bell_wait, METH_VARARGS, "Wait until a futex word differs from `seen`, at most `timeout_ns`."),
-    METHOD(atomics, bell_relay, METH_VARARGS, "Tell an event loop of each ring of a futex word, until it is stopped."),
-    METHOD(atomics, relay_heard, METH_VARARGS, "Say that the event loop is about to look at what the bell rings for."),
-    METHOD(atomics, relay_stop, METH_O, "Have a relay return; it tells nothing more."),
-    METHOD(atomics, queue_push, METH_VARARGS, "Put a record into a queue; False when there is no room."),
-    METHOD(atomics, queue_pop, METH_VARARGS, "Take the oldest record, None if there is none; ValueError: it was broken, all is dropped."),
-    METHOD(atomics, changed, METH_VARARGS, "Indices in a table of (offset, size, mask, index) whose bytes differ between two images."),
+    METHOD(atomics, cell_write, METH_VARARGS, "Write a cell. It may have only one writer."),
+    METHOD(atomics, cell_read, METH_VARARGS, "Return a consistent copy of a cell; None while it is being written."),
+    METHOD(atomics, bell, METH_VARARGS, "Return the value of a futex word. Read it before you check for changes."),
+    METHOD(atomics, bell_ring, METH_VARARGS, "Increment a futex word, and wake all that wait on it."),
+    METHOD(atomics, bell_wait, METH_VARARGS, "Wait until a word is not `seen`, at most `timeout_ns`; return its value."),
+    METHOD(atomics, bell_relay, METH_VARARGS, "Signal each ring of a futex word to an event loop, until stopped."),
+    METHOD(atomics, relay_heard, METH_VARARGS, "Acknowledge a notification. Call this before you check for changes."),
+    METHOD(atomics, relay_stop, METH_O, "Stop a relay: it signals nothing more, and returns."),
+    METHOD(atomics, queue_push, METH_VARARGS, "Append a record to a queue; return False if there is no room."),
+    METHOD(atomics, queue_pop, METH_VARARGS, "Remove and return the oldest record, or None; ValueError: corrupt, now empty."),
+    METHOD(atomics, changed, METH_VARARGS, "Return the indices of a table's entries whose bytes differ in two images."),
     {0},
 };
 

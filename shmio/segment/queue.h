@@ -1,8 +1,9 @@
-/* A queue of byte records in shared memory: one producer, one consumer, and neither ever waits.
+/* A queue of byte records in shared memory: one producer and one consumer, of which neither ever waits.
  *
- * Pure C11 like ring.h. Commands to a source pass through such queues, one for each writer and block;
- * docs/reference/segment-format.md describes the bytes. Only head and tail order the plain accesses to
- * the data: the bytes between them belong to the consumer, all others to the producer.
+ * Pure C11 like ring.h. Writers send commands to a source through such queues, one for each writer and
+ * block; docs/reference/segment-format.md describes the bytes. Accesses to the data are not atomic. Only
+ * head and tail order them: the bytes between tail and head belong to the consumer, all others to the
+ * producer.
  */
 #ifndef SHMIO_QUEUE_H
 #define SHMIO_QUEUE_H
@@ -45,7 +46,7 @@ static inline bool queue_push(uint8_t *queue, uint64_t capacity, const uint8_t *
     uint8_t *data = queue + QUEUE_HEADER_SIZE;
     uint64_t needed = RECORD_HEADER_SIZE + align8(size);
     uint64_t head = atomic_load_explicit(&header->head, memory_order_relaxed); /* only we write it */
-    /* Pairs with the release store in queue_drop: records that the consumer has removed may be overwritten. */
+    /* Pairs with the release store in queue_drop: records that the consumer has removed may now be overwritten. */
     uint64_t used = head - atomic_load_explicit(&header->tail, memory_order_acquire);
     if (used > capacity || needed > capacity - used) return false;
     uint32_t words[2] = {size, 0};
@@ -56,7 +57,7 @@ static inline bool queue_push(uint8_t *queue, uint64_t capacity, const uint8_t *
     return true;
 }
 
-/* Returns the size of the oldest record. BROKEN: the words contradict each other; shmio never writes that. */
+/* Returns the size of the oldest record. BROKEN: head, tail and size are inconsistent, which shmio never writes. */
 static inline enum queue_result queue_peek(const uint8_t *queue, uint64_t capacity, uint32_t *size)
 {
     const queue_header *header = (const queue_header *)(const void *)queue;

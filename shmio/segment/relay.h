@@ -9,7 +9,8 @@
 
 enum { RELAY_HEARD, RELAY_TOLD, RELAY_HELD, RELAY_STOPPED };
 
-/* State that the thread and the event loop share. Unless it is HEARD, the loop has yet to look, and will. */
+/* State that the thread and the event loop share. HEARD: the loop has handled the last wake-up. TOLD: it has
+ * not handled it yet. HELD: it has not, and the thread waits until it has. */
 typedef struct {
     a32 state;
     a32 reserved;
@@ -18,14 +19,14 @@ typedef struct {
 _Static_assert(sizeof(relay) == 16, "relay");
 
 /* Makes `descriptor` readable at the start, after each ring of the doorbell, and after `turn_ns` without
- * one. While the loop has not yet handled the last wake-up there is no other, and ringing the doorbell
- * need not wake this thread. Returns when it is stopped. */
+ * one. There is no further wake-up until the loop has handled the last one; meanwhile, ringing the
+ * doorbell need not wake this thread. Returns when it is stopped. */
 static inline void relay_run(relay *shared, const a32 *word, int descriptor, int64_t turn_ns)
 {
     const uint64_t one = 1;
     atomic_store(&shared->word, word);
     for (;;) {
-        /* Before the write: the next ring from here on causes another wake-up. */
+        /* Before the write, so that any later ring causes another wake-up. */
         uint32_t seen = atomic_load_explicit(word, memory_order_acquire);
         uint32_t state = RELAY_HEARD;
         if (atomic_compare_exchange_strong(&shared->state, &state, RELAY_TOLD)) {
@@ -38,7 +39,7 @@ static inline void relay_run(relay *shared, const a32 *word, int descriptor, int
     }
 }
 
-/* Changes the state, unless the thread is stopping, which is final. */
+/* Changes the state, unless it is STOPPED, which is final. */
 static inline void relay_free(relay *shared, uint32_t state)
 {
     uint32_t before = atomic_load(&shared->state);
@@ -46,8 +47,8 @@ static inline void relay_free(relay *shared, uint32_t state)
     if (before == RELAY_HELD) syscall(SYS_futex, &shared->state, FUTEX_WAKE, 1, NULL, NULL, 0);
 }
 
-/* The loop calls this before it looks at the shared data. Not to be called after relay_stop: the
- * descriptor may have been closed and reused. */
+/* The loop calls this before it checks the shared data. Do not call it after relay_stop: the descriptor
+ * may have been closed and reused. */
 static inline void relay_heard(relay *shared, int descriptor)
 {
     uint64_t count;
@@ -55,13 +56,13 @@ static inline void relay_heard(relay *shared, int descriptor)
     relay_free(shared, RELAY_HEARD);
 }
 
-/* Makes the thread return at once; if it is just about to wait, within its `turn_ns` or after another
- * relay_stop. There are no more wake-ups. */
+/* Makes the thread return at once. If the thread is just about to wait, it returns after `turn_ns` or
+ * another relay_stop. There are no more wake-ups. */
 static inline void relay_stop(relay *shared)
 {
     relay_free(shared, RELAY_STOPPED);
     const a32 *word = atomic_load(&shared->word);
-    if (word) syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0); /* others look and continue to wait */
+    if (word) syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0); /* other waiters check the word and wait again */
 }
 
 #endif

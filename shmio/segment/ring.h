@@ -78,8 +78,8 @@ typedef struct {
 } slot_info;
 _Static_assert(sizeof(slot_info) == SLOT_HEADER_SIZE - 8, "slot info");
 
-/* A checked view of one ring. It has its own copy of the geometry, so that a later change in shared memory
- * cannot lead out of the mapping. */
+/* A checked view of one ring. It has a copy of the geometry, so that a later change in shared memory
+ * cannot cause an access outside the mapping. */
 typedef struct {
     uint8_t *base;
     uint32_t slot_count, slot_stride, frame_size, effective_offset;
@@ -94,7 +94,7 @@ static inline uint8_t *ring_slot(const ring_view *ring, uint64_t frame)
     return ring->base + RING_HEADER_SIZE + (uint64_t)ring->slot_stride * (frame & (ring->slot_count - 1));
 }
 
-/* Checks a ring's header within `size` bytes; returns NULL if it is sound, else the text of an error. */
+/* Checks a ring's header within `size` bytes. Returns NULL if it is valid, else the text of an error. */
 static inline const char *ring_open(ring_view *ring, uint8_t *base, uint64_t size)
 {
     if (((uintptr_t)base & 7u) != 0) return "ring is not aligned to 8 bytes";
@@ -114,7 +114,7 @@ static inline const char *ring_open(ring_view *ring, uint8_t *base, uint64_t siz
     return NULL;
 }
 
-/* Copy to and from shared memory in relaxed 64-bit words; only the private side may end within a word. */
+/* Copy to and from shared memory in relaxed 64-bit words. Only the private side may end within a word. */
 static inline void words_store(uint8_t *shared, const uint8_t *data, size_t size)
 {
     a64 *words = (a64 *)(void *)shared;
@@ -145,7 +145,7 @@ static inline void words_load(uint8_t *data, const uint8_t *shared, size_t size)
     }
 }
 
-/* Wakes all who wait on this word. They may have a read-only mapping, so they cannot register as waiters. */
+/* Wakes all that wait on this word. With a read-only mapping they cannot register, so it always wakes. */
 static inline void doorbell_ring(a32 *word)
 {
     /* release: a waiter that sees the new value sees everything written before it. */
@@ -163,7 +163,7 @@ static inline int doorbell_wait(const a32 *word, uint32_t seen, int64_t timeout_
     return result == 0 || errno == EAGAIN ? 0 : errno;
 }
 
-/* Publishes a frame and returns its number. Each ring has one writer. `effective` is NULL if consumers see
+/* Publishes a frame, and returns its number. Each ring has one writer. `effective` is NULL if consumers see
  * the raw image, or if slots have no room for another. */
 static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const uint8_t *reason, const uint8_t *raw,
                                     const uint8_t *effective)
@@ -189,7 +189,7 @@ static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const
     return frame;
 }
 
-/* Copies one frame; false if the slot no longer has it, or is being overwritten. `reason` has
+/* Copies one frame. Returns false if the slot no longer has it, or is being overwritten. `reason` has
  * REASON_SIZE bytes. */
 static inline bool ring_read(const ring_view *ring, uint64_t frame, slot_info *info, uint8_t *reason, uint8_t *raw,
                              uint8_t *effective)
@@ -220,11 +220,11 @@ static inline uint64_t ring_latest(const ring_view *ring, slot_info *info, uint8
     return 0;
 }
 
-/* A cell: a sequence word, then bytes with one writer, which readers get only as a whole. */
+/* A cell: a sequence word, then bytes. It has one writer, and readers copy all of the bytes or none. */
 static inline void cell_write(uint8_t *cell, const uint8_t *data, size_t size)
 {
     a64 *sequence = (a64 *)(void *)cell;
-    uint64_t odd = atomic_load_explicit(sequence, memory_order_relaxed) | 1u; /* a predecessor may have died half-way */
+    uint64_t odd = atomic_load_explicit(sequence, memory_order_relaxed) | 1u; /* an earlier writer may have died half-way */
     atomic_store_explicit(sequence, odd, memory_order_relaxed);
     atomic_thread_fence(memory_order_release); /* pairs with the fence in cell_read */
     words_store(cell + 8, data, size);
