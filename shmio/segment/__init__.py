@@ -1,6 +1,7 @@
-"""The shared-memory segment of an instance: header, process table, for each source rings of frames, events, commands.
+"""The shared-memory segment of an instance: header, process table, and a block for each source.
 
-The byte format is docs/reference/segment-format.md; a local program starts with :func:`shmio.attach`.
+A block has the frames, events and commands of its source. docs/reference/segment-format.md
+describes the bytes. A local program starts with :func:`shmio.attach`.
 """
 
 from shmio.layout.values.write import Write

@@ -1,8 +1,8 @@
-"""The block of a source: the source's process publishes frames and events, and readers copy and follow them.
+"""The block of a source: its process publishes frames and events, which readers copy and follow.
 
-A frame is published by :meth:`BlockWriter.publish`. Readers copy the newest one (:meth:`Block.latest`), read
-each one in order (:class:`Cursor`), or also learn when the quality changes (:class:`FrameFollower`).
-The ring itself is ``ring.h``, in C.
+:meth:`BlockWriter.publish` publishes a frame. Readers copy the newest one (:meth:`Block.latest`),
+or read each one in order (:class:`Cursor`, and :class:`FrameFollower`, which also reports changes
+of the quality). The ring is in C: ``ring.h``.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ class Frame(NamedTuple):
 
     Attributes:
         number: Number of the frame in its ring, from 1.
-        cycle: Period of the source's schedule; in virtual time the number of the step.
+        cycle: Number of the period in the source's schedule; in virtual time, number of the step.
         publish_ns: CLOCK_MONOTONIC at publication, or a comparable time in virtual time.
         clock_ns: The instance's clock at publication.
-        source_ns: The source's time stamp, UTC. A bad frame has that of the image it repeats; 0: the
-            source never had an image, and the bytes are zeros.
+        source_ns: The source's time stamp, UTC. A bad frame repeats the last image with its time
+            stamp. 0: there never was an image, and the bytes are zeros.
         incarnation: Number of the source's process.
-        quality: Quality of the image when it was published.
+        quality: Quality of the image at publication.
         provenance: Where the raw image comes from.
         event: Number of the last event before the frame.
-        delay_us: Maximum age of the image when it was published: the time that the device took to answer.
-        reason: Why the quality is not good.
+        delay_us: Maximum age of the image at publication: the time that the device took to answer.
+        reason: Reason why the quality is not good.
         raw: The image that the source delivered, in its own byte order.
-        effective: The image that consumers see; None while nothing is injected.
+        effective: The image with injections, which consumers see; None if nothing is injected.
     """
 
     number: int
@@ -93,7 +93,7 @@ _PROVENANCES: Final = tuple(Provenance)
 
 
 def decode_frame(fields: FrameTuple) -> Frame:
-    """Make a frame of what the ring returns."""
+    """Convert what a ring returns to a frame."""
     (number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, reason,
      raw, effective) = fields  # fmt: skip
     return Frame(
@@ -108,7 +108,7 @@ def decode_frame(fields: FrameTuple) -> Frame:
 Entry = TypeVar("Entry")
 
 _POLL_NS: Final = 1_000_000_000
-"""How often a waiting reader polls: if the supervisor dies, the doorbell for a block's end is never rung."""
+"""Polling interval of a waiting reader: a dead supervisor rings no doorbell when a block ends."""
 
 
 class Cursor(Generic[Entry]):
@@ -137,12 +137,12 @@ class Cursor(Generic[Entry]):
 
     @property
     def behind(self) -> int:
-        """Number of entries that are not read yet."""
+        """Number of unread entries in the ring."""
         return max(0, self._ring.head() - self._last)
 
     @property
     def ended(self) -> bool:
-        """Whether a reload has retired the block, and all its entries have been read."""
+        """True if a reload has retired the block, and all its entries have been read."""
         return self._retired() and not self.behind  # in this order: nothing is published after the end
 
     def take_missed(self) -> int:
@@ -151,7 +151,7 @@ class Cursor(Generic[Entry]):
         return missed
 
     def resume(self, *, after: int) -> None:
-        """Continue with the entry behind this number; those in between do not count as missed."""
+        """Continue after the entry with this number. Entries in between do not count as missed."""
         self._last = after
 
     def poll(self) -> Entry | None:
@@ -163,7 +163,7 @@ class Cursor(Generic[Entry]):
             if fields is not None:
                 self._last += 1
                 return self._decode(fields)
-            # Lapped: resume with the oldest entry, and further ahead each time the writer is faster.
+            # Lapped: resume with the oldest entry, or further ahead if the writer has overwritten that, too.
             resume = max(self._last + 1, ring.head() - ring.slot_count + margin)
             margin = min(2 * margin + 1, ring.slot_count // 2)
             self.missed += resume - self._last
@@ -174,13 +174,13 @@ class Cursor(Generic[Entry]):
         """Return the next entry, waiting at most ``timeout_s`` (None: forever).
 
         Returns:
-            The entry. None if none came in time, or if a reload has retired the block and all of it
-            has been read.
+            The entry. None if none came in time, or if a reload has retired the block and all its
+            entries have been read.
         """
         ring = self._ring
         deadline_ns = None if timeout_s is None else time.monotonic_ns() + round(timeout_s * 1e9)
         while True:
-            seen = ring.doorbell()  # before polling, so that no ring is lost
+            seen = ring.doorbell()  # before polling, so that no wake-up is lost
             retired = self._retired()  # also before polling: what was published before the end is still read
             entry = self.poll()
             if entry is not None or retired:
@@ -191,7 +191,7 @@ class Cursor(Generic[Entry]):
             ring.wait(seen, rest_ns)
 
     def __iter__(self) -> Iterator[Entry]:
-        """Iterate over all entries to come, until the block is retired."""
+        """Iterate over the entries that follow, until the block is retired."""
         while True:
             entry = self.next()
             if entry is not None:
@@ -208,19 +208,19 @@ class Attributes:
     writable: tuple[str, ...] = ()
     """Patterns of the registers that may be written."""
     armed: bool = False
-    """Whether an injection may reach the device."""
+    """True if an injection may reach the device."""
     stepped: bool = False
-    """Whether the source uses the instance clock: in virtual time it publishes a frame for each step."""
+    """True if the source uses the instance clock: it publishes a frame for each step of time."""
     outputs: tuple[str, ...] = ()
     """Patterns of the registers that a remote model computes."""
     inouts: tuple[str, ...] = ()
     """Patterns of the registers that a remote model both reads and computes."""
     replay: bool = False
-    """Whether the source replays a recording."""
+    """True if the source replays a recording."""
 
     @property
     def remote(self) -> bool:
-        """Whether a remote model computes registers of the source."""
+        """True if a remote model computes registers of the source."""
         return bool(self.outputs or self.inouts)
 
 
@@ -236,17 +236,17 @@ class EventRing:
         return self.ring.head()
 
     def read(self, number: int) -> Event | None:
-        """Return a copy of the event with this number; None if the ring does not hold it."""
+        """Return a copy of the event with this number; None if it is not in the ring."""
         fields = self.ring.read(number)
         return None if fields is None else decode_event(fields)
 
     def cursor(self, *, after: int | None = None) -> Cursor[Event]:
-        """Return a cursor that starts behind event ``after`` (default: the newest one)."""
+        """Return a cursor that starts after event ``after`` (default: the newest one)."""
         return Cursor(self.ring, decode_event, self.head() if after is None else after, self._retired)
 
 
 class Block:
-    """Reading side of a block. Reading leaves the writer undisturbed.
+    """Reading side of a block. Readers never delay the writer.
 
     Several threads may use a block; a :class:`Cursor` belongs to one thread.
     """
@@ -297,12 +297,15 @@ class Block:
 
     @property
     def retired(self) -> bool:
-        """Whether a reload has retired this block: nothing more is written to it."""
+        """True if a reload has retired this block: nothing more is written to it."""
         return self._retired()
 
     @property
     def incarnation(self) -> int:
-        """Number of the process that writes here, counted from 1; a command names the one it is for."""
+        """Number of the process that writes the block, counted from 1.
+
+        A command names its process.
+        """
         return self.ring.incarnation
 
     @property
@@ -316,17 +319,20 @@ class Block:
         return self.ring.stale_ns
 
     def now_ns(self) -> int:
-        """Return the present time by which frames age: that of the playhead, the instance clock or CLOCK_MONOTONIC."""
+        """Return the present time in ns on the clock by which frames age.
+
+        This is the clock of the playhead, the instance clock, or CLOCK_MONOTONIC.
+        """
         if self.playhead is not None:
             return self.playhead.now_ns()
         return self.clock.now_ns() if self.attributes.stepped else time.monotonic_ns()
 
     def assess(self, frame: Frame) -> tuple[Quality, str]:
-        """Return a frame's quality as of now, and the reason if it is not good."""
+        """Return a frame's present quality, and the reason if it is not good."""
         return frame.assess(self.stale_ns, self.now_ns())
 
     def came_with(self, frame: Frame, step: int) -> bool:
-        """Whether a frame was published for the present step of virtual time, or a later one.
+        """Return whether a frame belongs to the present step of virtual time, or to a later one.
 
         Always False for a block that does not use the instance clock.
         """
@@ -350,12 +356,12 @@ class Block:
         )
 
     def read(self, number: int) -> Frame | None:
-        """Return a copy of the frame with this number; None if the ring does not hold it."""
+        """Return a copy of the frame with this number; None if it is not in the ring."""
         fields = self.ring.read(number)
         return None if fields is None else decode_frame(fields)
 
     def cursor(self, *, after: int | None = None) -> Cursor[Frame]:
-        """Return a cursor that starts behind frame ``after`` (default: the newest one)."""
+        """Return a cursor that starts after frame ``after`` (default: the newest one)."""
         return Cursor(self.ring, decode_frame, self.ring.head() if after is None else after, self._retired)
 
 
@@ -388,7 +394,13 @@ _MAX_DELAY_US: Final = 2**32 - 1
 
 
 class Stamp(NamedTuple):
-    """Times of a publication: comparable to CLOCK_MONOTONIC, by the instance's clock, and, for an event, in UTC."""
+    """Times of a publication.
+
+    Attributes:
+        publish_ns: Time comparable to CLOCK_MONOTONIC.
+        clock_ns: The instance's clock.
+        utc_ns: UTC; for events only.
+    """
 
     publish_ns: int
     clock_ns: int
@@ -396,10 +408,10 @@ class Stamp(NamedTuple):
 
 
 class BlockWriter:
-    """Writing side of a block. There is one, in the source's process; several threads may use it."""
+    """Writing side of a block, in the source's process. Several threads may use it."""
 
     def __init__(self, block: Block, clock_ns: Callable[[int], int], at: Stamp | None = None) -> None:
-        """Begin a new incarnation, and publish its start.
+        """Begin a new incarnation, and publish the event of its start.
 
         Args:
             block: The block to write.
@@ -445,9 +457,9 @@ class BlockWriter:
             source_ns: The source's time stamp, UTC; None: now; 0: there is no image yet.
             quality: Quality of the image.
             provenance: Where the image comes from.
-            reason: Why the quality is not good; cut at 256 bytes.
+            reason: Reason why the quality is not good; cut at 256 bytes.
             effective: The image that consumers see; None: ``raw``.
-            asked_ns: When the device was asked for the image, as :meth:`now_ns`; None: now.
+            asked_ns: Time of the request to the device, on the clock of :meth:`now_ns`; None: now.
             at: Times of the publication; None: now.
 
         Returns:
@@ -507,27 +519,27 @@ class BlockWriter:
 
 
 class QualityChange(Enum):
-    """How a block's quality has changed since the frame before."""
+    """Change of a block's quality since the previous frame."""
 
     NONE = "none"
     DETAIL = "detail"
-    """Another quality or reason, but bad as before, or not bad as before."""
+    """The quality or its reason has changed, but not between bad and not bad."""
     RECOVERED = "recovered"
-    """No longer bad, or not bad from the first frame on."""
+    """The quality is no longer bad, or the first frame is not bad."""
     BAD = "bad"
     GAP = "gap"
-    """Not bad, but the frame before was stale when this one came."""
+    """The quality is not bad, but the previous frame had become stale before this one came."""
 
 
-_BAD: Final = Quality.BAD  # members of an enum are slow to look up, and these are for each frame
+_BAD: Final = Quality.BAD  # looking up an enum's member is slow, and each frame needs these
 _NONE: Final = QualityChange.NONE
 
 
 class FrameFollower(Cursor[Frame]):
-    """Reads a block's frames from the newest one on, and assesses the last one. For one thread.
+    """Reads a block's frames from the newest one on, and tracks the quality. For one thread.
 
-    The caller reads a frame with :meth:`poll`, :meth:`read` or :meth:`newest`, and then calls :meth:`take`.
-    If there is no new frame, it asks whether the last one :meth:`became_stale`.
+    Read a frame with :meth:`poll`, :meth:`read` or :meth:`newest`, then pass it to :meth:`take`. If
+    there is no new frame, call :meth:`became_stale`.
     """
 
     def __init__(self, block: Block, *, catch_up_s: float | None = None, notice_gaps: bool = False) -> None:
@@ -535,8 +547,9 @@ class FrameFollower(Cursor[Frame]):
 
         Args:
             block: The block.
-            catch_up_s: When :meth:`read` is further behind than this time, or than half the ring,
-                it skips to the newest frame, and counts the others as missed. None: it does not.
+            catch_up_s: If :meth:`read` is behind by more than this time, or by more than half the
+                ring, it skips to the newest frame and counts the others as missed. None: it never
+                skips.
             notice_gaps: Whether :meth:`take` reports :attr:`QualityChange.GAP`.
         """
         super().__init__(block.ring, decode_frame, max(0, block.ring.head() - 1), lambda: block.retired)
@@ -546,7 +559,7 @@ class FrameFollower(Cursor[Frame]):
         self.quality = Quality.BAD
         """Quality when the last frame was taken or its age checked."""
         self.reason = "no data yet"
-        """Why the quality is not good; empty if it is."""
+        """Reason why the quality is not good; empty if it is."""
         self._notice_gaps = notice_gaps
         self._most_behind = None
         if catch_up_s is not None:
@@ -554,11 +567,11 @@ class FrameFollower(Cursor[Frame]):
 
     @property
     def stale(self) -> bool:
-        """Whether the last frame is bad only because of its age."""
+        """True if the last frame is bad only because of its age."""
         return self.quality is _BAD and self.frame is not None and self.frame.quality is not _BAD
 
     def read(self, limit: int) -> Iterator[Frame]:
-        """Yield new frames, at most ``limit``; when too far behind, skip to the newest first."""
+        """Yield at most ``limit`` new frames; if too far behind, skip to the newest first."""
         if self._most_behind is not None and self.behind > self._most_behind:
             newest = self._ring.head()
             self.missed += newest - 1 - self._last
@@ -569,7 +582,7 @@ class FrameFollower(Cursor[Frame]):
             yield frame
 
     def newest(self) -> Frame | None:
-        """Return the newest frame, and continue behind it; None: there is none yet.
+        """Return the newest frame, and continue after it; None if there is none yet.
 
         Raises:
             SegmentError: The writer overtook the reader at every attempt to copy.
@@ -580,12 +593,12 @@ class FrameFollower(Cursor[Frame]):
         return frame
 
     def take(self, frame: Frame, *, aged: bool = True) -> QualityChange:
-        """Make a frame the last one, and return how it changes the quality.
+        """Record a frame as the last one, and return the change of the quality.
 
         Args:
             frame: The frame.
-            aged: Whether its quality is that of now, which depends on its age; otherwise it is the
-                one that the frame was published with.
+            aged: Whether to assess its quality now, by its age; otherwise it counts as at
+                publication.
         """
         last, before = self.frame, self.quality
         self.frame = frame
@@ -601,14 +614,14 @@ class FrameFollower(Cursor[Frame]):
         if (
             self._notice_gaps
             and last is not None
-            and frame.number == last.number + 1  # else the frames between may have come in time
+            and frame.number == last.number + 1  # otherwise frames in between may have come in time
             and last.age_ns(frame.publish_ns) > self.block.stale_ns
         ):
             return QualityChange.GAP
         return change
 
     def became_stale(self) -> bool:
-        """Return whether the last frame has become stale since it was taken, once."""
+        """Return True once, after the last frame has become stale."""
         if self.frame is None or self.quality is _BAD:
             return False
         quality, reason = self.block.assess(self.frame)
@@ -618,6 +631,6 @@ class FrameFollower(Cursor[Frame]):
         return True
 
     def restart(self) -> None:
-        """Forget the last frame, and begin with the newest one again."""
+        """Forget the last frame, and start again with the newest one."""
         self._last = max(0, self._ring.head() - 1)
         self.frame, self.quality, self.reason = None, Quality.BAD, "no data yet"

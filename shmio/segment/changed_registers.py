@@ -33,7 +33,7 @@ class ChangeScan:
         """Return the ascending indices of the registers whose bytes differ.
 
         Raises:
-            ValueError: The images differ in size, or do not hold all registers.
+            ValueError: The images differ in size, or are too short for the registers.
         """
         return _atomics.changed(old, new, self._table)
 

@@ -1,11 +1,11 @@
-"""The clock page: the instance's time, the requested step, and the steps that each process has delivered.
+"""The clock page: the instance's time, the requested step, and the delivered steps of processes.
 
-See docs/reference/segment-format.md for the section. The owner of time writes the page, anybody reads
-it. Each process has a doorbell there, which is rung when the page has something for it to do.
+docs/reference/segment-format.md describes its bytes. Only the owner of time writes the page. Each
+process has a doorbell in it, which is rung when the process must act on a change of the page.
 
-When time is released (``Coordinator.release``), real time goes on from the last virtual time, and
-cycles go on from the last step's number, so that neither ever goes back. The page keeps the base of
-both, so that every process, even one that starts later, counts alike:
+When time is released (``Coordinator.release``), real time continues from the last virtual time, and
+cycles continue from the last step's number, so neither ever decreases. The page has the base of
+both. From it, every process, even one that starts later, computes the same:
 
 - clock = CLOCK_MONOTONIC - ``started`` + ``offset_ns``;
 - cycle of a block = clock // period + lead, lead = step - ``resumed_ns`` // period.
@@ -52,7 +52,7 @@ class DoubleBuffer:
     """
 
     def __init__(self, memory: memoryview, copies: tuple[int, int], complaint: str) -> None:
-        """``copies``: offsets of the copies. ``complaint``: message of the error if both are corrupt."""
+        """Take the offsets of the copies, and the message of the error if both are corrupt."""
         self._memory = memory
         self._copies = copies
         self._complaint = complaint
@@ -66,7 +66,7 @@ class DoubleBuffer:
         raise SegmentError(self._complaint)
 
     def write(self, data: bytes) -> None:
-        """Write one copy, then the other. Only the owner may."""
+        """Write one copy, then the other. Only the owner may call this."""
         for at in self._copies:
             _atomics.cell_write(self._memory, at, data)
 
@@ -75,7 +75,18 @@ class ClockPage:
     """The clock page of a segment. Several threads may use it; only the owner of time writes it."""
 
     def __init__(self, memory: memoryview, offset: int, size: int, head: Header, owned: Callable[[], bool]) -> None:
-        """``head``: the segment's header. ``owned``: whether anybody owns time. ValueError: wrong geometry."""
+        """Open the page.
+
+        Args:
+            memory: The mapped segment.
+            offset: Offset of the section.
+            size: Size of the section in bytes.
+            head: The segment's header.
+            owned: Returns whether a process owns time.
+
+        Raises:
+            ValueError: The section does not match the header.
+        """
         slots = head.process_capacity
         if size < page_size(slots) or _word(memory, offset + _SLOTS_AT) != slots:
             raise ValueError("the clock page is too short, or does not have a place for each process")
@@ -92,14 +103,17 @@ class ClockPage:
 
     @staticmethod
     def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int) -> None:
-        """Write the page of a new segment. ``virtual``: time stands still at ``time_ns`` until it is stepped."""
+        """Write the page of a new segment.
+
+        With ``virtual``, time stands still at ``time_ns`` until it is stepped.
+        """
         struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
         state = Clock(ClockMode.VIRTUAL, time_ns=time_ns) if virtual else Clock()
         _cell(memory, offset).write(_pack(state))
 
     @property
     def stepped(self) -> bool:
-        """Whether the configuration makes time virtual from the start."""
+        """True if the configuration makes time virtual from the start."""
         return bool(_word(self._memory, self._offset + _STEPPED_AT))
 
     def read(self) -> Clock:
@@ -116,7 +130,11 @@ class ClockPage:
         return state._replace(time_ns=time.monotonic_ns() - self._started_ns + state.offset_ns)
 
     def last_written(self) -> Clock:
-        """Return the state as last written, even if its writer is dead. SegmentError: the page is corrupt."""
+        """Return the state as last written, even by a dead process.
+
+        Raises:
+            SegmentError: The page is corrupt.
+        """
         data = self._state.read(_STATE.size)
         before, state = self._last
         if data != before:
@@ -125,9 +143,9 @@ class ClockPage:
         return state
 
     def write(self, state: Clock, *, ring: bool = True) -> None:
-        """Write the page and ring its doorbell. Only the owner of time may.
+        """Write the page and ring its doorbell. Only the owner of time may call this.
 
-        ``ring`` is False if the processes that wait have nothing to do yet.
+        Pass ``ring=False`` if no waiting process has to act on the change yet.
         """
         self._state.write(_pack(state))
         if ring:
@@ -136,9 +154,9 @@ class ClockPage:
     def now_ns(self) -> int:
         """Return the present time by which frames on this clock age.
 
-        It is comparable to CLOCK_MONOTONIC, and equal to it in wall time until time is taken over.
+        It is comparable to CLOCK_MONOTONIC. In wall time, both are equal until the first take-over.
         """
-        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # often called
+        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # no more than needed: this is called often
         if not mode:
             offset_ns: int = time_ns - dt_ns
             return time.monotonic_ns() + offset_ns
@@ -162,24 +180,28 @@ class ClockPage:
         return (SIMULATED_UTC_NS if self.stepped else self._started_utc_ns) + since_ns
 
     def slot_bell(self, index: int) -> Doorbell:
-        """Return the doorbell of the process in a slot, rung when the page has something for it to do."""
+        """Return the doorbell that is rung when the process in a slot must act."""
         return Doorbell(self._memory, self._entry(index) + 8)
 
     def delivered(self, index: int) -> int | None:
-        """Return the last step that the process in a slot has delivered; None: it delivers no steps."""
+        """Return the last step that a slot's process has delivered; None if it delivers none."""
         count = _atomics.load64(self._memory, self._entry(index))
         return count - 1 if count else None
 
     def deliver(self, index: int, step: int) -> None:
         """Record that the process in a slot has delivered everything up to this step.
 
-        Only that process may call it. After the first call each step waits for it as long as it lives.
+        Only that process may call it. After its first call, each step waits for it while it is
+        alive.
         """
         _atomics.store64(self._memory, self._entry(index), step + 1)
         self.delivered_bell.ring()
 
     def abstain(self, index: int) -> None:
-        """Let no step wait for the process in a slot until it delivers one. Only that process may call it."""
+        """Stop steps from waiting for the process in a slot until it calls :meth:`deliver` again.
+
+        Only that process may call it.
+        """
         _atomics.store64(self._memory, self._entry(index), 0)
         self.delivered_bell.ring()
 
@@ -188,7 +210,7 @@ class ClockPage:
 
 
 def time_lock(head: Header) -> int:
-    """Return the lock byte of the owner of time: the one after those of the process table."""
+    """Return the lock byte of the owner of time: the next after those of the process table."""
     return head.process_capacity + 1
 
 

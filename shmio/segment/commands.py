@@ -1,9 +1,9 @@
 """Commands to a source, sent from each writer's process through a queue of its own.
 
-A block has one queue for each writer, so that writers never contend, and one doorbell for all queues.
-Only the source decides what is done, and in which order; it reports outcomes in the block's events.
-Readers of the events collect a command's outcomes (:class:`CommandOutcomes`) and what it wrote
-(:class:`CommandAssembler`).
+A block has a queue for each writer, so that writers never contend, and one doorbell for all queues.
+The source decides whether and in which order to execute commands, and reports the outcomes as
+events. From the events, readers collect the outcomes of a command (:class:`CommandOutcomes`) and
+its writes (:class:`CommandAssembler`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from shmio.segment import _atomics
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 WRITERS: Final = 8
-"""Command queues of a block; processes.py assigns them."""
+"""Number of command queues of a block; processes.py assigns them."""
 _MIN_CAPACITY: Final = 1 << 14
 MAX_WRITES: Final = 4096
 """Maximum number of items in a command."""
@@ -39,20 +39,23 @@ _KEEP: Final = 2  # flag beside the direction
 
 
 class CommandKind(IntEnum):
-    """Kind of a command, which also says what its items are."""
+    """Kind of a command. It determines what the command's items mean."""
 
     WRITE = 1
-    """Write the items to the device, or to the injections in between."""
+    """Write the items to the device, or to injections that cover them."""
     INJECT = 2
-    """Lay an injection over the bits that the items' data set; it gets the command's number."""
+    """Lay an injection over the bits that the items' data set.
+
+    Its number is that of the command.
+    """
     SHADOW = 3
-    """Give values to an injection: for consumers if it is over ``/out``, for the device if over ``/in``."""
+    """Give values to an injection: to consumers if it covers ``/out``, to the device if ``/in``."""
     LIFT = 4
     """Lift an injection; there are no items."""
     DECLARE = 5
-    """Lay an injection that the source runs by itself; the single item's data is the declaration in JSON."""
+    """Lay an injection that the source runs by itself; the only item is its declaration in JSON."""
     NOTE = 6
-    """Add the name to the events as a note, whatever the device's state; there are no items."""
+    """Add a note, which is the command's name, to the events; there are no items."""
 
 
 EMPTY: Final = frozenset({CommandKind.LIFT, CommandKind.NOTE})
@@ -81,8 +84,8 @@ class Command:
 
     Attributes:
         writer: Number of the writer's queue.
-        id: The writer's number of the command.
-        incarnation: The source's process that the command is for.
+        id: Number that the writer gave the command.
+        incarnation: Number of the source's process that the command is for.
         deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
         writes: The items.
         kind: Kind of command.
@@ -90,7 +93,8 @@ class Command:
         direction: With INJECT: the direction.
         priority: With INJECT: the priority; the highest is outermost.
         keep: With INJECT: whether the injection outlives its client.
-        name: With INJECT the name of the injection, with NOTE the note; at most MAX_NAME_BYTES in UTF-8.
+        name: With INJECT: the name of the injection. With NOTE: the note. At most MAX_NAME_BYTES in
+            UTF-8.
     """
 
     writer: int
@@ -149,7 +153,7 @@ class Command:
 
 
 def capacity_for(layout_size: int) -> int:
-    """Return a queue's data size in bytes: a power of two with room for the whole block several times."""
+    """Return a queue's data size in bytes: a power of two, several times the size of the block."""
     wanted = max(_MIN_CAPACITY, 4 * layout_size)
     return 1 << (wanted - 1).bit_length()
 
@@ -188,9 +192,9 @@ class CommandQueues:
             raise ValueError("the queues do not fit in the commands section")
 
     def push(self, writer: int, record: bytes) -> bool:
-        """Append a record to a writer's queue and ring the doorbell; returns False if there is no room."""
+        """Append a record to a writer's queue, and ring the doorbell; False: there is no room."""
         taken = _atomics.queue_push(self._memory, self._queue(writer), self.capacity, record)
-        self.wake()  # even if full: the last writer may have died before it rang
+        self.wake()  # even if full: a writer may have died after its push, before it rang
         return taken
 
     def pop(self, writer: int) -> bytes | None:
@@ -206,7 +210,7 @@ class CommandQueues:
         return _atomics.bell(self._memory, self._offset + _BELL_AT)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> None:
-        """Wait until the doorbell differs from ``seen``, at most ``timeout_ns`` (negative: forever)."""
+        """Wait until the doorbell is not ``seen``, at most ``timeout_ns`` (negative: forever)."""
         _atomics.bell_wait(self._memory, self._offset + _BELL_AT, seen, timeout_ns)
 
     def wake(self) -> None:
@@ -220,24 +224,24 @@ class CommandQueues:
 
 
 NO_COMMAND: Final = (0, 0, 0)
-"""The key of no command; see ``Event.command_key``."""
+"""Value of ``Event.command_key`` that stands for no command."""
 
 
 class CommandWrites(NamedTuple):
-    """The writes of one command that went to one injection, or to the device, in the events' order."""
+    """The writes of one command to one injection or to the device, in the order of the events."""
 
     injection: int
     event: Event
-    """The last of the events, which has the time and the writer."""
+    """The last event of these writes, with their time and writer."""
     writes: tuple[Write, ...]
 
 
 class CommandAssembler:
     """Assembles commands from DIVERTED events, or from events of another kind with data.
 
-    Pass it all events of a block, in order. A command is complete when an event of another kind about it
-    follows, or when events of another command begin. Writes without a command (number 0) are complete
-    with their last part.
+    Pass it all events of a block, in order. A command is complete at the next event of another kind
+    about it, or at the first event of another command. Writes without a command (number 0) are
+    complete with their last item.
     """
 
     def __init__(self, kind: EventKind = EventKind.DIVERTED) -> None:
@@ -246,7 +250,7 @@ class CommandAssembler:
         self._parts: dict[int, list[Event]] = {}
 
     def follow(self, event: Event) -> list[CommandWrites]:
-        """Process the next event; returns the commands that it completes."""
+        """Process the next event, and return the commands that it completes."""
         command = event.command_key
         if event.kind != self._kind:
             return self._whole() if command == self._command or event.kind == EventKind.STARTED else []
@@ -267,7 +271,7 @@ class CommandAssembler:
 
 
 End = tuple[EventKind, str]
-"""An item's outcome and its reason: one of ``ENDS``, or ACCEPTED if the command ends with that."""
+"""Outcome of an item, with its reason: one of ``ENDS``, or ACCEPTED (see ``until_accepted``)."""
 
 
 def worst(ends: Sequence[End]) -> End:
@@ -279,7 +283,7 @@ class CommandOutcomes:
     """Collects the outcomes of one command's items."""
 
     def __init__(self, items: int, *, until_accepted: bool = False) -> None:
-        """``until_accepted``: whether acceptance already ends an item."""
+        """With ``until_accepted``, acceptance counts as the outcome of an item."""
         self._items = items
         self._until_accepted = until_accepted
         self._ends: dict[int, End] = {}
@@ -296,7 +300,10 @@ class CommandOutcomes:
         return len(self._ends) == self._items
 
     def of(self, items: Iterable[int], missing: str) -> End:
-        """Return the outcome of a value, which has these items. ``missing``: why one may be unknown."""
+        """Return the outcome of a value with these items.
+
+        ``missing``: the reason if one is unknown.
+        """
         return worst([self._ends.get(item, (EventKind.UNKNOWN, missing)) for item in items])
 
 

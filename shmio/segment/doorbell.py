@@ -9,13 +9,15 @@ from typing import Final, Protocol
 from shmio.segment import _atomics
 
 TURN_NS: Final = 200_000_000
-"""Longest time between two notifications: listeners also check ages, and changes that ring no doorbell."""
+"""Maximum time between two notifications: listeners must also check the age of frames, and changes
+that ring no doorbell.
+"""
 _STOP_AGAIN_S: Final = 0.01
-"""How often :meth:`Relay.join` repeats its request: a thread that is about to wait may miss it."""
+"""Interval at which :meth:`Relay.join` repeats its request, which a thread may miss."""
 
 
 class Doorbell:
-    """A futex word in shared memory; ringing it wakes all that wait. Only ringing needs a writable mapping."""
+    """A futex word in shared memory. Ringing it wakes all waiters, and needs a writable mapping."""
 
     def __init__(self, memory: memoryview, offset: int) -> None:
         self._memory = memory
@@ -26,11 +28,11 @@ class Doorbell:
         return _atomics.bell(self._memory, self._offset)
 
     def ring(self) -> None:
-        """Wake all that wait."""
+        """Wake all waiters."""
         _atomics.bell_ring(self._memory, self._offset)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> int:
-        """Wait until the value differs from ``seen``, at most ``timeout_ns`` (negative: forever).
+        """Wait until the value is not ``seen``, at most ``timeout_ns`` (negative: forever).
 
         Returns:
             The value after the wait.
@@ -38,22 +40,22 @@ class Doorbell:
         return _atomics.bell_wait(self._memory, self._offset, seen, timeout_ns)
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int) -> None:
-        """Run the thread of a :class:`Relay`."""
+        """Signal wake-ups to ``descriptor`` until stopped, in the thread of a :class:`Relay`."""
         _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
 
 
 class WakeSource(Protocol):
-    """A :class:`Doorbell`, or the ring of a block, which has one of its own."""
+    """Source of wake-ups: a :class:`Doorbell`, or a ring of a block, which contains a doorbell."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
-        """Wait for rings and signal the descriptor until stopped, without the interpreter's lock."""
+        """Signal wake-ups to ``descriptor`` until stopped, without the GIL."""
 
 
 class Relay:
-    """Signals the rings of a doorbell through a descriptor.
+    """Signals the rings of a doorbell to an event loop, through a file descriptor.
 
-    A thread that never holds the interpreter's lock waits for the doorbell (``relay.h``). The
-    ``descriptor`` is readable at first, after each ring, and after ``turn_ns`` without one, until
+    A thread waits for the doorbell without the GIL (``relay.h``). The ``descriptor`` becomes
+    readable at first, after each ring, and after ``turn_ns`` without one. It stays so until
     :meth:`heard` is called.
     """
 
@@ -68,11 +70,14 @@ class Relay:
 
     @property
     def alive(self) -> bool:
-        """Whether the thread still runs."""
+        """True if the thread still runs."""
         return self._thread.is_alive()
 
     def heard(self) -> None:
-        """Acknowledge a notification. Call it before you check for changes, so that later rings are signalled."""
+        """Acknowledge a notification.
+
+        Call this before you check for changes: then you miss none.
+        """
         if not self._stopped:  # the descriptor may have been closed and reused
             _atomics.relay_heard(self._shared, self.descriptor)
 
@@ -82,7 +87,7 @@ class Relay:
         _atomics.relay_stop(self._shared)
 
     def join(self) -> None:
-        """Stop, and wait until the thread has ended, which takes less than ``turn_ns``."""
+        """Stop, and wait until the thread has ended, at most ``turn_ns``."""
         while self._thread.is_alive():
             self.stop()
             self._thread.join(_STOP_AGAIN_S)

@@ -1,7 +1,7 @@
 """Events of a block: commands and their outcomes, injections, changes of quality, starts and ends.
 
-An event ring works like a frame ring and has the same writer. An event names the frame before it, and
-a frame the event before it, so that frames and events are in one order.
+An event ring works like a frame ring, and has the same writer. Each event has the number of the
+last frame before it, and each frame that of the last event, so frames and events are in one order.
 """
 
 from __future__ import annotations
@@ -42,25 +42,29 @@ class EventKind(IntEnum):
     UNKNOWN = 9
     """The write was sent, but no answer came."""
     DIVERTED = 10
-    """An injection took these bits, which a writer or an injection further in had given; with data."""
+    """An injection took this data, which came from a writer or from an inner injection."""
     TAKEN = 11
     """Injections took all of the item; nothing was left for the device."""
     INJECTED = 12
-    """An injection was laid; this ends its command, whose number the injection has.
+    """An injection was laid; this ends its command, whose number it has.
 
-    The data is JSON in parts. For a declared injection it is the declaration with the seed in use, for a
-    client's injection ``direction``, ``priority``, ``keep`` and ``ranges``: (offset, size, bits).
+    The data is a part of a JSON document. For a declared injection, the document is the declaration
+    with the seed in use. For others, it has ``direction``, ``priority``, ``keep`` and ``ranges``,
+    which are (offset, size, bits).
     """
     LIFTED = 13
     """An injection was lifted, with the reason; this ends the command that requested it, if any."""
     SHADOWED = 14
-    """An injection gave values, with data; consumers see them since the previous frame."""
+    """An injection gave this data, which the previous frame is the first to show."""
     ACTIVATED = 15
-    """A declared injection became active; over ``/out``, in the previous frame. ``item`` counts activations."""
+    """A declared injection became active; over ``/out``, the previous frame is the first with it.
+
+    ``item`` counts the activations.
+    """
     DEACTIVATED = 16
     """A declared injection is no longer active."""
     NOTED = 17
-    """A note was added, as text; this ends its command."""
+    """A note was added, which is the text; this ends its command."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -82,7 +86,7 @@ ENDS: Final = frozenset(
 )
 """Kinds that end an item; REJECTED ends a whole command."""
 DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN, EventKind.SHADOWED})
-"""Ends of a value that reached its target, or an injection in between."""
+"""Kinds of :data:`ENDS` for a value that reached its target, or was taken by an injection."""
 
 
 class Event(NamedTuple):
@@ -93,15 +97,15 @@ class Event(NamedTuple):
         kind: The :class:`EventKind`; a plain number if this version does not know it.
         frame: Number of the last frame before the event.
         cycle: Cycle of the source's schedule.
-        publish_ns: CLOCK_MONOTONIC.
-        clock_ns: The instance's clock.
-        utc_ns: UTC.
+        publish_ns: CLOCK_MONOTONIC at publication, or a comparable time in virtual time.
+        clock_ns: The instance's clock at publication, in ns.
+        utc_ns: UTC at publication, in ns.
         incarnation: Number of the source's process.
         quality: Quality after the event.
-        writer: The command queue that the event is about, or NO_WRITER.
-        command: The writer's number of the command.
+        writer: Number of the command queue that the command came from, or NO_WRITER.
+        command: Number that the writer gave the command; 0: none.
         item: The first item of the command that the event is about.
-        items: How many of the command's items the event is about.
+        items: Number of the command's items that the event is about.
         offset: Offset of the first item's write.
         mask: Mask of the first item's write; 0: whole bytes.
         size: Size of the first item's write in bytes.
@@ -132,7 +136,7 @@ class Event(NamedTuple):
 
     @property
     def command_key(self) -> tuple[int, int, int]:
-        """Identifies the command among all of the block: the source's process, the writer, and the number."""
+        """Unique key of the command in its block: incarnation, writer and number."""
         return self.incarnation, self.writer, self.command
 
 

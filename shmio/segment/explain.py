@@ -1,4 +1,7 @@
-"""Explain events: name their registers, values, direction and writer. Loads numpy, so import it late."""
+"""Explain events: name their registers, values, direction and writer.
+
+This module loads numpy, which takes time, so import it only when needed.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from shmio.segment.events import EVENT_DATA_SIZE, NO_WRITER, Event, EventKind
 from shmio.segment.processes import GUEST_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096
-"""Limit on unfinished commands, and on injections, whose first event is kept."""
+"""Maximum number of unfinished commands, and of injections, that an explainer remembers."""
 MAX_LAID_BYTES: Final = 1 << 16
 
 _INWARD: Final = frozenset(
@@ -33,7 +36,7 @@ _INWARD: Final = frozenset(
         EventKind.REJECTED,
     }
 )
-"""Results of writes, including writes of values that an injection over ``/in`` generates."""
+"""Kinds about writes to the device, including those of injections over ``/in``."""
 _WITH_VALUES: Final = frozenset({EventKind.ACCEPTED, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_WRITES: Final = frozenset({*_INWARD, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_INJECTIONS: Final = frozenset(
@@ -43,7 +46,7 @@ _ROLES: Final = {writer: name for name, writer in WRITERS.items()}
 
 
 class Place(NamedTuple):
-    """A register, an element, a slice or a part, with its full path, and its value if known."""
+    """A register or a part of one, with its full path, and with its value if known."""
 
     path: str
     register: Register
@@ -57,7 +60,7 @@ class Place(NamedTuple):
 
     @property
     def plain(self) -> Any:
-        """The value for JSON."""
+        """The value in a form that JSON can encode."""
         return json_value(self.value, self.register.element)
 
 
@@ -67,9 +70,9 @@ class Explained(NamedTuple):
     Attributes:
         places: The registers that the event concerns.
         direction: ``in``, ``out`` or empty.
-        by: Who caused the event: grpc, mqtt or a program; empty if nobody did, or it is unknown.
-        laid: Definition of an injection that starts, with the last of its events; else None.
-        partial: Whether more events of the definition follow.
+        by: The event's cause: grpc, mqtt or a program; empty if there is none or it is unknown.
+        laid: Definition of the injection that was laid, with the last event of the definition.
+        partial: True if the event is part of a definition, and further parts follow.
     """
 
     places: tuple[Place, ...]
@@ -88,12 +91,12 @@ class Explainer:
     """Explains the events of one block, in their order."""
 
     def __init__(self, source: str, layout: Layout | None, most: int | None = None) -> None:
-        """Begin without known injections.
+        """Start without known injections.
 
         Args:
             source: Name of the source.
-            layout: The block's layout; None if it cannot be read, and registers stay unnamed.
-            most: The most registers that are named of an event; None: all.
+            layout: The block's layout; None if it cannot be read. Then no registers are named.
+            most: Maximum number of registers to name for an event; None: all.
         """
         self._source = source
         self._layout = layout
@@ -102,19 +105,19 @@ class Explainer:
         self._documents: dict[int, bytes] = {}
         self._under_way: dict[tuple[int, int, int], dict[int, list[Place]]] = {}
         self._gone: frozenset[int] = frozenset()
-        """Known injections that were lifted no later than by event ``_gone_at``."""
+        """Injections that event ``_gone_at``, or one before it, has lifted."""
         self._gone_at = 0
 
     def know(self, present: Iterable[Injection[Any]]) -> None:
-        """Take the injections that were laid before the next event."""
+        """Remember injections that were laid before the next event."""
         for one in present:
             if one.number not in self._injections and len(self._injections) < MAX_REMEMBERED:
-                # Of a declared one, the event that lays it does not name the registers either.
+                # The event of a declared injection names no registers, so none are named here.
                 places = self._over(one.ranges) if one.running is None else ()
                 self._injections[one.number] = _Injection(one.direction, places)
 
     def resume(self, present: Sequence[Injection[Any]], newest: int) -> None:
-        """Go on after lost events, among which may be ends of commands and injections.
+        """Continue after a loss of events, which may have ended commands or injections.
 
         Args:
             present: The injections that are laid now.
@@ -128,11 +131,11 @@ class Explainer:
 
     def explain(self, event: Event) -> Explained:
         """Explain the next event."""
-        if self._gone and event.number > self._gone_at:  # their ends, if they were not lost, have been explained
+        if self._gone and event.number > self._gone_at:  # by now, their LIFTED events have been explained, or were lost
             for number in self._gone:
                 self._injections.pop(number, None)
             self._gone = frozenset()
-        if event.kind == EventKind.STARTED:  # nobody ends the commands of the process before
+        if event.kind == EventKind.STARTED:  # commands to the previous process get no further events
             for key in [key for key in self._under_way if key[0] != event.incarnation]:
                 del self._under_way[key]
         laid = self._laid(event) if event.kind == EventKind.INJECTED else None
@@ -142,7 +145,7 @@ class Explainer:
             direction = known.direction if known else ""
         elif event.kind in _INWARD and event.size:  # without a size, it is not about a write
             direction = "in"
-        elif event.kind == EventKind.SHADOWED:  # values over /in have events of writes
+        elif event.kind == EventKind.SHADOWED:  # values over /in have the events of writes instead
             direction = "out"
         if event.kind in _OF_WRITES:
             places = self._of_command(event)
@@ -182,7 +185,7 @@ class Explainer:
             known += (place._replace(value=None, valued=False) for place in self._at_most(places, known))
 
     def _at_most(self, places: Sequence[Place], before: Sequence[Place]) -> Sequence[Place]:
-        """Return the places that may still be named behind those before."""
+        """Return those places that may be named in addition to those before."""
         return places if self._most is None else places[: self._most - len(before)]
 
     def _places(self, offset: int, size: int, mask: int, data: bytes = b"") -> tuple[Place, ...]:
@@ -211,7 +214,7 @@ class Explainer:
     # ---- injections --------------------------------------------------------------------------------------------------
 
     def _laid(self, event: Event) -> dict[str, Any] | None:
-        """Return an injection's definition once all its parts have come, and remember its places."""
+        """Return an injection's definition once it is complete, and remember its places."""
         document = (self._documents.pop(event.injection, b"") if event.offset else b"") + event.data
         try:
             laid = msgspec.json.decode(document, type=dict[str, Any])
@@ -258,7 +261,7 @@ def by(writer: int) -> str:
 
 
 ABOUT: Final = ("path", "value", "direction", "by")
-"""Columns of what an event is about, in tables."""
+"""Columns of a table of events that say what an event is about; see :func:`cells_of`."""
 
 
 def kind_of(event: Event) -> str:
@@ -270,7 +273,7 @@ def kind_of(event: Event) -> str:
 
 
 def object_of(event: Event, explained: Explained) -> dict[str, Any]:
-    """Return what an event is about as an object for JSON, with ``data`` in hexadecimal digits."""
+    """Return what an event is about as an object for JSON; ``data`` is in hexadecimal digits."""
     places = explained.places
     return {
         "by": explained.by,

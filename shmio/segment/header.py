@@ -89,7 +89,7 @@ class Header:
         """Write everything except the magic, which :func:`finish` writes last."""
         packed = _HEADER.pack(
             0, ABI_VERSION, HEADER_SIZE, self.epoch, self.size, self.started_utc_ns, self.started_ns,
-            0, 0,  # generation and section count, see write_section
+            0, 0,  # generation and section count, see change_sections
             self.sections_offset, self.section_capacity, SECTION_SIZE,
             self.processes_offset, self.process_capacity, SLOT_SIZE, 0,
             self.mode.encode(), self.instance.encode(), self.version.encode(), self.control.encode(),
@@ -127,7 +127,7 @@ class Header:
             and HEADER_SIZE <= processes <= len(memory) - process_capacity * SLOT_SIZE
         )
         if not sound:
-            raise FormatError(f"{name}: the header contradicts itself")
+            raise FormatError(f"{name}: the header is inconsistent")
         return cls(
             epoch, size, utc_ns, started_ns, sections, section_capacity, processes, process_capacity,
             text(mode), text(instance), text(version), text(control),
@@ -138,7 +138,8 @@ class Header:
 class SectionEntry:
     """An entry of the section table.
 
-    ``layout`` is the index of the block's layout section; a section of no block has its own index there.
+    ``layout`` is the index of the block's layout section. A section without a block has its own
+    index.
     """
 
     kind: int
@@ -153,10 +154,10 @@ class SectionEntry:
 def change_sections(
     memory: memoryview, header: Header, append: Sequence[SectionEntry], retire: Sequence[int] = ()
 ) -> None:
-    """Append entries to the section table, then retire others, given by index.
+    """Append entries to the section table, then retire others, which are given by index.
 
-    Readers see all new entries before any old one is retired. Of two blocks with one name the later
-    one counts.
+    Readers see all new entries before any old one is retired. If two blocks have the same name, the
+    later one is in use.
 
     Raises:
         FormatError: The table has no room.
@@ -178,20 +179,20 @@ def change_sections(
 
 
 def table_state(memory: memoryview) -> tuple[int, int]:
-    """Return the table's generation, which changes with the table, and the number of complete entries."""
+    """Return the table's generation, which each change increases, and its number of entries."""
     word = _atomics.load64(memory, GENERATION_OFFSET)
     return word & 0xFFFFFFFF, word >> 32
 
 
 def retired(memory: memoryview, header: Header, index: int) -> bool:
-    """Whether an entry is retired."""
+    """Return whether an entry is retired."""
     return _atomics.load64(memory, header.sections_offset + index * SECTION_SIZE) & _RETIRED != 0
 
 
 def read_sections(memory: memoryview, header: Header, count: int, name: str) -> list[SectionEntry]:
-    """Read the first ``count`` entries, and check that they lie within the object."""
+    """Read the first ``count`` entries. FormatError: one is not within the segment."""
     if count > header.section_capacity:
-        raise FormatError(f"{name}: more sections than the table holds")
+        raise FormatError(f"{name}: more sections than the table has room for")
     entries = []
     for index in range(count):
         kind, flags, offset, size, layout, _, label, digest = _SECTION.unpack_from(
@@ -225,7 +226,7 @@ def read_config(memory: memoryview) -> Path | None:
 
 
 def has_config(memory: memoryview, file: Path) -> bool:
-    """Whether the instance was started from this configuration file."""
+    """Return whether the instance was started from this configuration file."""
     return memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE] == _config_field(file)
 
 
@@ -234,7 +235,7 @@ def _config_field(file: Path) -> bytes:
 
 
 def write_supervised_since(memory: memoryview, since_ns: int) -> None:
-    """Write the supervisor's start time, if it differs from the zero of the instance's clock."""
+    """Write the supervisor's start time. It is needed only if clock 0 is another time."""
     _atomics.store64(memory, SUPERVISED_SINCE_OFFSET, since_ns)
 
 

@@ -1,7 +1,8 @@
 """The channel between a source and its remote model: requests for steps, and their answers.
 
-See docs/reference/segment-format.md for the section. The source's process writes requests. The process
-to which the model is connected holds the channel's lock, names the model, and writes the answers.
+docs/reference/segment-format.md describes its section. The source's process writes requests. The
+process to which the model is connected keeps the channel's lock, and writes the model's name and
+its answers.
 """
 
 from __future__ import annotations
@@ -40,7 +41,10 @@ class ModelPorts(NamedTuple):
 
 
 class ConnectedModel(NamedTuple):
-    """A connected model. ``number`` counts connections from 1; ``pid``: the process that writes for it."""
+    """A connected model.
+
+    ``number`` counts the connections from 1. ``pid`` is the process that writes the answers.
+    """
 
     number: int
     pid: int
@@ -56,7 +60,7 @@ class ModelRequest(NamedTuple):
         time_ns: The instance's clock after the step.
         dt_ns: Length of the step.
         until_ns: CLOCK_MONOTONIC at which the source stops waiting.
-        doubt: Why inputs may be wrong; empty: they are not.
+        doubt: Reason why inputs may be wrong; empty: they are right.
         commanded: The image with the model's inputs.
         shown: The image with the outputs so far.
     """
@@ -72,7 +76,10 @@ class ModelRequest(NamedTuple):
 
 
 class ModelAnswer(NamedTuple):
-    """The answer to a request. ``image`` has the outputs; with a ``failure`` it is void."""
+    """The answer to a request.
+
+    ``image`` has the outputs; it is not used if there is a ``failure``.
+    """
 
     image: bytes
     failure: str | None
@@ -112,7 +119,7 @@ def _named(layout: Layout, key: str, patterns: Sequence[str]) -> set[int]:
 
 
 def section(ring_header: bytes, slot_bytes: int) -> tuple[int, bytes]:
-    """Return size and first bytes of a new section, whose two rings have this header."""
+    """Return size and first bytes of a new section; ``ring_header`` is that of both its rings."""
     ring_size = _atomics.RING_HEADER_SIZE + SLOTS * slot_bytes
     begin = _SIZE.pack(ring_size).ljust(_RINGS_AT, b"\0") + ring_header.ljust(ring_size, b"\0") + ring_header
     return _RINGS_AT + 2 * ring_size, begin
@@ -142,7 +149,7 @@ class ModelChannel:
         return self.asked.frame_size
 
     def model(self) -> ConnectedModel | None:
-        """Return the connected model, as other processes see it; None: there is none, or its process died."""
+        """Return the model that another process has connected; None if none has, or it has died."""
         return self._read() if self._shared.locked(self._lock_byte) else None
 
     def _read(self) -> ConnectedModel:
@@ -153,14 +160,14 @@ class ModelChannel:
         return ConnectedModel(number, pid, text(name))
 
     def computed(self) -> bool:
-        """Whether any model, this one or an earlier one, has done a step."""
+        """True if a model has done a step: the connected one or an earlier one."""
         data = _atomics.cell_read(self._memory, self._offset + _JOINED_AT, _JOINED.size)
         return data is not None and _JOINED.unpack(data)[1] == _COMPUTED
 
-    # ---- the source's part ---------------------------------------------------------------------------------------
+    # ---- for the source's process --------------------------------------------------------------------------------
 
     def ask(self, ask: ModelRequest, publish_ns: int) -> int:
-        """Request a step; returns the request's number. ``publish_ns``: time of the frame."""
+        """Request a step, and return the request's number. ``publish_ns``: time of the frame."""
         return self.asked.publish(
             ask.commanded, ask.shown, ask.step, publish_ns, ask.time_ns, ask.until_ns,
             Quality.UNCERTAIN if ask.doubt else Quality.GOOD, Provenance.SIMULATED, ask.dt_ns, 0,
@@ -168,17 +175,17 @@ class ModelChannel:
         )  # fmt: skip
 
     def answer_to(self, number: int) -> ModelAnswer | None:
-        """Return the answer to a request if it is the newest one, so that no late answer is used."""
+        """Return the newest answer if it is to this request: a late answer is never used."""
         fields = self.answered.latest()
         if fields is None or fields[8] != number:
             return None
         failed = fields[6] != Quality.GOOD
         return ModelAnswer(fields[11], fields[10] if failed else None)
 
-    # ---- the part of the process that writes for the model ---------------------------------------------------------
+    # ---- for the process that writes the model's answers -----------------------------------------------------------
 
     def join(self, name: str) -> bool:
-        """Take the channel for a model; returns False if another process has it."""
+        """Lock the channel for a model; return False if another process has locked it."""
         if not self._shared.try_lock(self._lock_byte):
             return False
         self._write(ConnectedModel(self._read().number + 1, os.getpid(), name), _COMPUTED if self.computed() else 0)
@@ -205,7 +212,10 @@ class ModelChannel:
         )
 
     def answer(self, ask: ModelRequest, now_ns: int, image: bytes | bytearray, failure: str | None = None) -> None:
-        """Answer a request. ``failure``: why it failed; ``now_ns``: CLOCK_MONOTONIC."""
+        """Answer a request.
+
+        ``failure``: the reason if the step failed; ``now_ns``: CLOCK_MONOTONIC.
+        """
         if failure is None and not self.computed():
             self._write(self._read(), _COMPUTED)
         self.answered.publish(

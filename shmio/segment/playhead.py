@@ -1,8 +1,8 @@
 """The playhead of a block that replays a recording: its position, and requests to move it.
 
-See docs/reference/segment-format.md for the section. The source's process writes the state. A program
-that wants to move the playhead takes the section's lock, writes a request, and waits for the answer.
-A position is a time of the recorded instance's clock, in ns since its start.
+docs/reference/segment-format.md describes its section. The source's process writes the state. To
+move the playhead, a program takes the section's lock, writes a request, and waits for the answer. A
+position is a time of the recorded instance's clock, in ns since its start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
 
 OWN_WORDS: Final = "replay: "
-"""Prefix of a replay's own reasons and event texts; those without it were recorded."""
+"""Prefix of the reasons and event texts that a replay creates. Recorded ones have no prefix."""
 MIN_SPEED: Final = 0.01
 MAX_SPEED: Final = 1000.0
 
@@ -50,21 +50,22 @@ class PlayState(NamedTuple):
     Attributes:
         begin_ns: Start of the played range.
         end_ns: End of the played range, exclusive.
-        anchor_ns: The instance's clock at which the position was ``position_ns``.
-        position_ns: Position at the anchor; from there it moves at ``speed`` times the clock.
+        anchor_ns: A time of the instance's clock, the anchor.
+        position_ns: Position at the anchor, from which it moves ``speed`` times as fast as the
+            clock.
         until_ns: Position at which the replay stops.
-        base_ns: Publish time of position 0.
+        base_ns: Publish time of position 0, comparable to CLOCK_MONOTONIC.
         utc_ns: UTC of position 0.
         speed: Speed relative to the instance's clock.
-        paused: Whether it is paused.
-        loop: Whether it starts again at the end.
-        own_clock: Whether frames have the clock of the recording, or that of the instance.
-        over: Whether the end was reached.
-        step: The last step of virtual time that was answered.
+        paused: True while the replay is paused.
+        loop: True if the replay starts again at the end.
+        own_clock: True if frames have the recorded clock, False if they have the instance's.
+        over: True if the replay has reached its end.
+        step: Number of the last answered step of virtual time.
         asked: Number of the last request that was answered.
         answer: The answer to that request.
-        begun: The last step of virtual time that was begun.
-        head: Number of the newest frame when that step was begun.
+        begun: Number of the last step of virtual time that the source has begun.
+        head: Number of the newest frame when it began that step.
     """
 
     begin_ns: int
@@ -86,7 +87,7 @@ class PlayState(NamedTuple):
     head: int = 0
 
     def reach_ns(self, clock_ns: int) -> int:
-        """Return the position at a time of the instance's clock, ignoring the end."""
+        """Return the position at a time of the instance's clock as if the recording had no end."""
         if self.paused or clock_ns <= self.anchor_ns:
             return self.position_ns
         passed_ns = clock_ns - self.anchor_ns
@@ -94,7 +95,7 @@ class PlayState(NamedTuple):
 
     @property
     def wraps(self) -> bool:
-        """Whether the replay starts again when it reaches the end."""
+        """True if the replay starts again when it reaches the end."""
         return self.loop and self.until_ns >= self.end_ns
 
     def at_ns(self, clock_ns: int) -> int:
@@ -105,10 +106,10 @@ class PlayState(NamedTuple):
         return min(reach_ns, self.until_ns)
 
     def due_ns(self, position_ns: int) -> int:
-        """Return the first time of the instance's clock at which a position ahead is reached."""
+        """Return the time of the instance's clock at which a later position is first reached."""
         ahead_ns = position_ns - self.position_ns
         clock_ns = self.anchor_ns + (ahead_ns if self.speed == 1 else math.ceil(ahead_ns / self.speed))
-        while not self.paused and self.reach_ns(clock_ns) < position_ns:  # by a rounding
+        while not self.paused and self.reach_ns(clock_ns) < position_ns:  # rounding has made it too early
             clock_ns += 1
         return clock_ns
 
@@ -117,7 +118,7 @@ class PlayState(NamedTuple):
         return self._replace(anchor_ns=self.due_ns(self.end_ns), position_ns=self.begin_ns)
 
     def settled(self, clock_ns: int) -> PlayState:
-        """Return the state after all finished rounds, paused if it has reached its stop."""
+        """Return the state after all finished rounds; paused if ``until_ns`` has been reached."""
         reach_ns = self.reach_ns(clock_ns)
         if self.paused or reach_ns < self.until_ns:
             return self
@@ -128,11 +129,11 @@ class PlayState(NamedTuple):
         return self.anchored(clock_ns)._replace(paused=True, until_ns=self.end_ns)
 
     def anchored(self, clock_ns: int) -> PlayState:
-        """Return the same state with another anchor."""
+        """Return the same state with the anchor at this time of the instance's clock."""
         return self._replace(anchor_ns=clock_ns, position_ns=self.at_ns(clock_ns))
 
     def moved_as(self, other: PlayState) -> PlayState:
-        """Return the state with the movement of another replay of the same recording."""
+        """Return this state with position, speed and pauses of another replay."""
         return self._replace(
             anchor_ns=other.anchor_ns,
             position_ns=other.position_ns,
@@ -145,9 +146,9 @@ class PlayState(NamedTuple):
 
 
 class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
-    """A request to change a replay from ``clock_ns`` of the instance's clock on. None: no change.
+    """A request to change a replay at time ``clock_ns`` of the instance's clock. None: no change.
 
-    ``until_ns``: position at which to pause once; with a ``position_ns``, None means the end.
+    The replay pauses once at the position ``until_ns``. With a ``position_ns``, None means the end.
     """
 
     clock_ns: int
@@ -159,7 +160,7 @@ class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_d
 
 
 class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_defaults=True):
-    """A request for the first position after ``after_ns`` with a change of a register or an event of a kind."""
+    """A request to find the first change of a register, or event of a kind, after ``after_ns``."""
 
     after_ns: int
     path: str = ""
@@ -167,7 +168,10 @@ class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_d
 
 
 class PlayheadAnswer(msgspec.Struct, omit_defaults=True):
-    """The answer to a request. ``error``: why it was not done; ``position_ns``: the position found, if any."""
+    """The answer to a request.
+
+    ``error`` is the reason for a failure, ``position_ns`` a found position.
+    """
 
     error: str = ""
     position_ns: int | None = None
@@ -213,24 +217,24 @@ class Playhead:
         )  # fmt: skip
 
     def now_ns(self) -> int:
-        """Return the present time by which the block's frames age: the position as a publish time."""
+        """Return the present time by which frames age: the publish time of the position."""
         play = self.read()
         return time.monotonic_ns() if play is None else play.base_ns + play.at_ns(self._clock.present_ns())
 
     def came_now(self, number: int) -> bool:
-        """Whether a frame was published in the present step of virtual time."""
+        """Return whether a frame was published in the present step of virtual time."""
         play, state = self.read(), self._clock.last_written()
         return play is not None and state.stepping and play.begun == state.step and number > play.head
 
     def clock_ns(self, publish_ns: int) -> int:
-        """Return the instance's clock for an entry that is published now with this publish time."""
+        """Return the clock with which to publish an entry of this publish time now."""
         play = self.read()
         return self._clock.present_ns() if play is None or not play.own_clock else publish_ns - play.base_ns
 
-    # ---- the source's part ---------------------------------------------------------------------------------------
+    # ---- for the source's process --------------------------------------------------------------------------------
 
     def write(self, play: PlayState) -> None:
-        """Write the state. Only the source's process may."""
+        """Write the state. Only the source's process may call this."""
         flags = _VALID | (_PAUSED * play.paused) | (_LOOP * play.loop) | (_OWN_CLOCK * play.own_clock)
         data = _STATE.pack(
             flags | (_OVER * play.over), 0, play.begin_ns, play.end_ns, play.anchor_ns, play.position_ns,
@@ -240,7 +244,10 @@ class Playhead:
         self._state.write(data)
 
     def asks(self, answered: int) -> tuple[int, PlayheadRequest | None] | None:
-        """Return number and content of a request newer than ``answered``, if any. Invalid content is None."""
+        """Return number and content of the last request unless its number is ``answered``.
+
+        The content is None if it is invalid.
+        """
         asked = self._asked()
         if asked is None or asked[0] == answered:
             return None
@@ -266,20 +273,28 @@ class Playhead:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Hold the lock for requests. CommandError: another program does not release it."""
+        """Lock the section for requests.
+
+        Raises:
+            CommandError: Another program does not release the lock.
+        """
         with self._turn:
             until_s = time.monotonic() + _LOCK_S
             while not self._shared.try_lock(self._lock_byte):
                 if time.monotonic() > until_s:
                     raise CommandError("another program is moving this recording: try again when it is done")
-                time.sleep(_LOCK_TURN_S)  # rare, and its release rings no doorbell
+                time.sleep(_LOCK_TURN_S)  # the release of a lock rings no doorbell
             try:
                 yield
             finally:
                 self._shared.unlock(self._lock_byte)
 
     def ask(self, ask: PlayheadRequest) -> int:
-        """Write a request, with the lock held; returns its number. The caller rings the source's doorbell."""
+        """Write a request, and return its number.
+
+        The caller has the lock, and afterwards rings the source's doorbell. CommandError: the
+        request is too long.
+        """
         document = msgspec.json.encode(ask)
         if len(document) > _MAX_ASK:
             raise CommandError("the request is too long")
@@ -300,6 +315,6 @@ class Playhead:
 
 
 def with_answer(play: PlayState, number: int, found: PlayheadAnswer) -> PlayState:
-    """Return the state with the answer to a request."""
+    """Return the state with an added answer to a request."""
     found = PlayheadAnswer(cut(found.error, _MAX_ERROR).decode(), found.position_ns)
     return play._replace(asked=number, answer=msgspec.json.encode(found).decode())

@@ -1,7 +1,8 @@
 """The process table: the instance's processes, their state and counters.
 
-The supervisor writes a slot's name, kind, digest and its own cell; the worker writes its heartbeat and
-its cell. Anybody may read. A worker holds an OS lock on its slot for life, so that its death is certain.
+The supervisor writes a slot's name, kind, digest and one cell. The worker writes its heartbeat and
+the other cell, and locks its slot. The kernel releases the lock when the worker dies, so its death
+is always noticed.
 """
 
 from __future__ import annotations
@@ -41,10 +42,16 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 GUEST_SLOTS: Final = 4
-"""Slots for other programs that write: the last ones of the table, with the first command queues."""
+"""Number of slots for other programs that write.
+
+They are the last slots of the table, and have the first command queues.
+"""
 
 WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5}
-"""The command queue of each process of the instance that writes, by its name, which is its kind."""
+"""Command queue of each process of the instance that sends commands, by its name.
+
+The name of such a process equals its kind.
+"""
 
 
 class Phase(IntEnum):
@@ -71,20 +78,20 @@ class Activity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """A process of the instance. ``kind``: source, emulator, grpc, mqtt or recorder."""
+    """A process of the instance. Its ``kind`` is source, emulator, grpc, mqtt or recorder."""
 
     name: str
     kind: str
 
     @property
     def writer(self) -> int | None:
-        """The process's command queue; None if it writes nothing, like the broker, which is of kind mqtt."""
+        """Command queue of the process; None if it sends no commands, as the MQTT broker."""
         return WRITERS.get(self.kind) if self.name == self.kind else None
 
 
 @dataclass(frozen=True, slots=True)
 class Supervised:
-    """The supervisor's part of a slot. ``note`` says why the process is not running."""
+    """The supervisor's part of a slot. ``note`` has the reason if the process is not running."""
 
     phase: Phase = Phase.STOPPED
     restarts: int = 0
@@ -94,7 +101,10 @@ class Supervised:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The worker's part of a slot. :data:`COUNTERS` names the counters; ``note`` describes a problem."""
+    """The worker's part of a slot.
+
+    :data:`COUNTERS` names the counters; ``note`` describes a problem.
+    """
 
     pid: int = 0
     activity: Activity = Activity.NONE
@@ -116,11 +126,11 @@ class ProcessSlot:
         self.name = text(name)
         self.kind = text(kind)
         self.writer: int | None = writer - 1 if writer else None
-        """The command queue that this process fills, in every block; None: it writes nothing."""
+        """Number of the process's command queue in every block; None: it sends no commands."""
 
     @property
     def digest(self) -> bytes:
-        """SHA-256 of the settings that the process was started from; zeros before the first start."""
+        """SHA-256 of the settings of the process at its start; zeros before the first start."""
         at = self._offset + _DIGEST_AT
         return bytes(self._memory[at : at + _DIGEST_SIZE])
 
@@ -145,7 +155,10 @@ class ProcessSlot:
 
     @property
     def report(self) -> Report:
-        """The worker's part, as last written; its predecessor's until a new worker has started."""
+        """The worker's part, as last written.
+
+        Until a new worker has started, it is the previous one's.
+        """
         data = _atomics.cell_read(self._memory, self._offset + _REPORT_AT, _REPORT.size)
         if data is None:
             return Report()
@@ -165,7 +178,7 @@ class ProcessSlot:
 
     @property
     def heartbeat_ns(self) -> int:
-        """CLOCK_MONOTONIC of the worker's last heartbeat; 0 before the first."""
+        """CLOCK_MONOTONIC of the worker's last heartbeat, in ns; 0 before the first."""
         return _atomics.load64(self._memory, self._offset + _HEARTBEAT_AT)
 
     def beat(self) -> None:
@@ -173,11 +186,11 @@ class ProcessSlot:
         _atomics.store64(self._memory, self._offset + _HEARTBEAT_AT, time.monotonic_ns())
 
     def take(self) -> bool:
-        """Take the slot's lock for life; returns False if another process holds it."""
+        """Lock the slot until this process ends; return False if another process has locked it."""
         return self._shared.try_lock(self.index + 1)
 
     def alive(self) -> bool:
-        """Whether another holder has the slot's lock."""
+        """Return whether another process, or another segment object, has locked the slot."""
         return self._shared.locked(self.index + 1)
 
 
@@ -213,7 +226,13 @@ class ProcessTable(Sequence[ProcessSlot]):
             )
 
     def add(self, spec: ProcessSpec) -> ProcessSlot:
-        """Assign a vacant slot to a process. Only the supervisor may. SegmentError: there is none."""
+        """Assign a vacant slot to a process.
+
+        Only the supervisor may call this.
+
+        Raises:
+            SegmentError: No slot is vacant.
+        """
         self.require(1)
         taken = {slot.index for slot in (*self._slots, *self.guests)}
         index = next(i for i in range(self._header.process_capacity) if i not in taken)
@@ -227,7 +246,7 @@ class ProcessTable(Sequence[ProcessSlot]):
         return slot
 
     def remove(self, slot: ProcessSlot) -> None:
-        """Vacate the slot of a process that has ended. Only the supervisor may."""
+        """Vacate the slot of a process that has ended. Only the supervisor may call this."""
         at = self._header.processes_offset + slot.index * SLOT_SIZE
         self._memory[at : at + _NAME_SIZE] = bytes(_NAME_SIZE)  # first: a slot without a name is not read
         slot.supervised, slot.report, slot.digest = Supervised(), Report(), bytes(_DIGEST_SIZE)
@@ -244,7 +263,7 @@ class ProcessTable(Sequence[ProcessSlot]):
         return iter(self._slots)
 
     def find(self, name: str) -> ProcessSlot:
-        """Return the slot with this name; KeyError."""
+        """Return the slot with this name; KeyError if there is none."""
         for slot in self._slots:
             if slot.name == name:
                 return slot

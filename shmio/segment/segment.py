@@ -40,7 +40,7 @@ from shmio.segment.standing_injections import CELL_SIZE, declared_cell, standing
 from shmio.version import __version__
 
 PREFIX = "shmio-"
-"""What the name of each segment begins with."""
+"""Prefix of the name of each segment."""
 
 
 def _align(size: int, to: int) -> int:
@@ -49,13 +49,16 @@ def _align(size: int, to: int) -> int:
 
 
 _RING_SECONDS = 8
-_SECTIONS_PER_BLOCK = 8  # of a block that has every kind
+_SECTIONS_PER_BLOCK = 8  # of a block with every kind of section
 _SPARE_SECTIONS = 40 * _SECTIONS_PER_BLOCK
-_OWN_SECTIONS = 1  # of the instance: the clock page
+_OWN_SECTIONS = 1  # sections of no block: the clock page
 _SPARE_PROCESSES = 16 + GUEST_SLOTS
 _EVENT_STRIDE = _align(_atomics.RAW_OFFSET + EVENT_SIZE, 64)
 _FIRST_LINK = 2
-"""Offset of the lock byte of a block's model channel or playhead: process slots + this + index of its layout."""
+"""Number that determines the lock byte of a block's model channel or playhead.
+
+The lock byte is the number of process slots + this number + the index of the layout section.
+"""
 
 _RING = struct.Struct("<8Iqq")
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
@@ -63,9 +66,9 @@ _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: buil
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """The time with which an instance starts that replays a recording.
+    """Start time of an instance that replays a recording.
 
-    ``clock_ns``: the clock at the start. ``started_utc_ns``: UTC of clock 0.
+    ``clock_ns`` is the instance's clock at the start, ``started_utc_ns`` the UTC of clock 0.
     """
 
     clock_ns: int
@@ -81,19 +84,22 @@ class BlockSpec:
     period_ns: int
     stale_ns: int
     ring_bytes: int
-    """Maximum size of the frame ring."""
+    """Maximum size of the frame ring, in bytes."""
     attributes: Attributes = field(default_factory=Attributes)
     declared: bytes = b""
     """The declared injections, as a JSON document of at most STANDING_SIZE bytes."""
 
     @property
     def slot_bytes(self) -> int:
-        """Bytes of one slot: header, reason, raw image and effective image."""
+        """Size of one slot in bytes: header, reason, raw image and effective image."""
         return _align(_atomics.RAW_OFFSET + 2 * _align(self.layout.size, 8), 64)
 
     @property
     def slots(self) -> int:
-        """Number of frames in the ring: 8 s, rounded up to a power of two, within the memory limit; at least 8."""
+        """Number of frames in the ring: a power of two, at least 8.
+
+        It is enough for 8 s, unless the memory limit allows less.
+        """
         wanted = max(8, _RING_SECONDS * 1_000_000_000 // self.period_ns)
         slots: int = 1 << (wanted - 1).bit_length()
         while slots > 8 and slots * self.slot_bytes > self.ring_bytes:
@@ -102,7 +108,7 @@ class BlockSpec:
 
     @property
     def size(self) -> int:
-        """Bytes of all sections of the block."""
+        """Size of all sections of the block, in bytes."""
         return sum(_align(size, 64) for _, size, _ in self.sections())
 
     def sections(self) -> list[tuple[SectionKind, int, bytes]]:
@@ -128,7 +134,7 @@ class BlockSpec:
 
 
 def _write_blocks(memory: memoryview, at: int, first: int, blocks: Sequence[BlockSpec]) -> list[SectionEntry]:
-    """Write the sections of blocks from offset ``at`` on; returns their table entries.
+    """Write the sections of blocks from offset ``at`` on, and return their table entries.
 
     ``first`` is the table index of the first entry.
     """
@@ -203,9 +209,9 @@ def read_block(
 
 
 def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
-    """Wake everybody who waits at these sections. A needless wake-up is harmless."""
+    """Wake all processes that wait at these sections. A needless wake-up is harmless."""
     for entry in entries:
-        with suppress(ValueError):  # nobody waits at an inconsistent section
+        with suppress(ValueError):  # no process waits at an inconsistent section
             if entry.kind in (SectionKind.FRAMES, SectionKind.EVENTS):
                 _atomics.Ring(memory, entry.offset, entry.size).wake()
             elif entry.kind == SectionKind.COMMANDS:
@@ -213,7 +219,7 @@ def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
 
 
 def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:
-    """Return the size in bytes of a segment with these blocks and processes; ``check`` prints it."""
+    """Return the size in bytes of a segment with these blocks and this number of processes."""
     tables = sum(_table_sizes(len(blocks), processes))
     return HEADER_SIZE + tables + sum(block.size for block in blocks) + _clock_size(processes)
 
@@ -278,23 +284,23 @@ def _build_segment(
 
 
 def _read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntry]) -> ClockPage:
-    """Open the clock page. FormatError: there is none, or it is inconsistent."""
+    """Open the clock page. FormatError: it is missing or inconsistent."""
     for entry in entries:
         if entry.kind == SectionKind.CLOCK:
-            try:  # its own mapping, so that frames age even after the segment is closed
+            try:  # another mapping, so that frames still age after the segment is closed
                 own = memoryview(shared.map())
                 return ClockPage(own, entry.offset, entry.size, head, partial(shared.taken, time_lock(head)))
             except ValueError as error:
                 raise FormatError(f"{shared.name}: {error}") from None
     raise FormatError(
-        f"{shared.name} has no clock page, so shmio {head.version} that made it is older: use one version for both"
+        f"{shared.name} has no clock page: an older shmio, {head.version}, made it; use one version for both"
     )
 
 
 class Segment:
     """The mapped shared memory of an instance.
 
-    A supervisor creates it with :meth:`create`; workers :meth:`open` it writable, readers read-only.
+    A supervisor uses :meth:`create`. Workers :meth:`open` it writable, and readers read-only.
     """
 
     def __init__(self, shared: SharedObject, instance: str) -> None:
@@ -304,9 +310,9 @@ class Segment:
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
         self._turn = threading.RLock()
-        """Held while ``blocks`` change, which several threads may check at once."""
+        """Lock for changes of ``blocks``: several threads may call :meth:`refresh`."""
         self.clock = _read_clock(shared, self.header, self._sections())
-        self._known: dict[int, Block] = {}  # by the section of its layout
+        self._known: dict[int, Block] = {}  # by index of the layout section
         self.blocks = self._find_blocks()
 
     @classmethod
@@ -337,8 +343,8 @@ class Segment:
             origin: The start time for a replay; None: the clock starts at 0, now.
 
         Raises:
-            AlreadyRunningError: There is a segment of this name, with a living supervisor or without
-                one (see :func:`shmio.segment.stale_segment.clear`).
+            AlreadyRunningError: A segment of this name exists, with or without a living supervisor
+                (see :func:`shmio.segment.stale_segment.clear`).
             SegmentError: There is no room in shared memory.
         """
         name = PREFIX + instance
@@ -406,8 +412,8 @@ class Segment:
     def require_config(self, file: Path) -> None:
         """Raise WrongInstanceError unless the instance was started from this file.
 
-        Configurations in different folders may have the same ``instance.name``. Paths are compared, with
-        links resolved; the file may have been edited since.
+        Configurations in different folders may have the same ``instance.name``. Only the resolved
+        paths are compared, not the contents.
         """
         if header.has_config(self.memory, file.resolve()):
             return
@@ -423,14 +429,14 @@ class Segment:
         return {entries[index].name: self._found(index) for index in layouts if not entries[index].retired}
 
     def _found(self, layout: int) -> Block:
-        """Return the block whose layout is in this section, always the same object."""
+        """Return the block whose layout is in this section: the same object at each call."""
         if layout not in self._known:
             self._known[layout] = read_block(self.shared, self.memory, self.header, self._entries, layout, self.clock)
         return self._known[layout]
 
     @property
     def ended(self) -> list[Block]:
-        """The blocks that reloads have retired, the oldest first, as of the last :meth:`refresh`.
+        """Blocks that reloads have retired, the oldest first, as of the last :meth:`refresh`.
 
         Their rings can still be read. FormatError: a block is inconsistent.
         """
@@ -451,21 +457,21 @@ class Segment:
 
     @property
     def generation(self) -> int:
-        """Generation of the section table: it changes whenever a reload adds or retires blocks."""
+        """Generation of the section table, which changes when a reload adds or retires blocks."""
         return header.table_state(self.memory)[0]
 
     @property
     def outdated(self) -> bool:
-        """Whether a :meth:`refresh` is due."""
+        """True if a :meth:`refresh` is due."""
         return self.generation != self._generation
 
     def refresh(self) -> bool:
-        """Update blocks and process table after a reload. Blocks that still exist stay the same objects.
+        """Update blocks and process table after a reload. Blocks that remain are the same objects.
 
         Several threads may call it.
 
         Returns:
-            Whether anything had changed.
+            Whether anything has changed.
 
         Raises:
             FormatError: A block is inconsistent.
@@ -498,31 +504,32 @@ class Segment:
         size = at + sum(block.size for block in add)
         before = self.shared.size
         self.shared.allocate(size)
-        with memoryview(self.shared.map()) as memory:  # a supervisor that died may have used it
+        with memoryview(self.shared.map()) as memory:  # a supervisor that died may have written there
             memory[at : min(before, size)] = bytes(max(0, min(before, size) - at))
         return at
 
     def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
-        """Add blocks, then retire others. Readers see the changes in this order. Only the supervisor may.
+        """Add blocks, then retire others. Only the supervisor may call this.
 
-        A source named in both gets a new block in place of the old one.
+        Readers see the changes in this order. A source named in both gets a new block in place of
+        the old one.
 
         Raises:
             SegmentError: There is no room; nothing has changed.
         """
         at = self.reserve(add)
-        first = len(self._sections())  # which maps what has been added, too
+        first = len(self._sections())  # this also maps the reserved room
         self._change(_write_blocks(self.memory, at, first, add), {self.blocks[name].section for name in retire})
 
     def end_replaced(self) -> None:
-        """Finish a :meth:`change` whose supervisor died, and wake everybody who waits at retired blocks."""
+        """Finish a :meth:`change` whose supervisor died, and wake the waiters at retired blocks."""
         replaced = {block.section for block in self._known.values() if block not in self.blocks.values()}
         parts = enumerate(self._sections())
         ended = {index for index, part in parts if part.kind == SectionKind.LAYOUT and part.retired}
-        self._change((), replaced | ended)  # even if there is none: the generation may not have been updated
+        self._change((), replaced | ended)  # even if these are none: the generation may not be up to date
 
     def _change(self, add: Sequence[SectionEntry], ending: Collection[int]) -> None:
-        """Append entries, and retire the blocks with these layout sections."""
+        """Append entries, and retire the blocks that have these layout sections."""
         parts = list(enumerate(self._sections()))
         ended = {i: part for i, part in parts if (i if part.kind == SectionKind.LAYOUT else part.layout) in ending}
         header.change_sections(self.memory, self.header, add, list(ended))
@@ -530,11 +537,11 @@ class Segment:
         wake(self.memory, ended.values())
 
     def clock_ns(self, now_ns: int) -> int:
-        """Convert a time comparable to CLOCK_MONOTONIC to the instance's clock, ns since its start."""
+        """Convert a time comparable to CLOCK_MONOTONIC to ns of the instance's clock."""
         return now_ns - self.header.started_ns
 
     def writer(self, source: str, at: Stamp | None = None) -> BlockWriter:
-        """Open a source's block for writing. Only the process that holds the source's slot may.
+        """Open a source's block for writing. Only the process in the source's slot may do so.
 
         ``at``: times of the start event; None: now.
         """
@@ -553,17 +560,17 @@ class Segment:
 
     @property
     def supervisor_heartbeat_ns(self) -> int:
-        """CLOCK_MONOTONIC of the supervisor's last heartbeat."""
+        """CLOCK_MONOTONIC of the supervisor's last heartbeat, in ns."""
         return _atomics.load64(self.memory, header.HEARTBEAT_OFFSET)
 
     @property
     def supervised_since_ns(self) -> int:
-        """CLOCK_MONOTONIC of the supervisor's start; after a take-over later than the instance's start."""
+        """CLOCK_MONOTONIC at the start of the present supervisor, in ns."""
         return _atomics.load64(self.memory, header.SUPERVISED_SINCE_OFFSET) or self.header.started_ns
 
     @property
     def supervised(self) -> bool:
-        """Whether a supervisor is alive."""
+        """True if a supervisor is alive."""
         return self.shared.locked(SUPERVISOR_LOCK)
 
     def require_running(self) -> None:
@@ -572,7 +579,7 @@ class Segment:
             raise NotRunningError(f"instance {self.instance!r} has stopped")
 
     def set_state(self, pid: int, state: State, note: str = "") -> None:
-        """Write the supervisor's pid, the instance's state and a note. Only the supervisor may."""
+        """Write the supervisor's pid, the instance's state and a note, as its supervisor."""
         header.write_supervisor(self.memory, pid, state)
         header.write_note(self.memory, note)
         supervisor_beat(self.memory)
@@ -580,7 +587,8 @@ class Segment:
     def lead_to(self, control: str, config: Path) -> None:
         """Write start time, control socket and configuration of a supervisor that takes over.
 
-        Only that supervisor may. Processes that opened the segment before keep the old paths.
+        Only that supervisor may call this. Processes that opened the segment before keep the old
+        paths.
         """
         header.write_supervised_since(self.memory, time.monotonic_ns())
         header.write_control(self.memory, control)
@@ -588,17 +596,20 @@ class Segment:
         self.header = Header.read(self.memory, self.shared.name)
 
     def unlink(self) -> None:
-        """Remove the segment's name, if it still belongs to this segment. Only a clean stop does this."""
+        """Remove the segment's name if it still belongs to this segment.
+
+        Only a clean stop does so.
+        """
         if self.shared.current():
             shm.unlink(self.shared.name)
 
     @property
     def closed(self) -> bool:
-        """Whether :meth:`close` was called."""
+        """True if :meth:`close` was called."""
         return self.shared.closed
 
     def close(self) -> None:
-        """Release mapping and locks. Blocks that are still referenced keep the mapping."""
+        """Release mapping and locks. Blocks that are still in use keep the mapping."""
         self.blocks, self._known = {}, {}
         with suppress(BufferError):  # a Ring is still referenced
             self.memory.release()

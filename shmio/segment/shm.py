@@ -1,7 +1,7 @@
 """A POSIX shared-memory object: create, open, lock, map and unlink. Linux only.
 
-It uses posix-ipc, because the resource tracker of ``multiprocessing.shared_memory`` unlinks a live
-segment when any process that attached to it ends.
+It uses posix-ipc, because ``multiprocessing.shared_memory`` unlinks a segment in use when any
+process that has attached to it ends.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _FLOCK = "@hhqqi4x"  # struct flock of 64-bit Linux: type, whence, start, length
 class SharedObject:
     """An open shared-memory object with its mapping and its byte locks.
 
-    The locks are *open file description* locks (fcntl(2)). The kernel releases them when the holder dies
-    in any way. They belong to this object, not to the process, so two objects in one process exclude
-    each other.
+    The locks are *open file description* locks (fcntl(2)). The kernel releases them when the
+    process dies, however it dies. They belong to this object, not to the process: two objects in
+    one process exclude each other.
     """
 
     def __init__(self, name: str, fd: int, *, writable: bool) -> None:
@@ -41,7 +41,11 @@ class SharedObject:
 
     @classmethod
     def create(cls, name: str, group: str | None = None) -> SharedObject:
-        """Create an empty object, with mode 0600, or 0640 with a group. FileExistsError: it exists."""
+        """Create an empty object with mode 0600, or 0640 with a group.
+
+        Raises:
+            FileExistsError: It exists.
+        """
         try:
             memory = posix_ipc.SharedMemory(f"/{name}", posix_ipc.O_CREX, mode=0o600)
         except posix_ipc.ExistentialError:
@@ -62,7 +66,12 @@ class SharedObject:
 
     @classmethod
     def open(cls, name: str, *, writable: bool = False) -> SharedObject:
-        """Open an existing object. FileNotFoundError: there is none; SegmentError: no permission."""
+        """Open an existing object.
+
+        Raises:
+            FileNotFoundError: There is none.
+            SegmentError: No permission.
+        """
         try:
             memory = posix_ipc.SharedMemory(f"/{name}", 0, read_only=not writable)
         except posix_ipc.ExistentialError:
@@ -76,7 +85,11 @@ class SharedObject:
         return cls(name, memory.fd, writable=writable)
 
     def allocate(self, size: int) -> None:
-        """Reserve all pages up to ``size``, so that a full file system fails here and not as a SIGBUS later."""
+        """Reserve all pages up to ``size``. Without that, a process could get SIGBUS later.
+
+        Raises:
+            SegmentError: There is no room in shared memory.
+        """
         try:
             os.posix_fallocate(self._fd, 0, size)
         except OSError as error:
@@ -91,13 +104,14 @@ class SharedObject:
 
     @property
     def size(self) -> int:
-        """Present size of the object in bytes."""
+        """Present size of the object, in bytes."""
         return os.fstat(self._fd).st_size
 
     def map(self) -> mmap.mmap:
         """Map the whole object, read-only unless it was opened writable.
 
-        Calls return the same mapping until the object grows. Older mappings stay valid while referenced.
+        Calls return the same mapping until the object grows. Older mappings stay valid while
+        referenced.
         """
         if self._map is None or len(self._map) < self.size:
             access = mmap.PROT_READ | (mmap.PROT_WRITE if self.writable else 0)
@@ -105,7 +119,7 @@ class SharedObject:
         return self._map
 
     def try_lock(self, byte: int) -> bool:
-        """Take the write lock on a byte for the life of this object; returns False if another holds it."""
+        """Lock a byte until this object is closed; return False if another object has locked it."""
         try:
             fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0))
         except OSError as error:
@@ -121,18 +135,18 @@ class SharedObject:
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, byte, 1, 0))
 
     def locked(self, byte: int) -> bool:
-        """Whether another holder has locked the byte. It works on a read-only object, too."""
+        """Return whether another object has locked the byte. Works also for a read-only object."""
         query = struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, byte, 1, 0)
         answer = fcntl.fcntl(self._fd, fcntl.F_OFD_GETLK, query)
         kind: int = struct.unpack(_FLOCK, answer)[0]
         return kind != fcntl.F_UNLCK
 
     def taken(self, byte: int) -> bool:
-        """Whether anybody has locked the byte, this object or another."""
+        """Return whether any object has locked the byte, this one included."""
         return byte in self._held or self.locked(byte)
 
     def current(self) -> bool:
-        """Whether the name still refers to this object, and not to none or to a successor."""
+        """Return whether the name still refers to this object: it was not removed or replaced."""
         try:
             return (DIRECTORY / self.name).stat().st_ino == self.inode
         except FileNotFoundError:
@@ -140,18 +154,21 @@ class SharedObject:
 
     @property
     def closed(self) -> bool:
-        """Whether :meth:`close` was called."""
+        """True if :meth:`close` was called."""
         return self._fd < 0
 
     def close(self) -> None:
-        """Release mapping, descriptor and locks. A view that is still referenced keeps the mapping."""
+        """Release mapping, descriptor and locks.
+
+        A view that is still referenced keeps the mapping.
+        """
         if self._fd < 0:
             return
         if self._map is not None:
             with suppress(BufferError):  # a view is still referenced; the mapping ends with it
                 self._map.close()
             self._map = None
-        # The mapping has a copy of the descriptor, which would keep the locks as long as a view is held.
+        # The mapping has a copy of the descriptor, which would keep the locks while a view is in use.
         unlock = struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, 0, 0, 0)
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, unlock)
         os.close(self._fd)
@@ -159,7 +176,7 @@ class SharedObject:
 
 
 def unlink(name: str) -> None:
-    """Remove a name; nothing happens if it does not exist."""
+    """Remove a name; do nothing if it does not exist."""
     try:
         posix_ipc.unlink_shared_memory(f"/{name}")
     except posix_ipc.ExistentialError:

@@ -1,4 +1,4 @@
-"""Claim or clear the segment and the processes that a killed supervisor has left."""
+"""Claim or clear a stale segment: a supervisor that died has left it, with its processes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRACE_S = 3.0
 
 
 class Worker(NamedTuple):
-    """A living process of the instance. The owner of the object closes ``pidfd``."""
+    """A living process of the instance. Whoever gets this object must close ``pidfd``."""
 
     name: str
     pid: int
@@ -32,7 +32,7 @@ class Worker(NamedTuple):
 
 
 def claim(instance: str) -> SharedObject | None:
-    """Take the supervisor's lock of an instance's stale segment. Only one of several callers gets it.
+    """Take the supervisor's lock of an instance's stale segment. Only one of several callers does.
 
     Returns:
         The segment's object; None if there is no segment.
@@ -62,7 +62,12 @@ def claim(instance: str) -> SharedObject | None:
 
 
 def read(shared: SharedObject, instance: str) -> Segment:
-    """Open a claimed segment. UnfinishedError: its creator died; FormatError: another version made it."""
+    """Open a claimed segment.
+
+    Raises:
+        UnfinishedError: Its creator died.
+        FormatError: It has another version.
+    """
     if shared.size < HEADER_SIZE:
         raise UnfinishedError(f"{shared.name} is not a complete shmio segment")
     segment = Segment(shared, instance)
@@ -72,7 +77,11 @@ def read(shared: SharedObject, instance: str) -> Segment:
 
 
 def living(instance: str) -> bool:
-    """Whether processes of the instance run, of any version of shmio. SegmentError: no permission."""
+    """Return whether processes of the instance run, of any version of shmio.
+
+    Raises:
+        SegmentError: There is no permission to open the segment.
+    """
     try:
         with Segment.open(instance) as segment:
             return any(slot.alive() for slot in segment.processes)
@@ -84,15 +93,15 @@ def living(instance: str) -> bool:
 
 
 def clear(instance: str, forget_control: Callable[[str], object] = lambda _: None) -> list[str]:
-    """Stop the orphans of a dead supervisor, and unlink its segment. It is no error if there is none.
+    """Stop the orphans of a dead supervisor, and unlink its segment, if there is one.
 
     Args:
         instance: Name of the instance.
-        forget_control: Called with the path of the dead supervisor's control socket, at a time when no
-            new supervisor can have created one.
+        forget_control: Called with the path of the dead supervisor's control socket. While it runs,
+            no new supervisor can create one.
 
     Returns:
-        A line of text for each thing done.
+        A line of text for each action.
 
     Raises:
         AlreadyRunningError: A supervisor is alive.
@@ -125,14 +134,14 @@ def clear_claimed(
 
 
 def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
-    """End every process that holds a slot, and take all slots, so that a late process gets none."""
+    """End every process that has locked a slot, and lock all slots against late processes."""
     held = {slot.index: slot for slot in segment.processes if not shared.try_lock(slot.index + 1)}
     found: list[Worker] = []
     deadline = time.monotonic() + GRACE_S
     try:
         while held and time.monotonic() < deadline:
             for index, slot in list(held.items()):
-                worker = holder(slot, shared)  # a process that has just taken its slot has no pid there yet
+                worker = holder(slot, shared)  # a process that has just locked its slot may not have written its pid
                 if worker is not None:
                     found.append(worker)
                 if worker is not None or shared.try_lock(index + 1):
@@ -151,7 +160,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
 
 
 def _stop_mapping(shared: SharedObject, instance: str) -> list[str]:
-    """End the processes of a segment of unknown format: this user's workers that map it writable."""
+    """End this user's workers that map a segment of unknown format writable."""
     with _opened(_workers(shared)) as found:
         end(instance, found)
         return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]
@@ -174,7 +183,7 @@ def _workers(shared: SharedObject) -> Iterator[Worker]:
 
 
 def _module(folder: Path) -> str:
-    """Return the shmio module that a process runs by ``-m``; empty for others and for shmio's commands."""
+    """Return the shmio module that a process runs with ``-m``; empty for commands of shmio."""
     with suppress(OSError, ValueError):
         words = (folder / "cmdline").read_bytes().split(b"\0")
         module = words[words.index(b"-m") + 1].decode(errors="replace")
@@ -194,15 +203,18 @@ def _opened(workers: Iterable[Worker]) -> Iterator[list[Worker]]:
 
 
 def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
-    """Return the process that holds a slot. It must map the segment, so that a reused pid is not mistaken."""
+    """Return the process that has locked a slot; None if it is unknown or has ended.
+
+    It must map the segment, because another program may have its pid now.
+    """
     pid = slot.report.pid
     if not pid:
         return None
     try:
         fd = os.pidfd_open(pid)
     except OSError:
-        # The process has ended. If its number went to another program's thread, Linux says EINVAL,
-        # and from 6.14 on ENOENT; the latter also while the process is being reaped.
+        # The process has ended. If a thread of another program has its number now, the error is EINVAL,
+        # from Linux 6.14 on ENOENT; the latter also while the process is being reaped.
         return None
     if _maps(pid, shared.inode) and slot.alive():
         return Worker(slot.name, pid, fd)
@@ -264,20 +276,20 @@ def _foreign(pid: int) -> str:
 
 
 def survivor(pid: int) -> str:
-    """Describe a process that SIGKILL has not ended, with the remedy."""
+    """Describe a process that runs even after SIGKILL, with the remedy."""
     state = ""
     with suppress(OSError, IndexError):  # "pid (name) state …", where the name may be anything: proc_pid_stat(5)
         state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0]
     held = (
         "is blocked in the kernel (state D), for example by a disk or a device that hangs"
         if state == "D"
-        else "lives on"
+        else "still runs"
     )
     return f"pid {pid} was killed and {held}: remove the cause, or restart the host"
 
 
 def _ended(pidfds: Collection[int], timeout_s: float) -> set[int]:
-    """Wait until a process ends; returns the pidfds of all that have ended."""
+    """Wait until a process ends; return the pidfds of all that have ended."""
     poll = select.poll()
     for fd in pidfds:
         poll.register(fd, select.POLLIN)

@@ -1,7 +1,8 @@
-"""The present injections of a block, for all processes, and for a restarted source to resume.
+"""The present injections of a block: readable by all, and resumed by a restarted source.
 
-A second section has the injections that the configuration declares; the supervisor writes it. Both are
-cells (docs/reference/segment-format.md) with a JSON document of at most STANDING_SIZE bytes.
+The supervisor writes the injections that the configuration declares to a second section. Both
+sections are cells (docs/reference/segment-format.md) with a JSON document of at most STANDING_SIZE
+bytes.
 """
 
 from __future__ import annotations
@@ -23,29 +24,29 @@ CELL_SIZE: Final = 8 + STANDING_SIZE
 
 
 class StandingInjection(Injection[Declaration], frozen=True, omit_defaults=True):
-    """A present injection as its block lists it; the innermost comes first."""
+    """A present injection in the list of its block, in which the innermost comes first."""
 
     @property
     def configured(self) -> bool:
-        """Whether the configuration declares it."""
+        """True if the configuration declares the injection."""
         return self.running is not None and self.writer == NO_WRITER
 
     @property
     def active(self) -> bool:
-        """Whether it is in effect."""
+        """True if the injection is in effect."""
         return self.running is None or self.running.state == "active"
 
     @property
     def lifted(self) -> bool:
-        """Whether it was lifted, but is still listed because the configuration declares it."""
+        """True if the injection was lifted; a configured one remains in the list."""
         return self.running is not None and self.running.state == "lifted"
 
     def covers(self, register: Register) -> bool:
-        """Whether it is in effect for any bit of a register."""
+        """Return whether the injection is in effect for any bit of a register."""
         return self.active and self.reaches(register)
 
     def reaches(self, register: Register) -> bool:
-        """Whether it is laid over any bit of a register."""
+        """Return whether the injection is laid over any bit of a register."""
         start, stop = register.offset, register.offset + register.size
         own = bits_of(register)
         shared = (
@@ -62,7 +63,7 @@ _Item = TypeVar("_Item")
 
 
 def ranges_of(cover: bytes) -> tuple[tuple[int, int, int], ...]:
-    """Return the bits that are set in an image, as (offset, size, mask) of bytes with equal bits."""
+    """Return the set bits of an image as (offset, size, mask), one for each run of equal bytes."""
     ranges: list[tuple[int, int, int]] = []
     for at, bits in enumerate(cover):
         if not bits:
@@ -75,7 +76,11 @@ def ranges_of(cover: bytes) -> tuple[tuple[int, int, int], ...]:
 
 
 def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
-    """Join JSON items to a document. ValueError: with ``growth`` more bytes it would be too long."""
+    """Join JSON items to a document.
+
+    Raises:
+        ValueError: It would be too long with ``growth`` more bytes.
+    """
     document = b"[" + b",".join(items) + b"]"
     if len(document) + growth > STANDING_SIZE:
         raise ValueError("the injections of one source are too large: lay fewer, or cover whole structures or arrays")
@@ -95,7 +100,7 @@ class DocumentCell(Generic[_Item]):
 
     @property
     def sequence(self) -> int:
-        """Sequence number, which changes with each :meth:`write`."""
+        """Sequence number of the cell, which changes with each :meth:`write`."""
         return _atomics.load64(self._memory, self._offset)
 
     def read(self) -> tuple[_Item, ...]:
@@ -108,7 +113,7 @@ class DocumentCell(Generic[_Item]):
             return ()
 
     def write(self, document: bytes) -> None:
-        """Write a document of :func:`encode`."""
+        """Write a document made by :func:`encode`."""
         _atomics.cell_write(self._memory, self._offset, document.ljust(STANDING_SIZE, b"\0"))
 
 
@@ -117,15 +122,23 @@ DeclaredCell = DocumentCell[Declaration]
 
 
 def standing_cell(memory: memoryview, offset: int, size: int) -> StandingCell:
-    """Open the section of present injections, written by the source's process. ValueError: too short."""
+    """Open the section of present injections, which the source writes.
+
+    Raises:
+        ValueError: It is too short.
+    """
     return DocumentCell(memory, offset, size, _STANDING)
 
 
 def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
-    """Open the section of configured injections, written by the supervisor. ValueError: too short."""
+    """Open the section of configured injections, which the supervisor writes.
+
+    Raises:
+        ValueError: It is too short.
+    """
     return DocumentCell(memory, offset, size, _DECLARED)
 
 
 def declared_document(declarations: Iterable[Declaration]) -> bytes:
-    """Encode the configured injections. ValueError: the document is too long."""
+    """Encode configured injections as a document. ValueError: it is too long."""
     return encode(msgspec.json.encode(declaration) for declaration in declarations)

@@ -13,7 +13,7 @@ from shmio.segment import Segment, instances
 from shmio.supervisor.control import Reload, Restart, Stop
 from tests.unit.supervisor.harness import CELL, Launch, Launched, until
 
-STUCK = "pid {pid} was killed and lives on: remove the cause, or restart the host"
+STUCK = "pid {pid} was killed and still runs: remove the cause, or restart the host"
 
 
 def held(launch: Launch, name: str) -> tuple[Launched, int, str]:
