@@ -47,11 +47,11 @@ from shmio.segment.segment import Segment, running_instances
 from shmio.segment.standing_injections import StandingInjection
 
 _TURN_S: Final = 1.0
-"""How often a waiting reader checks that the instance still runs, in s."""
+"""Interval at which a waiting reader checks that the instance still runs, in s."""
 
 
 class Attachment:
-    """A running instance, attached to by a program on the same host.
+    """A running instance to which a program on the same host has attached.
 
     Use it as a context manager, or call :meth:`close`. :func:`attach` creates it.
     """
@@ -60,7 +60,7 @@ class Attachment:
         self._segment = segment
         self._time = Timekeeper(segment)
         self.replay = Replays(segment)
-        """The instance's replays: call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
+        """The instance's replays. Call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
 
         The attachment must be ``writable`` to change them.
         """
@@ -88,7 +88,7 @@ class Attachment:
 
     @property
     def current(self) -> bool:
-        """Whether the attached instance still runs. Once it has stopped, attach again."""
+        """True if the attached instance still runs. Once it has stopped, attach again."""
         return self._segment.shared.current()
 
     def layouts(self, *sources: str) -> Mapping[str, Layout]:
@@ -160,7 +160,7 @@ class Attachment:
         return subscription
 
     def events(self, *sources: str) -> Events:
-        """Follow what happens in these sources from now on, or in all that there are: see :class:`shmio.Cell`.
+        """Follow the events of these sources, or of all, from now on: see :class:`shmio.Cell`.
 
         Closing the iterator or the attachment ends it.
 
@@ -256,7 +256,7 @@ class Attachment:
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             rest_s = _TURN_S if deadline_s is None else deadline_s - time.monotonic()
-            retired = block.retired  # before looking: what was published before the end is still read
+            retired = block.retired  # before reading, so that nothing published before the end is missed
             entry = cursor.next(min(rest_s, _TURN_S))
             if entry is not None or retired:
                 return entry
@@ -269,12 +269,12 @@ class Attachment:
     ) -> View | None:
         """Wait for a frame that is newer than a given one.
 
-        A frame of a block that a reload has put in place of the old one counts as newer.
+        If a reload replaces the source's block, each frame of the new block counts as newer.
 
         Args:
             source: Name of the source; None if there is only one.
-            after: The frame to be newer than; None: the newest frame at the time of the call.
-            timeout_s: How long to wait; None waits forever.
+            after: An earlier frame; None: the newest one at the time of the call.
+            timeout_s: Time-out in s; None waits forever.
 
         Returns:
             The newest frame, or None if none came in time.
@@ -314,7 +314,8 @@ class Attachment:
 
         Args:
             values: Values by path: registers, whole arrays, elements, slices or bits of one source.
-            timeout_s: How long the values may wait for a cycle of the source.
+            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or three
+                cycles if that is longer.
 
         Returns:
             The outcome of each value, in the given order.
@@ -334,11 +335,11 @@ class Attachment:
         The attachment must be ``writable``.
 
         Args:
-            paths: Registers, elements, structures or patterns of one source. With the suffix ``/in``
-                the shadow takes what others write; with ``/out``, or without a suffix, it replaces
-                what consumers see. All paths must have the same direction.
-            priority: Of several shadows over a register the one with the highest priority is
-                outermost; of equal ones the newest.
+            paths: Registers, elements, structures or patterns of one source. With the suffix
+                ``/in``, the shadow takes what others write. With ``/out``, or without a suffix, it
+                replaces what consumers see. All paths must have the same direction.
+            priority: Of several shadows over a register, the one with the highest priority is
+                outermost; among equal ones, the newest.
             keep: Whether the shadow stays when this program ends, until somebody lifts it.
             name: Name of the injection in events and lists.
 
@@ -357,14 +358,14 @@ class Attachment:
             raise PathError("an injection covers /out or /in, not both")
         direction = Direction.IN if "in" in directions else Direction.OUT
         source_writer = self._source_writer(block)
-        events = block.events.cursor()  # from before it is laid: what it diverts at once is not missed
+        events = block.events.cursor()  # created before the shadow is laid, so that no diversion is missed
         number = source_writer.inject(
             [topic.path or "**" for topic in topics], direction=direction, priority=priority, keep=keep, name=name
         )
         return Shadow(source_writer, number, direction, events, partial(self._next, block), keep=keep)
 
     def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[Diversion]:
-        """Iterate over the commands that anybody writes to registers of one source from now on.
+        """Iterate over the commands that write to registers of one source, from now on.
 
         Each accepted command is yielded once its outcome is known, in order.
 
@@ -381,17 +382,18 @@ class Attachment:
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
     def declare(self, declarations: Iterable[Mapping[str, Any] | Declaration], *, keep: bool = False) -> Campaign:
-        """Lay declared injections, which their sources run by themselves: all of them or none.
+        """Lay declared injections, all or none. Their sources run them without this program.
 
-        An injection ends when it is over or lifted. The attachment must be ``writable``.
+        They end by themselves or when they are lifted. The attachment must be ``writable``.
         See docs/reference/injections.md.
 
         Args:
-            declarations: What to inject: tables as ``[[injection]]`` has them, or declarations.
-            keep: Whether the injections go on when this program ends.
+            declarations: Mappings with the keys of an ``[[injection]]`` table, or declarations.
+            keep: Whether the injections continue when this program ends.
 
         Returns:
-            What was laid. Iterate over it for the events; leaving its ``with`` block lifts the injections.
+            The laid injections. Iterate over them for their events. Leaving the ``with`` block
+            lifts them, unless ``keep`` is set.
 
         Raises:
             DeclarationError: A declaration is wrong.
@@ -404,7 +406,9 @@ class Attachment:
         return campaign
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all; of each source the innermost first.
+        """Return the present injections of these sources, or of all.
+
+        Within a source, the innermost comes first.
 
         Raises:
             PathError: There is no such source.
@@ -439,7 +443,7 @@ class Attachment:
         """Lift all injections of these sources, or of all, whoever laid them.
 
         Returns:
-            What was lifted.
+            The lifted injections.
 
         Raises:
             CommandError: Some injections could not be lifted; the message gives the reasons.
@@ -471,16 +475,16 @@ class Attachment:
     def clock(self) -> Clock:
         """State of the instance's clock: wall time, or virtual time with its last step.
 
-        It may be called, as ``clock()`` of :class:`shmio.Cell`.
+        You may also call it, ``clock()``, as with any :class:`shmio.Cell`.
         """
         return self._segment.clock.read()
 
     def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
-        """Move time by steps, and wait until all sources that use the instance clock have done them.
+        """Move time by steps, and wait until all sources on the instance clock have done them.
 
-        The first call of this method, :meth:`pause` or :meth:`play` takes over time: from then on only
-        steps move it. This program owns time until it detaches or calls :meth:`release`.
-        The attachment must be ``writable``.
+        The first call of this method, :meth:`pause` or :meth:`play` takes control of time: from
+        then on, only steps move it. This program owns time until it detaches or calls
+        :meth:`release`. The attachment must be ``writable``.
 
         Args:
             dt_s: Length of each step in s, from 1 us to 1 h; None: the step size.
@@ -490,9 +494,9 @@ class Attachment:
             The state of the clock after the last step.
 
         Raises:
-            TimeError: Another program owns time, or the step failed; the message says who failed or
-                did not answer.
-            ValueRangeError: The length is not within 1 us and 1 h, or the number is below 1.
+            TimeError: Another program owns time, or a step failed. The message names the source
+                that failed or did not answer.
+            ValueRangeError: The length is not within 1 us and 1 h, or the count is below 1.
         """
         dt_ns = _ns(dt_s)
         if count < 1:
@@ -502,10 +506,10 @@ class Attachment:
         return self.clock
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Step time in a thread until :meth:`pause`; returns the state of the clock.
+        """Step time in a thread until :meth:`pause`, and return the state of the clock.
 
         Args:
-            rate: How many times as fast as real time; above 0, at most 1000.
+            rate: Speed relative to real time; above 0, at most 1000.
             dt_s: Length of a step in s; None: the step size.
 
         Raises:
@@ -516,7 +520,7 @@ class Attachment:
         return self.clock
 
     def pause(self) -> Clock:
-        """Stop time until it is stepped or played; returns the state of the clock.
+        """Stop time until it is stepped or played, and return the state of the clock.
 
         Raises:
             TimeError: Another program owns time, or a step failed while time was played.
@@ -525,9 +529,12 @@ class Attachment:
         return self.clock
 
     def release(self) -> Clock:
-        """Return to real time, which goes on from the present virtual time; returns the state of the clock.
+        """Return to real time, which continues from the present virtual time.
 
-        This program gives up the ownership of time. If time is real, nothing happens.
+        This program then no longer owns time. If time is real already, nothing happens.
+
+        Returns:
+            The state of the clock.
 
         Raises:
             TimeError: Another program owns time, time was virtual from the instance's start, or a
@@ -537,7 +544,10 @@ class Attachment:
         return self.clock
 
     def _source_writer(self, block: Block) -> SourceWriter:
-        """Return the writer for a block. The first call takes a guest slot, which is kept."""
+        """Return the writer for a block.
+
+        The first call takes a guest slot, until the program detaches.
+        """
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
         with self._turn:
@@ -549,7 +559,10 @@ class Attachment:
             return known
 
     def _end_with_this(self, following: Following[Any]) -> None:
-        """End an iterator when the attachment is closed, at once if another thread has just done that."""
+        """Register an iterator that :meth:`close` must end.
+
+        If another thread has just closed this attachment, end the iterator now.
+        """
         with self._turn:
             detached = self._detached
             self._open.add(following)
@@ -560,7 +573,7 @@ class Attachment:
         """Detach from the instance.
 
         Raises:
-            TimeError: A step had failed while time was played.
+            TimeError: A step has failed while time was played.
         """
         with self._turn:
             self._detached = True
@@ -584,7 +597,8 @@ def attach(instance: str | None = None, *, writable: bool = False) -> Attachment
 
     Args:
         instance: Name of the instance; None if only one is running.
-        writable: Whether to write, inject and step, too. Only the user who runs the instance can.
+        writable: Whether to allow writing, injecting and stepping. Only the user who runs the
+            instance can.
 
     Raises:
         NotRunningError: The instance is not running, or you named none and several are running.
@@ -664,7 +678,7 @@ def _with_source(source: str, one: StandingInjection) -> Injection[Mapping[str, 
 
 
 def _ns(dt_s: float | None) -> int | None:
-    """Check the length of a step, and convert it to ns; ValueRangeError."""
+    """Check the length of a step, and convert it to ns. ValueRangeError: it is out of range."""
     if dt_s is None:
         return None
     check_step(dt_s * 1e9)  # before rounding, which fails for infinity

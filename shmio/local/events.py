@@ -1,4 +1,4 @@
-"""Follow what happens in the sources of a local instance."""
+"""Follow the events of the sources of a local instance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from shmio.segment.block import Block
 from shmio.segment.segment import Segment
 
 MAX_PATHS: Final = 2048
-"""Most paths of an event: as many as a write of one event can set. An injection may cover more registers."""
+"""Maximum number of paths of an event: as many as the data of an event has bits.
+
+An injection may cover more registers.
+"""
 _KINDS: Final = {int(kind): EventKind(str(kind)) for kind in segment_events.EventKind}
 
 
@@ -22,24 +25,24 @@ class EventReader:
     """Reads a block's events in order, with their registers and values. For one thread."""
 
     def __init__(self, block: Block, *, after: int | None = None) -> None:
-        """Begin behind event ``after`` (default: the newest one)."""
+        """Start after event ``after`` (default: the newest one)."""
         from shmio.segment.explain import Explainer  # noqa: PLC0415  loads numpy, which nothing else here needs
 
         self.block = block
         self._cursor = block.events.cursor(after=after)
         self._explainer = Explainer(block.source, block.layout, MAX_PATHS)
         self._explainer.know(block.standing.read())
-        self._missed = 0  # before the event that comes next
+        self._missed = 0  # number of events lost before the next one
         self._last: segment_events.Event | None = None
 
     @property
     def behind(self) -> bool:
-        """Whether there are events that are not read yet."""
+        """True if there are unread events."""
         return self._cursor.behind > 0
 
     @property
     def ended(self) -> bool:
-        """Whether a reload has retired the block, and all its events have been read."""
+        """True if a reload has retired the block, and all its events have been read."""
         return self._cursor.ended
 
     def next(self) -> Event | None:
@@ -51,7 +54,7 @@ class EventReader:
             self._last = event
             explained = self._explainer.explain(event)
             if explained.partial:
-                continue  # the last of the events that define an injection stands for all
+                continue  # of the events that define an injection, only the last is returned
             missed, self._missed = self._missed, 0
             return Event(
                 self.block.source, _KINDS.get(event.kind, EventKind.OTHER), event.number, event.frame, event.cycle,
@@ -62,7 +65,7 @@ class EventReader:
         return None
 
     def removed(self, instance: str) -> Event:
-        """Create the REMOVED event, which ends the events of a source that a reload has removed."""
+        """Create the REMOVED event: the last event of a source that a reload has removed."""
         last, source = self._last, self.block.source
         times = (0, 0, 0) if last is None else (last.frame, last.cycle, last.incarnation)
         reason = f"source {source!r} was removed from instance {instance!r} by a reload"
@@ -82,7 +85,7 @@ class Events(Following[Event]):
     """The :class:`shmio.model.cell.Events` of a local instance."""
 
     def __init__(self, segment: Segment, blocks: Callable[[], Mapping[str, Block]], followed: Iterable[Block]) -> None:
-        """Begin to follow.
+        """Start to follow.
 
         Args:
             segment: The instance's segment.
@@ -101,14 +104,14 @@ class Events(Following[Event]):
             if event is None and reader.ended:
                 event = self._succeed(reader)
             if event is not None:
-                if reader in self._readers:  # the others come first now
+                if reader in self._readers:  # so that the other readers come first next time
                     self._readers.remove(reader)
                     self._readers.append(reader)
                 return event
         return None
 
     def _succeed(self, old: EventReader) -> Event | None:
-        """Follow the block that a reload has put in place of another; return the end if there is none."""
+        """Follow the block that has replaced a retired one; if none has, return a REMOVED event."""
         self._segment.require_running()
         block = self._blocks().get(old.block.source)
         if block is old.block:

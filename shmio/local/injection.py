@@ -1,4 +1,4 @@
-"""Injections of a local program: those whose values it gives, with the writes that they divert, and declared ones."""
+"""Injections of a local program: shadows, to which it gives values, and declared injections."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ if TYPE_CHECKING:
 _EVENTS: Final = frozenset({EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.LIFTED})
 
 Next = Callable[[Cursor[Event], float | None], Event | None]
-"""Waits at most so many seconds for a cursor's next event. None: no event came, or none will come.
+"""Waits at most this many seconds for a cursor's next event. None: none came in time, or none will.
 
-Raises NotRunningError when the instance has stopped."""
+Raises NotRunningError when the instance has stopped.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +47,14 @@ class Diversion:
     """The values that one command wrote to a source, or the part of them that an injection took.
 
     Attributes:
-        values: Values by path within the block. For an array or integer that was written in part,
-            its elements or bits.
+        values: Values by path within the block. If only part of an array or integer was written,
+            the written elements or bits.
         writer: Number of the command queue, as in events.
-        command: The writer's number of the command, as in events.
+        command: Number that the writer gave the command, as in events.
         clock_ns: Time of the instance's clock.
         utc_ns: UTC time.
-        missed: Events lost since the previous diversion; some may have been about further writes.
+        missed: Number of events lost since the previous diversion. They may have been about further
+            writes.
     """
 
     values: Mapping[str, Value]
@@ -64,10 +66,11 @@ class Diversion:
 
 
 class Shadow:
-    """An injection over registers of one source, whose values this program gives.
+    """An injection over registers of one source, to which this program gives values.
 
-    Until values are given, consumers of ``/out`` see what they saw before; over ``/in``, nothing
-    reaches the device. Leaving the ``with`` block lifts the shadow, unless it was laid with ``keep``.
+    Until it gives some, a shadow over ``/out`` changes nothing for consumers, and with one over
+    ``/in`` nothing reaches the device. Leaving the ``with`` block lifts the shadow, unless it was
+    laid with ``keep``.
     """
 
     def __init__(
@@ -80,10 +83,10 @@ class Shadow:
         *,
         keep: bool,
     ) -> None:
-        """``events``: a cursor from before the shadow was laid."""
+        """Take the shadow's properties. ``events``: a cursor created before the shadow was laid."""
         self.source = source_writer.block.source
         self.number = number
-        """Number of the injection; by it anybody may lift the shadow or give values to it."""
+        """Number of the injection, with which any program may lift it or give values to it."""
         self.direction = direction
         self._source_writer = source_writer
         self._events = events
@@ -97,11 +100,13 @@ class Shadow:
 
         Args:
             values: Values by path, with or without the source.
-            timeout_s: How long the values may wait for a cycle of the source.
+            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or three
+                cycles if that is longer.
 
         Returns:
-            The outcome of each value, under the path that you gave: SHADOWED when consumers see it, or, for
-            ``/in``, an outcome as of a write; REJECTED when the shadow does not cover it or was lifted.
+            The outcome of each value, under the path that you gave: SHADOWED if consumers see it,
+            or, for ``/in``, the outcome of a write. REJECTED: the shadow does not cover the path,
+            or was lifted.
 
         Raises:
             PathError: A path names nothing.
@@ -115,12 +120,13 @@ class Shadow:
     def diverted(self, timeout_s: float | None = None) -> Iterator[Diversion]:
         """Iterate over what this shadow has taken since it was laid, command by command, in order.
 
-        Over ``/in`` these are the writes of others; over ``/out`` the values of shadows further in.
-        What the source itself delivers is in the frames. Each diversion is yielded once, even if
-        there are two iterators. The iterator ends when the shadow is lifted.
+        Over ``/in``, these are the writes of others; over ``/out``, the values of inner shadows.
+        The values that the source delivers are in the frames. Each diversion is yielded once, even
+        if there are two iterators. The iterator ends when the shadow is lifted.
 
         Args:
-            timeout_s: The iterator also ends after this time without a diversion; None waits forever.
+            timeout_s: The iterator also ends after this time without a diversion; None waits
+                forever.
 
         Raises:
             NotRunningError: The instance has stopped.
@@ -141,10 +147,10 @@ class Shadow:
         return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, self._events.take_missed())
 
     def lift(self) -> None:
-        """Lift the shadow: consumers see what the source delivers.
+        """Lift the shadow: consumers see what they would see without it.
 
         Raises:
-            CommandError: It was lifted already, or the source does not answer.
+            CommandError: The shadow was lifted already, or the source does not answer.
         """
         self._source_writer.lift(self.number)
 
@@ -169,7 +175,7 @@ class Shadow:
 def written(
     block: Block, patterns: Iterable[str], events: Cursor[Event], next_event: Next, timeout_s: float | None
 ) -> Iterator[Diversion]:
-    """Iterate over the commands that a source accepts for registers, each once its outcome is known.
+    """Iterate over the accepted commands to registers, each once its outcome is known.
 
     Args:
         block: The source's block.
@@ -217,7 +223,11 @@ class _Laid(NamedTuple):
     program: Program
 
     def lift(self) -> None:
-        """Lift it. CommandError: it is over, was lifted already, or the source does not answer."""
+        """Lift the injection.
+
+        Raises:
+            CommandError: It is over, was lifted, or the source does not answer.
+        """
         self.source_writer.lift(self.number)
 
 
@@ -229,11 +239,11 @@ def compile_declarations(
     Args:
         declarations: What to compile.
         blocks: The instance's blocks, by source.
-        wanted: Called before each declaration; compilation stops when it returns False. Many
-            declarations over a large layout take seconds.
+        wanted: Called before each declaration; False cancels the compilation, which takes seconds
+            for many declarations over a large layout.
 
     Raises:
-        ConfigError: The first fault, such as ``injection[0].target: …``.
+        ConfigError: A declaration is wrong; the message starts as ``injection[0].target: …``.
         CommandError: ``wanted`` returned False.
     """
     from shmio.injection import compile_program  # noqa: PLC0415 - loads numpy, which nothing else here needs
@@ -277,7 +287,7 @@ def _lay(
 
 
 def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Declaration]:
-    """Read declarations from tables, and give each that has no seed a random one.
+    """Read declarations from tables, and draw a seed for those that have none.
 
     Raises:
         DeclarationError: A declaration is wrong.
@@ -287,16 +297,16 @@ def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Decla
         read = parse_campaign({"injection": tables}) if tables else []
     except ConfigError as error:
         raise DeclarationError(str(error)) from None
-    # 53 bits: every JSON reader keeps such a number exactly.
+    # 53 bits: every JSON reader represents such a number exactly.
     return [msgspec.structs.replace(one, seed=secrets.randbits(53)) if one.seed is None else one for one in read]
 
 
 class Campaign(Following[Happening]):
     """Declared injections that this program has laid.
 
-    Iterate over it for their events: the iteration ends when all of them are lifted. Events that were
-    overwritten before they could be read are left out. Leaving the ``with`` block lifts the rest,
-    unless they were laid with ``keep``.
+    Iterate over it for their events: the iteration ends when all of them are lifted. It leaves out
+    events that were overwritten before they could be read. Leaving the ``with`` block lifts the
+    remaining injections, unless they were laid with ``keep``.
     """
 
     def __init__(
@@ -308,11 +318,11 @@ class Campaign(Following[Happening]):
         *,
         keep: bool,
     ) -> None:
-        """Lay all of them, or none.
+        """Lay all the injections, or none.
 
         Args:
             segment: The instance's segment.
-            declarations: What to lay.
+            declarations: The injections to lay.
             blocks: The instance's blocks, by source.
             source_writer: Returns the writer that sends commands to a block.
             keep: Whether the injections stay when this program ends.
@@ -341,11 +351,11 @@ class Campaign(Following[Happening]):
 
     def _take(self) -> Happening | None:
         for source, (block, cursor) in self._cursors.items():
-            retired = block.retired  # before looking
+            retired = block.retired  # before reading
             while (event := cursor.poll()) is not None:
                 if event.kind in _EVENTS and event.offset == 0 and (source, event.injection) in self._left:
                     return self._happening(source, event)  # the first part, if the event has several
-            if cursor.take_missed():  # some of them may be about lifted injections
+            if cursor.take_missed():  # a lost event may have been that of a lifted injection
                 present = {one.number for one in block.standing.read() if not one.lifted}
                 self._left = {key: one for key, one in self._left.items() if key[0] != source or key[1] in present}
             if retired:
@@ -365,7 +375,7 @@ class Campaign(Following[Happening]):
         )  # fmt: skip
 
     def close(self) -> None:
-        """Lift the injections that still stand, unless they are to be kept."""
+        """Lift the remaining injections, unless they were laid with ``keep``."""
         super().close()
         for one in () if self._keep else self._left.values():
             with suppress(CommandError):  # it is over, or somebody else has lifted it
@@ -374,7 +384,7 @@ class Campaign(Following[Happening]):
 
 
 def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
-    """Lift injections, given by writer and number. One that is already gone counts as lifted.
+    """Lift injections, given by writer and number. One that is lifted already is no error.
 
     Raises:
         CommandError: Some could not be lifted; the message gives the reasons.
@@ -401,7 +411,7 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
 
 
 def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, object]:
-    """Return values by the paths of their topics. ValueRangeError: two topics have the same path."""
+    """Return values by the paths of their topics. ValueRangeError: two paths are the same."""
     found: dict[str, object] = {}
     for topic, (path, value) in zip(topics, values.items(), strict=True):
         if topic.path in found:
@@ -411,7 +421,7 @@ def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, 
 
 
 def as_given(paths: Iterable[str], outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Return outcomes under the paths that the caller gave."""
+    """Return outcomes with the paths that the caller gave."""
     return [dataclasses.replace(outcome, path=path) for path, outcome in zip(paths, outcomes, strict=True)]
 
 

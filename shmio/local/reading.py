@@ -1,4 +1,4 @@
-"""Readings of a local program: values of registers, and frames with their layout."""
+"""Values that a local program reads: single registers, and frames with their layout."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 class View:
     """A copy of a frame, with the layout to decode it. It never changes.
 
-    ``missed`` counts the frames lost between the previous frame of the stream and this one.
+    ``missed`` is the number of frames lost between the previous frame of the stream and this one.
     """
 
     block: Block
-    """The block that published the frame."""
+    """Block in which the frame was published."""
     frame: Frame
     missed: int = 0
 
@@ -39,9 +39,9 @@ class View:
 
     @property
     def section(self) -> int:
-        """Index that tells the blocks of a source apart.
+        """Index that identifies the block.
 
-        A reload may replace a source's block; frame numbers then start again at 1.
+        A reload may replace a source's block. Frame numbers then start again at 1.
         """
         return self.block.section
 
@@ -57,16 +57,16 @@ class View:
 
     @property
     def quality(self) -> Quality:
-        """Quality as of now: a frame turns bad with age."""
+        """Present quality: a frame becomes bad when it is too old."""
         return self.block.assess(self.frame)[0]
 
     @property
     def reason(self) -> str:
-        """Why quality is not good; empty if it is."""
+        """Reason why the quality is not good; empty if it is."""
         return self.block.assess(self.frame)[1]
 
     def __getitem__(self, path: str) -> Value:
-        """Return the value of a register or array element that consumers see, whatever its quality.
+        """Return a register's or element's value as consumers see it, whatever its quality.
 
         Raises:
             PathError: There is no such register.
@@ -92,7 +92,10 @@ class View:
 
     @cached_property
     def array(self) -> np.ndarray[Any, np.dtype[Any]]:
-        """The decoded frame: a numpy structured array of shape (1,), with one field per register path."""
+        """The decoded frame: a numpy structured array of shape (1,), with a field per register.
+
+        The fields are named by the registers' paths.
+        """
         return _frame_codec(self.layout).decode(self.frame.image)
 
 
@@ -108,10 +111,9 @@ def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool
 
     Args:
         block: The frame's block.
-        register: What to read.
+        register: The register.
         frame: The frame; None if the source has not published one yet.
-        aged: Whether its quality is that of now, which depends on its age; otherwise it is the one
-            that the frame was published with.
+        aged: Whether to assess its quality now, by its age; otherwise it counts as at publication.
     """
     if frame is None:
         return Reading(block.source, register, None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
@@ -128,7 +130,7 @@ def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool
 
 
 def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:
-    """Whether an injection covers any of these registers of a frame."""
+    """Return whether an injection covers any of these registers in a frame."""
     if frame.effective is None:
         return False
     standing = [one for one in block.standing.read() if one.direction == "out"]
@@ -136,5 +138,5 @@ def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:
 
 
 def holds_none(value: Value) -> bool:
-    """Whether a value, or an element of an array, could not be decoded."""
+    """Return whether a value or an element of it is None: it could not be decoded."""
     return any(map(holds_none, value)) if isinstance(value, list) else value is None

@@ -1,6 +1,6 @@
-"""Control replays from a local program: the sources of a recording move together, in step.
+"""Control replays from a local program. The sources of one recording always move together.
 
-Also reads times of a recording as users write them.
+This module also parses times and dates that users give.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from shmio.segment.playhead import (
 from shmio.segment.segment import Segment
 
 ANSWER_S: Final = 5.0
-"""How long to wait for an answer that needs no search."""
+"""Time-out for an answer that needs no search."""
 _SEARCH_S: Final = 600.0
 _TURN_NS: Final = 500_000_000
-"""How often to check whether the caller has given up."""
+"""Interval at which to check whether the caller has given up."""
 
 
 class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A request to change replays. Fields that are None or empty change nothing.
+    """A request to change replays. A field that is None or empty changes nothing.
 
     Attributes:
         paused: Whether to pause.
         speed: Speed relative to the instance's clock, 0.01 to 1000.
-        seek: Position to go to: seconds from the start, or a date and time (local, unless it names
-            a time zone).
+        seek: Position to go to: seconds from the start, or a date and time, which is local unless
+            it has a time zone.
         until: Position at which to pause once, given as ``seek``.
         loop: Whether to start again at the end.
         change: Path of a register: play to its next change, and pause there.
@@ -65,19 +65,22 @@ class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def nothing(self) -> bool:
-        """Whether the request changes nothing."""
+        """True if the request changes nothing."""
         return self == ReplayRequest(sources=self.sources)
 
 
 class Replays:
-    """The replays of an instance. Several threads may use it, but only one program at a time."""
+    """The replays of an instance.
+
+    Several threads may use it; only one program moves them at a time.
+    """
 
     def __init__(self, segment: Segment) -> None:
-        """``segment`` must be writable to change anything."""
+        """Take the segment, which must be writable to change anything."""
         self._segment = segment
 
     def __call__(self, **wish: Unpack[Wish]) -> list[Playing]:
-        """Change replays, as ``replay`` of :class:`shmio.Cell`; without arguments, only return their status."""
+        """Control the replays, and return their status: see ``replay`` of :class:`shmio.Cell`."""
         self._segment.require_running()
         keys: dict[str, Any] = {**wish, "sources": tuple(wish.get("sources", ()))}
         for key in {"seek", "until"} & keys.keys():
@@ -100,11 +103,11 @@ class Replays:
         return [_replay_status(source, play, now_ns) for source, play in plays.items()]
 
     def pause(self) -> list[Playing]:
-        """Pause all replays; returns their status."""
+        """Pause all replays, and return their status."""
         return self.change(ReplayRequest(paused=True))
 
     def play(self, speed: float | None = None) -> list[Playing]:
-        """Resume all replays; one that has reached its end starts again. Returns their status.
+        """Resume all replays, and return their status. One that has reached its end starts again.
 
         Args:
             speed: Speed relative to the instance's clock, 0.01 to 1000; None: as before.
@@ -119,7 +122,7 @@ class Replays:
         return self.change(ReplayRequest(speed=speed))
 
     def seek(self, to: float | str) -> list[Playing]:
-        """Go to a position; returns the status.
+        """Go to a position, and return the status.
 
         Args:
             to: Seconds from the start, or a date and time.
@@ -130,7 +133,7 @@ class Replays:
         return self.change(ReplayRequest(seek=str(to)))
 
     def loop(self, on: bool = True) -> list[Playing]:
-        """Set whether replays start again at the end."""
+        """Set whether replays start again at the end, and return their status."""
         return self.change(ReplayRequest(loop=on))
 
     def play_until(self, to: float | str) -> list[Playing]:
@@ -142,7 +145,7 @@ class Replays:
 
         Args:
             path: Path of the register.
-            jump: Whether to go there at once.
+            jump: Whether to go there at once, instead of playing.
 
         Raises:
             PathError: There is no such register.
@@ -155,7 +158,7 @@ class Replays:
 
         Args:
             kind: Kind of event, such as ``accepted`` or ``noted``, or ``any``.
-            jump: Whether to go there at once.
+            jump: Whether to go there at once, instead of playing.
 
         Raises:
             CommandError: There is no such event any more.
@@ -163,7 +166,7 @@ class Replays:
         return self.change(ReplayRequest(event=kind, jump=jump))
 
     def change(self, wanted: ReplayRequest, given_up: Callable[[], bool] = lambda: False) -> list[Playing]:
-        """Carry out a request; returns the status of the replays afterwards.
+        """Carry out a request, and return the status of the replays.
 
         Args:
             wanted: The request.
@@ -172,7 +175,8 @@ class Replays:
         Raises:
             ValueRangeError: The speed or a position is out of range.
             PathError: A source or a register does not exist.
-            CommandError: There is no replay, it refuses, does not answer, or the search was given up.
+            CommandError: There is no replay, one refuses or does not answer, or the caller has
+                given up the search.
         """
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
@@ -186,7 +190,7 @@ class Replays:
                 self._move(heads, lambda play, clock_ns: _move_request(play, wanted, clock_ns))
         return self.status(wanted.sources)
 
-    # ---- which -----------------------------------------------------------------------------------------------------
+    # ---- choice ----------------------------------------------------------------------------------------------------
 
     def _blocks(self) -> dict[str, Block]:
         self._segment.refresh()
@@ -212,7 +216,7 @@ class Replays:
         if wanted.change:
             names = [self._register(wanted.change)[0]]
         meant = {_recording(plays[source]) for source in names or plays}
-        if wanted.event and len(meant) > 1:  # their positions are unrelated
+        if wanted.event and len(meant) > 1:  # positions in different recordings are unrelated
             raise CommandError(
                 f"several recordings are playing: choose one by the name of one of its sources ({', '.join(plays)})"
             )
@@ -229,15 +233,15 @@ class Replays:
 
     @contextmanager
     def _held(self, sources: Collection[str]) -> Iterator[dict[str, Playhead]]:
-        """Lock the playheads of sources for this program."""
+        """Lock the playheads of sources, so that no other program moves them."""
         blocks = self._blocks()
         heads = {source: head for source in blocks if source in sources and (head := blocks[source].playhead)}
         with ExitStack() as stack:
-            for head in heads.values():  # each program in the same order
+            for head in heads.values():  # all programs lock in this order, so that none deadlock
                 stack.enter_context(head.held())
             yield heads
 
-    # ---- what ------------------------------------------------------------------------------------------------------
+    # ---- moves -----------------------------------------------------------------------------------------------------
 
     def _go_to(self, wanted: ReplayRequest, heads: Mapping[str, Playhead], given_up: Callable[[], bool]) -> None:
         """Pause, search ahead, and play or jump to what was found."""
@@ -265,8 +269,8 @@ class Replays:
             self._move(heads, lambda _, now: MoveRequest(now, paused=False, until_ns=at_ns, speed=wanted.speed))
 
     def _move(self, heads: Mapping[str, Playhead], move: Callable[[PlayState, int], MoveRequest]) -> None:
-        """Move all playheads from the same time of the clock on."""
-        clock_ns = self._segment.clock.read().time_ns  # after the current step, before which no source answers
+        """Change the movement of all playheads at the same time of the clock."""
+        clock_ns = self._segment.clock.read().time_ns  # a step under way counts: no source answers before its end
         asks: dict[str, PlayheadRequest] = {}
         for source, head in heads.items():
             play = head.read()
@@ -322,7 +326,11 @@ def _recording(play: PlayState) -> tuple[int, int, int]:
 
 
 def _move_request(play: PlayState, wanted: ReplayRequest, clock_ns: int) -> MoveRequest:
-    """Turn a request into one source's move. ValueRangeError: a position is not in the recording."""
+    """Convert a request to the move of one source.
+
+    Raises:
+        ValueRangeError: A position is not in the recording.
+    """
     return MoveRequest(
         clock_ns,
         paused=wanted.paused,
@@ -379,7 +387,7 @@ def moment_ns(text: str, begin_ns: int) -> int:
 
 
 def date_ns(text: str) -> int:
-    """Parse a date and time in ISO 8601; local time, unless it names a time zone.
+    """Parse a date and time in ISO 8601, which is local time unless it has a time zone.
 
     Returns:
         UTC in ns.

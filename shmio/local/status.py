@@ -1,4 +1,4 @@
-"""Status of an instance, read from its segment alone: it needs no living process."""
+"""Status of an instance, read from its segment without the help of any process."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from shmio.segment.processes import Phase, ProcessSlot
 from shmio.segment.segment import Segment, running_instances
 
 SILENT_S = 5.0
-"""A supervisor without a heartbeat for this long is stopped or hangs."""
+"""Time without a heartbeat after which a supervisor counts as stopped or hanging."""
 
 
 class ProcessStatus(msgspec.Struct, kw_only=True):
-    """Status of one process. While it is not alive ``uptime_s`` is 0 and ``pid`` is null."""
+    """Status of one process. If it is not alive, ``uptime_s`` is 0 and ``pid`` is null."""
 
     name: str
     kind: str
@@ -35,8 +35,8 @@ class ProcessStatus(msgspec.Struct, kw_only=True):
 class SourceStatus(ProcessStatus, kw_only=True):
     """Status of a source: its process, and the newest frame of its block.
 
-    ``cycle`` is null before the first frame. ``real_time``: the source does not use the instance
-    clock, so steps do not move it.
+    ``cycle`` is null before the first frame. ``real_time`` is true if the source does not use the
+    instance clock, so steps do not move it.
     """
 
     quality: str
@@ -55,10 +55,10 @@ class SupervisorStatus(msgspec.Struct):
 
 
 class ClockStatus(msgspec.Struct):
-    """Status of the instance's clock. ``mode``: wall or virtual. ``step``: the last finished step.
+    """Status of the instance's clock. ``mode`` is wall or virtual, ``step`` the last finished step.
 
-    ``note`` says which processes a step waits for, why the last one failed, or what it did not move.
-    Before the first step it says how to return to real time.
+    ``note`` says which processes a step waits for, why the last step failed, or what it did not
+    move. Before the first step, it says how to return to real time.
     """
 
     mode: str
@@ -88,17 +88,17 @@ class InstanceStatus(msgspec.Struct):
 
     @property
     def running(self) -> bool:
-        """Whether any part of the instance runs."""
+        """True if any process of the instance runs."""
         return self.state != str(InstanceState.STOPPED)
 
 
 def read_status(instance: str, config: str | None = None, file: Path | None = None) -> InstanceStatus:
-    """Read the status of an instance, whether it runs or not.
+    """Read the status of an instance, running or not.
 
     Args:
         instance: Name of the instance.
-        config: Option that names the configuration on a command line, such as ``-c plc.toml``; empty
-            if none is needed, None if unknown.
+        config: Option of the commands in the note, such as ``-c plc.toml``; empty if none is
+            needed, None if unknown.
         file: The configuration that the instance must have been started from; None: any.
 
     Raises:
@@ -122,8 +122,8 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
     Args:
         segment: The segment.
         remedy: Advice for the note if the supervisor is dead.
-        asking: Kind of the calling process, if it belongs to the instance: a process cannot see its
-            own lock.
+        asking: Kind of the calling process, if it belongs to the instance: it counts as alive,
+            because a process cannot see its own lock.
     """
     supervised = segment.supervised
     pid, state = segment.supervisor
@@ -163,7 +163,7 @@ def clock_status(state: Clock) -> ClockStatus:
 
 
 def supervisor_silence(segment: Segment) -> str | None:
-    """Describe a supervisor that lives but has stopped its heartbeat; None if all is well."""
+    """Describe a living supervisor without a heartbeat, with the remedy; None if there is none."""
     silent_s = (time.monotonic_ns() - segment.supervisor_heartbeat_ns) / 1e9
     if silent_s < SILENT_S:
         return None
@@ -176,7 +176,7 @@ def supervisor_silence(segment: Segment) -> str | None:
 
 
 def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], note: str) -> InstanceState:
-    """Return the supervisor's state while it starts or stops; else a newer one, from the processes."""
+    """Return the supervisor's state while it starts or stops; else, the state of the processes."""
     if told not in (InstanceState.RUNNING, InstanceState.DEGRADED):
         return told
     running = [p.state == str(Phase.RUNNING) and not complaint(p.kind, p.note) for p in processes]
@@ -184,7 +184,7 @@ def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], n
 
 
 def complaint(kind: str, note: str) -> str:
-    """Return the problem that a running process reports; empty if there is none.
+    """Return the problem that the note of a running process reports; empty if there is none.
 
     A recorder without a problem reports ``to FILE``.
     """
@@ -192,7 +192,7 @@ def complaint(kind: str, note: str) -> str:
 
 
 def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: str = "") -> InstanceState:
-    """Return the state of a started instance: degraded if a process does not run or a source is bad.
+    """Return the state of a started instance: degraded if any part has a problem, else running.
 
     Args:
         running: For each process, whether it runs without a :func:`complaint`.
@@ -210,10 +210,10 @@ def _process(
     phase, note = told.phase, told.note
     if not supervised:
         phase = Phase.RUNNING if alive else Phase.STOPPED
-    elif phase is Phase.RUNNING and not alive:  # the supervisor has not noticed yet
+    elif phase is Phase.RUNNING and not alive:  # the supervisor has not noticed the death yet
         phase, note = Phase.STOPPED, "dead"
     counters = slot.counters
-    current = alive and report.pid != 0 and report.started_ns >= told.spawned_ns  # not a predecessor's report
+    current = alive and report.pid != 0 and report.started_ns >= told.spawned_ns  # else that of the previous process
     values = ProcessStatus(
         name=slot.name,
         kind=slot.kind,

@@ -1,4 +1,7 @@
-"""Follow registers of a local instance: their present values, then each change; and the base of such iterators."""
+"""Follow registers of a local instance: their present values, then each change.
+
+This module also has the base class of iterators that several blocks wake.
+"""
 
 from __future__ import annotations
 
@@ -24,25 +27,26 @@ from shmio.segment.doorbell import Relay
 from shmio.segment.segment import Segment
 
 TURN_S: Final = 0.2
-"""How often a waiting iterator checks that the instance still runs and that nobody has closed the iterator."""
+"""Interval at which a waiting iterator checks that the instance runs, and that nobody closed it."""
 
 Item = TypeVar("Item")
 
 
 class Following(Generic[Item]):
-    """Iterates over news of several blocks, in one thread; any thread may close it.
+    """Base of iterators over frames or events of several blocks.
 
-    A relay for each followed block wakes it, for frames and events alike.
+    One thread may iterate; any thread may close the iterator. Each followed block has a relay that
+    wakes it, for frames and events alike.
     """
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
-        self._turn = threading.Lock()  # held while the mapped memory is read: close waits for it
-        self._relays: dict[int, Relay] = {}  # by the block's section
-        self._stop = weakref.finalize(self, _stop, self._relays)  # also for a program that does not close it
+        self._turn = threading.Lock()  # locked while the mapped memory is read: close waits for it
+        self._relays: dict[int, Relay] = {}  # by section of the block
+        self._stop = weakref.finalize(self, _stop, self._relays)  # also if the program does not close it
         self._closed = False
         self._due_s = math.inf
-        """When to look again although nothing has happened, in s of the monotonic clock."""
+        """Time of the next check if nothing wakes the iterator, in s of the monotonic clock."""
         self._checked_s = time.monotonic()
 
     def __iter__(self) -> Self:
@@ -54,7 +58,7 @@ class Following(Generic[Item]):
                 if self._closed:
                     raise StopIteration
                 for relay in self._relays.values():
-                    relay.heard()  # before looking
+                    relay.heard()  # before reading
                 found = self._take()
                 poll = select.poll()
                 for relay in self._relays.values():
@@ -76,7 +80,7 @@ class Following(Generic[Item]):
         self._relays[block.section] = Relay(block.ring, f"following-{block.source}", round(TURN_S * 1e9))
 
     def _leave(self, block: Block) -> None:
-        """Let a block wake this iterator no longer."""
+        """Stop a block from waking this iterator."""
         self._relays.pop(block.section).join()
 
     def end(self) -> None:
@@ -109,7 +113,7 @@ def _stop(relays: dict[int, Relay]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """One frame of a source, and the registers that may have changed with it: see :class:`shmio.model.cell.Update`."""
+    """One frame of a source, with its readings: see :class:`shmio.model.cell.Update`."""
 
     source: str
     frame: int
@@ -142,14 +146,14 @@ class Subscription(Following[Update]):
         Args:
             segment: The instance's segment.
             blocks: Returns the instance's present blocks, by source.
-            patterns: What to follow.
+            patterns: Names of the registers to follow.
             every_frame: Whether to give an update for each frame.
-            max_rate_hz: The most updates of each source in a second; 0: no limit.
+            max_rate_hz: Maximum number of updates per second of each source; 0: no limit.
         """
         super().__init__(segment)
         self._blocks = blocks
         self._patterns = patterns
-        self._wanted: dict[str, list[str]] = {}  # by source, each pattern with its source
+        self._wanted: dict[str, list[str]] = {}  # patterns by source, including the source's name
         self._every_frame = every_frame
         self._interval_s = 1 / max_rate_hz if max_rate_hz > 0 else 0.0
         self._followers: list[_Follower] = []
@@ -157,16 +161,16 @@ class Subscription(Following[Update]):
         try:
             _check(patterns, max_rate_hz, every_frame=every_frame)
             self._begin()
-        except (PathError, ValueRangeError) as error:  # the first update raises it, as it does for a remote cell
+        except (PathError, ValueRangeError) as error:  # raised by the first update, as for a remote cell
             self._refusal = error
 
     def _take(self) -> Update | None:
         if self._refusal is not None:
             raise self._refusal
         for follower in list(self._followers):
-            retired = follower.block.retired  # before looking: frames published before the end are still read
+            retired = follower.block.retired  # before reading, so that no frame published before the end is missed
             if (update := follower.take()) is not None:
-                self._followers.remove(follower)  # the others come first now
+                self._followers.remove(follower)  # so that the other followers come first next time
                 self._followers.append(follower)
                 return update
             if retired and (update := self._succeed(follower)) is not None:
@@ -175,7 +179,7 @@ class Subscription(Following[Update]):
         return None
 
     def _begin(self) -> None:
-        """Follow the blocks that the patterns name. PathError: one names nothing."""
+        """Follow the blocks that the patterns name. PathError: a pattern names nothing."""
         blocks = self._blocks()
         layouts = Layouts(blocks)
         wanted: dict[str, list[str]] = {}
@@ -194,7 +198,7 @@ class Subscription(Following[Update]):
         self._follow(block)
 
     def _succeed(self, old: _Follower) -> Update | None:
-        """Follow the block with which a reload has replaced another; return the last update if there is none."""
+        """Follow the block that has replaced a retired one; if none has, return the last update."""
         self._segment.require_running()
         self._followers.remove(old)
         self._leave(old.block)
@@ -211,7 +215,7 @@ class Subscription(Following[Update]):
 
 
 def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) -> None:
-    """Raise ValueRangeError for arguments that no endpoint accepts either."""
+    """Raise ValueRangeError for arguments that an endpoint would refuse, too."""
     if not patterns:
         raise ValueRangeError("no pattern is given: name a path, a structure, a glob, or a source")
     if not 0 <= max_rate_hz < math.inf:
@@ -221,12 +225,12 @@ def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) ->
 
 
 class _Follower:
-    """Follows the registers of one block, and keeps the last frame that an update was for."""
+    """Follows the registers of one block, and keeps the frame of the last update."""
 
     def __init__(self, block: Block, registers: Sequence[Register], *, every_frame: bool, interval_s: float) -> None:
         self.block = block
         self.due_s = math.inf
-        """Earliest time of the next update, if ``max_rate_hz`` delays one."""
+        """Earliest time of the next update, if ``max_rate_hz`` delays it."""
         self._registers = registers
         self._scan = ChangeScan(registers)
         self._frames = FrameFollower(block)
@@ -241,12 +245,12 @@ class _Follower:
         frame = self._next()
         missed = 0 if frame is None else frames.take_missed()
         if frame is None:
-            if shown is None or frames.behind:  # the last one is not stale: a newer one is not due yet
+            if shown is None or frames.behind:  # if a newer frame waits until it is due, the last one is not stale
                 return None
             frame = shown
-        aged = not frames.behind  # only the newest frame can be stale, not those that a slow reader still gets
+        aged = not frames.behind  # only the newest frame can be stale, not an older one that a slow reader gets late
         frames.take(frame, aged=aged)
-        # A stale reason holds the age: its text changes, the fact does not.
+        # The reason of a stale frame contains its age. A change of the age alone is ignored.
         reason = frames.reason.partition(":")[0]
         state = frames.quality, reason, frame.provenance, frame.incarnation, self.block.standing.sequence
         if shown is None or state != self._state:
@@ -279,11 +283,11 @@ class _Follower:
             return None
         try:
             return frames.newest()
-        except SegmentError:  # each copy was overwritten while it was read: there will be another frame
+        except SegmentError:  # overwritten while it was read: there will be another frame
             return None
 
     def end(self, what: str) -> Update:
-        """Return the last update of a source that a reload has removed."""
+        """Return the last update, for a source that a reload has removed."""
         frame = self._frames.frame
         times = (0, 0, 0, 0, 0) if frame is None else (
             frame.number, frame.cycle, frame.incarnation, frame.clock_ns, frame.source_ns,

@@ -1,4 +1,4 @@
-"""Control an instance's time: take it over, step it until every source has done the step, play it, release it."""
+"""Control an instance's time: take over, step, play and release it."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ from shmio.segment.segment import Segment
 MIN_STEP_NS: Final = 1_000
 MAX_STEP_NS: Final = 3_600_000_000_000
 _TURN_NS: Final = 100_000_000
-"""How often a process that waits for the owner of time polls: an owner that dies rings no bell."""
+"""Polling interval of a wait for the owner of time: an owner that dies rings no doorbell."""
 MAX_RATE: Final = 1000.0
 _DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
 """Kinds of processes whose delivery a step may wait for."""
 _PATIENCE_S: Final = 2.0
-"""How long to wait for the owner of time to give it up; the gRPC endpoint does when its clients are idle."""
+"""Time to wait until the owner gives up time.
+
+The gRPC endpoint gives it up when its clients are idle.
+"""
 _LATE_NS: Final = 500_000_000
-"""Playing catches up with at most this much delay."""
+"""Maximum delay for which playing catches up."""
 
 _NOBODY: Final = (
     "no source uses the instance clock, so stepping has no effect; sources with a device continue in real time"
@@ -38,7 +41,7 @@ _REAL: Final = "; shmio step --release returns to real time"
 _PAUSED: Final = f"it is paused until the next step{_REAL}"
 
 log = logging.getLogger("shmio.time")
-log.addHandler(logging.NullHandler())  # a program that asks for no log gets none
+log.addHandler(logging.NullHandler())  # without it, Python would print warnings of a program that has set up no log
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +60,10 @@ class Step:
 
 
 class StepWait(NamedTuple):
-    """A wait within a step: until a doorbell differs from ``seen``, at most ``rest_ns``.
+    """A wait within a step: until a doorbell's value is not ``seen``, at most ``rest_ns``.
 
-    The doorbell is that of ``block``, whose answer is awaited. If ``block`` is None it is the doorbell
-    of the processes that deliver steps.
+    The doorbell is that of ``block``, which has not answered. If ``block`` is None, it is that of
+    the processes that deliver steps.
     """
 
     block: Block | None
@@ -71,9 +74,9 @@ class StepWait(NamedTuple):
 class Coordinator:
     """Moves the time of one instance. Several threads may use it; one program at a time owns time.
 
-    In a step, the clock page announces the step's number, and each block that uses the instance clock
-    publishes its frame for it. Then the step is ``done``. This process and the others that serve remote
-    programs deliver it.
+    A step begins when the clock page announces its number. Each source that uses the instance clock
+    then publishes a frame for it, and the step is ``done``. Finally, this process and others that
+    serve remote programs deliver the step to them.
     """
 
     def __init__(
@@ -84,14 +87,15 @@ class Coordinator:
         hard_s: float = 10.0,
         deliver: Callable[[Step], None] = lambda _: None,
     ) -> None:
-        """Prepare to move time; it is not taken over yet.
+        """Prepare to move time, without taking it over yet.
 
         Args:
-            segment: The instance's segment, writable. A process that delivers steps passes the segment
-                object by which it holds its role.
-            soft_s: After this time the log and the clock page say which process a step waits for.
-            hard_s: After this time a step has failed.
-            deliver: Called within :meth:`step` when all sources have done it.
+            segment: The instance's segment, writable. A process that delivers steps must pass the
+                segment object with which it has locked its slot.
+            soft_s: Soft time-out of a step: from then on, the log and the clock page name the
+                process that it waits for.
+            hard_s: Hard time-out of a step: it has failed.
+            deliver: Called within :meth:`step` when all sources have done the step.
         """
         self._segment = segment
         self._soft_ns = round(soft_s * 1e9)
@@ -109,11 +113,11 @@ class Coordinator:
         """Take over time: from now on only steps move it.
 
         Args:
-            patience_s: How long to wait for an owner that does not play.
-            steps: Whether a step follows at once, so that no note about stopped time is needed.
+            patience_s: Time to wait, in s, until an owner that does not play gives it up.
+            steps: Whether a step follows at once. Then the clock gets no note about stopped time.
 
         Raises:
-            TimeError: Another living process owns time, and plays it or does not give it up.
+            TimeError: Another living process owns time, and is playing or does not give it up.
         """
         with self._turn:
             if self._owns:
@@ -137,10 +141,10 @@ class Coordinator:
             self._ring_all()
 
     def release(self, patience_s: float = 0.0) -> None:
-        """Return to real time, which goes on from the present virtual time. Nobody owns it then.
+        """Return to real time, which continues from the present virtual time. Nobody owns it then.
 
         Args:
-            patience_s: How long to wait for an owner that does not play.
+            patience_s: Time to wait, in s, until an owner that does not play gives it up.
 
         Raises:
             TimeError: Another living process owns time, or time was virtual from the start.
@@ -172,7 +176,7 @@ class Coordinator:
             )
 
     def set_step_size(self, dt_ns: int) -> None:
-        """Set the default length of a step; takes over time.
+        """Set the default length of a step; take over time.
 
         Raises:
             ValueRangeError: The length is not within 1 us and 1 h.
@@ -184,7 +188,7 @@ class Coordinator:
             self._write(self.read()._replace(step_size_ns=dt_ns))
 
     def set_playing(self, playing: bool, rate: float = 1.0) -> None:
-        """Announce that the owner plays time at ``rate`` times real time, or no longer; takes over time.
+        """Announce whether the owner plays time, and at which rate; take over time.
 
         Raises:
             ValueRangeError: The rate is not above 0 and at most 1000.
@@ -197,16 +201,16 @@ class Coordinator:
             self._write(self.read()._replace(playing=playing, rate=rate))
 
     def step(self, dt_ns: int | None = None) -> Step:
-        """Move time by one step, and wait until it is done and delivered; takes over time.
+        """Move time by one step, and wait until it is done and delivered; take over time.
 
-        A step that fails uses up its number and its time.
+        A failed step also uses up its number and its time.
 
         Args:
             dt_ns: Length of the step; None: the step size.
 
         Raises:
-            TimeError: Another process owns time, a source failed, or a source or a delivering process
-                did not answer within the hard time-out.
+            TimeError: Another process owns time, a source failed, or a source or a delivering
+                process did not answer within the hard time-out.
             ValueRangeError: The length is not within 1 us and 1 h.
         """
         with self._turn, closing(self.stepping(dt_ns)) as stepping:
@@ -222,10 +226,10 @@ class Coordinator:
                     block.ring.wait(seen, rest_ns)
 
     def stepping(self, dt_ns: int | None = None) -> Generator[StepWait, None, Step]:
-        """Do a step for an event loop: yields what to wait for, and checks again when resumed.
+        """Do a step for an event loop: yield what to wait for, and check again when resumed.
 
-        Close the generator if you do not run it to its end. Call no other method of this coordinator
-        meanwhile.
+        Close the generator if you do not run it to its end. Call no other method of this
+        coordinator meanwhile.
         """
         self.take_over(steps=True)
         before = self.read()
@@ -237,7 +241,7 @@ class Coordinator:
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was cancelled"
         try:
-            self._segment.clock.write(asked, ring=False)  # delivering processes need to act only once it is done
+            self._segment.clock.write(asked, ring=False)  # delivering processes need not act before it is done
             self._ring([block.source for block in participants])
             problem = yield from self._await_frames(step.number, participants, asked)
         finally:
@@ -252,7 +256,7 @@ class Coordinator:
         return step
 
     def close(self) -> None:
-        """Give up the ownership of time, which stands still until another program takes it over."""
+        """Give up the ownership of time. Time stays stopped until another program takes it over."""
         with self._turn:
             if not self._owns or self._segment.closed:
                 return
@@ -281,12 +285,12 @@ class Coordinator:
             state = self.read()
             if rest_ns <= 0 or state.playing:
                 name = self._segment.instance
-                how = ", which is playing it; stop that first" if state.playing else "; it is free when that ends"
+                how = ", which is playing it; stop that first" if state.playing else "; wait until that program ends"
                 raise TimeError(f"the time of instance {name!r} is moved by {self._owner(state.owner)}{how}")
             bell.wait(seen, min(rest_ns, _TURN_NS))
 
     def _frozen(self, state: Clock) -> Clock:
-        """Return the state of virtual time that continues wall time from now."""
+        """Return a state of virtual time that continues the wall time of ``state`` from now."""
         now_ns = self._segment.clock_ns(time.monotonic_ns()) + state.offset_ns
         step = max([state.step, *(self._cycle(block, state, now_ns) for block in self._participants())])
         return state._replace(mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns, resumed_ns=0, offset_ns=0)
@@ -299,7 +303,7 @@ class Coordinator:
     def _cycle(block: Block, state: Clock, now_ns: int) -> int:
         """Return the present cycle of a free-running block, or a later one that it has published.
 
-        For a block that replays a recording it is 0: the recording's cycles are not steps.
+        For a block that replays a recording, return 0: the recording's cycles are not steps.
         """
         if block.playhead is not None:
             return 0
@@ -316,14 +320,14 @@ class Coordinator:
                 self._segment.clock.slot_bell(slot.index).ring()
 
     def _await_frames(self, number: int, participants: Sequence[Block], asked: Clock) -> Generator[StepWait, None, str]:
-        """Wait for each block's frame for a step; returns who failed and why, or an empty string."""
+        """Wait for each block's frame for a step; return a text about failures, or an empty one."""
         begun_ns = time.monotonic_ns()
         waiting = list(participants)
         problems: list[str] = []
         warned = False
         while waiting:
             block = waiting[0]
-            seen = block.ring.doorbell()  # before looking
+            seen = block.ring.doorbell()  # before reading
             found = _step_answer(block, number)
             if found is not None:
                 waiting.remove(block)
@@ -344,7 +348,7 @@ class Coordinator:
         return "; ".join(problems)
 
     def _await_delivery(self, number: int) -> Generator[StepWait, None, str]:
-        """Wait until the other processes have delivered a step; returns who has not, or an empty string."""
+        """Wait until others have delivered a step; return a text about those that have not."""
         clock, begun_ns = self._segment.clock, time.monotonic_ns()
         rung = warned = False
         while True:
@@ -362,15 +366,15 @@ class Coordinator:
             if passed_ns >= self._soft_ns and not warned:
                 warned = True
                 log.warning("step %d waits for its delivery by %s", number, names)
-            # With a time limit: a process that dies rings no bell.
+            # With a time limit, because a process that dies rings no doorbell.
             yield StepWait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
 
     def _owes(self, slot: ProcessSlot, number: int) -> bool:
-        """Whether another living process delivers steps and has not delivered this one yet."""
+        """Return whether another living process still has to deliver this step."""
         if slot.kind not in _DISPATCHERS:
             return False
         last = self._segment.clock.delivered(slot.index)
-        return last is not None and last < number and slot.alive()  # our own lock does not count as one held
+        return last is not None and last < number and slot.alive()  # alive() ignores the lock of this process
 
     def _owner(self, pid: int) -> str:
         """Name the owner of time, by the clock page and the process table."""
@@ -379,13 +383,13 @@ class Coordinator:
 
 
 class Timekeeper:
-    """Steps or plays an instance's time, and owns that time from the first step until it is closed.
+    """Steps or plays an instance's time, which it owns from the first step until it is closed.
 
-    Use it from one thread; it plays in a thread of its own.
+    Use it from one thread. Playing runs in another thread.
     """
 
     def __init__(self, segment: Segment) -> None:
-        """``segment`` must be writable."""
+        """Take the segment, which must be writable."""
         self._segment = segment
         self._coordinator = Coordinator(segment)
         self._paused = threading.Event()
@@ -393,14 +397,24 @@ class Timekeeper:
         self._failure: ShmioError | None = None
 
     def step(self, dt_ns: int | None = None) -> Step:
-        """Move time by one step, as :meth:`Coordinator.step` does. TimeError: also while time is played."""
+        """Move time by one step, as :meth:`Coordinator.step` does.
+
+        Raises:
+            TimeError: As for that method, or time is being played.
+            ValueRangeError: The length is not within 1 us and 1 h.
+        """
         if self._player is not None:
             raise TimeError("time is playing: pause it before you step it")
         self._take_over()
         return self._coordinator.step(dt_ns)
 
     def play(self, rate: float = 1.0, dt_ns: int | None = None) -> None:
-        """Step in a thread, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
+        """Step in a thread, ``rate`` times as fast as real time.
+
+        Raises:
+            TimeError: Another program owns time.
+            ValueRangeError: The rate or the length is out of range.
+        """
         if dt_ns is not None:
             check_step(dt_ns)
         self.pause()
@@ -426,7 +440,12 @@ class Timekeeper:
             raise failure
 
     def release(self) -> None:
-        """Return to real time. TimeError: also if a step failed while time was played."""
+        """Return to real time.
+
+        Raises:
+            TimeError: Another program owns time, time was virtual from the instance's start, or a
+                step has failed while time was played.
+        """
         self._segment.require_running()
         self._coordinator.check_release()
         if self._player is not None:
@@ -466,7 +485,7 @@ def check_step(dt_ns: float) -> None:
 
 
 def _step_answer(block: Block, number: int) -> str | None:
-    """Return a block's answer to a step: empty if done, the reason if it failed, None if none came."""
+    """Return a block's answer to a step: empty if done, the reason if failed, None if missing."""
     if block.retired:
         return ""  # a reload has retired the block
     try:
@@ -482,7 +501,7 @@ def _step_answer(block: Block, number: int) -> str | None:
 
 
 def _describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
-    """Describe a source that has not answered a step in time."""
+    """Describe a source that has not answered a step within the hard time-out."""
     what = f"{block.source}: no answer within {hard_ns / 1e9:g} s"
     for slot in segment.processes:
         if slot.name == block.source:
@@ -494,12 +513,12 @@ def _describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
 
 
 def _take_over_note(participants: Sequence[Block]) -> str:
-    """Return the clock's note after time was taken over."""
+    """Return the clock's note for the time from take-over to the first step."""
     return _PAUSED if participants else f"{_NOBODY}{_REAL}"
 
 
 def _unmoved_note(segment: Segment, participants: Sequence[Block]) -> str:
-    """Describe what the next step will not move, with the remedy; empty if it moves everything."""
+    """Return a text about what a step does not move, with the remedy; empty if it moves all."""
     if not participants:
         return _NOBODY if segment.clock.stepped else f"{_NOBODY}{_REAL}"
     found: dict[str, list[str]] = {"paused": [], "over": []}

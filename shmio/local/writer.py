@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 TIMEOUT_S: Final = 2.0
 MIN_PERIODS: Final = 3
-"""By default a command may wait for TIMEOUT_S or this many cycles, whichever is longer."""
-_MODELS: Final = frozenset({"simulation", "remote"})  # connectors whose sources have registers that nobody writes
+"""By default, a command may wait for TIMEOUT_S or this number of cycles, whichever is longer."""
+_MODELS: Final = frozenset({"simulation", "remote"})  # connectors of sources with registers that only a model writes
 PATIENCE_S: Final = 1.0
 """Additional time for the device's answer to arrive."""
 RETIRED: Final = "the source was changed or removed by a reload"
@@ -49,14 +49,17 @@ SILENT: Final = f"the source gave no answer in time{_UNKNOWN}"
 
 
 class CommandSender:
-    """Sends a writer's commands to one block. The writer's process holds the slot that owns the queue."""
+    """Sends a writer's commands to one block.
+
+    The process must have locked the slot to which the command queue belongs.
+    """
 
     def __init__(self, block: Block, writer: int) -> None:
         self.block = block
         self.writer = writer
         self._turn = threading.Lock()
         self._pid = os.getpid()  # two processes on one queue would overwrite each other's commands
-        # Random, so as never to reuse the number of a predecessor's command, whose outcome may still come.
+        # Random: the previous owner of the queue may have commands whose outcomes are still to come.
         self._next = secrets.randbits(62) + 1
 
     def submit(
@@ -111,7 +114,7 @@ class PendingCommand:
 
     number: int
     paths: tuple[str, ...]
-    """The path that each item writes; adjacent items with the same path belong to one value."""
+    """Path that each item writes. Adjacent items with the same path belong to one value."""
     incarnation: int
     until_ns: int
     events: Cursor[Event]
@@ -138,21 +141,21 @@ class SourceWriter:
         self._sender = CommandSender(block, writer)
 
     def prepare(self) -> None:
-        """Compute which bits are writable, so that the first :meth:`submit` need not.
+        """Determine which bits are writable now, instead of in the first :meth:`submit`.
 
         This takes seconds for a large layout.
         """
         _ = self._writable
 
     def is_writable(self, register: Register) -> bool:
-        """Whether the configuration allows all of a register or array element to be written."""
+        """Return whether the configuration allows writing all of a register or array element."""
         own = bits_of(register)
         allowed = self._writable[register.offset : register.offset + register.size]
         return not any(bits & ~covered for bits, covered in zip(own, allowed, strict=True))
 
     @property
     def timeout_s(self) -> float:
-        """Default time that a command may wait for the source."""
+        """Default time that a command may wait for the source, in s."""
         return max(TIMEOUT_S, MIN_PERIODS * self.block.period_ns / 1e9)
 
     @cached_property
@@ -164,7 +167,7 @@ class SourceWriter:
 
         Args:
             values: Values of registers, whole arrays or elements, by path within the block.
-            timeout_s: How long the command may wait for the source; None: :attr:`timeout_s`.
+            timeout_s: Time in s that the command may wait for the source; None: :attr:`timeout_s`.
 
         Raises:
             PathError: There is no such register.
@@ -175,7 +178,7 @@ class SourceWriter:
         return self._send_values({path: (self._register(path), value) for path, value in values.items()}, timeout_s)
 
     def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Give values to an injection: for consumers if it is over ``/out``, for the device if over ``/in``.
+        """Give values to an injection: over ``/out`` for consumers, over ``/in`` for the device.
 
         Raises:
             PathError: There is no such register.
@@ -187,7 +190,12 @@ class SourceWriter:
         return self.outcomes(self._send_values(found, timeout_s, CommandKind.SHADOW, injection))
 
     def joined(self, values: Mapping[str, object], raw: Iterable[Write] = ()) -> list[Write]:
-        """Encode values, add ``raw`` writes, and merge adjacent ones. PathError, ValueRangeError."""
+        """Encode values, add ``raw`` writes, and merge adjacent writes.
+
+        Raises:
+            PathError: There is no such register.
+            ValueRangeError: A value does not fit its register.
+        """
         image, bits = bytearray(self.block.layout.size), bytearray(self.block.layout.size)
         ranges = []
         writes = list(raw)
@@ -200,14 +208,14 @@ class SourceWriter:
         return merge(image, bits, ranges)
 
     def give(self, injection: int, writes: Sequence[Write], timeout_s: float | None = None) -> PendingCommand:
-        """Send the writes of :meth:`joined` as an injection's values. CommandError: not sent."""
+        """Send writes made by :meth:`joined` as values of an injection. CommandError: not sent."""
         return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)
 
     def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]) -> int:
-        """Lay an injection over all registers that patterns name; returns its number.
+        """Lay an injection over all registers that patterns name, and return its number.
 
-        Consumers see no difference until it is given values. See
-        :func:`shmio.layout.values.write.cover` for the patterns.
+        Consumers see no change until it gets values. See :func:`shmio.layout.values.write.cover`
+        for the patterns.
 
         Raises:
             PathError: There is no such register.
@@ -230,9 +238,9 @@ class SourceWriter:
         return self._send(("",), bits, timeout_s, CommandKind.INJECT, **laid)
 
     def declare(self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False) -> int:
-        """Lay an injection that the source runs by itself; returns its number.
+        """Lay a declared injection, which the source runs by itself, and return its number.
 
-        Unless ``keep`` is set it ends with this process. The source checks the declaration.
+        It ends with this process, unless ``keep`` is set. The source checks the declaration.
 
         Raises:
             CommandError: The source refuses, with the reason, or does not answer.
@@ -260,7 +268,7 @@ class SourceWriter:
         """
         try:
             size = len(text.encode())
-        except UnicodeEncodeError as error:  # a terminal that is not UTF-8
+        except UnicodeEncodeError as error:  # from a terminal that is not UTF-8
             raise ValueRangeError(f"a note must be UTF-8 text, but character {error.start + 1} is not") from None
         if not 0 < size <= MAX_NAME_BYTES:
             raise ValueRangeError(f"a note has 1 to {MAX_NAME_BYTES} bytes in UTF-8, this has {size}")
@@ -275,7 +283,11 @@ class SourceWriter:
         return self._send(("",), [], timeout_s, CommandKind.LIFT, injection)
 
     def expect_lifted(self, ticket: PendingCommand) -> None:
-        """Wait until a requested lift is done. CommandError: the source refuses, or does not answer."""
+        """Wait until a requested lift is done.
+
+        Raises:
+            CommandError: The source refuses or does not answer.
+        """
         self._expect(ticket, EventKind.LIFTED)
 
     def _expect(self, ticket: PendingCommand, kind: EventKind) -> None:
@@ -319,7 +331,7 @@ class SourceWriter:
         return PendingCommand(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
 
     def outcomes(self, ticket: PendingCommand) -> list[Outcome]:
-        """Wait until a command has ended; returns the outcome of each value, in the given order."""
+        """Wait until a command has ended, and return the outcomes of its values, in their order."""
         return [Outcome(path, OutcomeKind[kind.name], text) for path, (kind, text) in self._ends(ticket)]
 
     def _ends(self, ticket: PendingCommand) -> list[tuple[str, End]]:
@@ -330,7 +342,10 @@ class SourceWriter:
         return [(path, outcomes.of(items, missing)) for path, items in ticket.values]
 
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Send values as one command, and wait for their outcomes; raises as :meth:`submit`."""
+        """Send values as one command, and wait for their outcomes.
+
+        Errors are those of :meth:`submit`.
+        """
         return self.outcomes(self.submit(values, timeout_s))
 
     def _register(self, path: str) -> Register:
@@ -355,7 +370,7 @@ class SourceWriter:
             if event.command == ticket.number and event.writer == self._sender.writer:
                 return event
             if event.kind == EventKind.STARTED and event.incarnation != ticket.incarnation:
-                # The new process reports commands that the old one had not taken; the others stay unknown.
+                # The new process reports those commands that the old one left in the queue; others stay unknown.
                 ticket.until_ns = min(ticket.until_ns, time.monotonic_ns() + round(PATIENCE_S * 1e9))
         return None
 

@@ -358,7 +358,7 @@ def test_only_one_program_controls_time(instance: str) -> None:
         assert (first.read().playing, first.read().rate) == (True, 2.0)
         first.set_playing(False)
         with pytest.raises(
-            TimeError, match=rf"moved by another program \(pid {os.getpid()}\); it is free when that ends$"
+            TimeError, match=rf"moved by another program \(pid {os.getpid()}\); wait until that program ends$"
         ):
             second.take_over(HARD_S)
         first.close()
