@@ -8,7 +8,7 @@ Five lines::
         for update in cell.subscribe("cell/Robot_*/Axs*_Pos"):
             print(update.cycle, update.quality, update["cell/Robot_800/Axs1_Pos"])
 
-For asyncio: ``async with connect_aio(…)``, with the same methods to be awaited.
+For asyncio: ``async with connect_aio(…)``. Its methods are the same, but awaited.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def connect(
     token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
 ) -> Client:
-    """Return a client of an endpoint; the first call connects.
+    """Return a client of an endpoint. It connects at the first call of a method.
 
     Args:
         address: ``HOST:PORT`` or ``unix:PATH``.
@@ -90,7 +90,7 @@ def connect(
         key: PEM file of the certificate's key.
         token: Token of this client, if the endpoint needs one.
         token_in_plain_text: Whether to send the token to another host even without TLS.
-        timeout_s: Time limit in s for calls that are answered at once.
+        timeout_s: Time-out in s of calls that the endpoint answers at once.
 
     Raises:
         OSError: A file cannot be read.

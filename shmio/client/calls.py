@@ -1,4 +1,4 @@
-"""Shared by both clients: target, requests, answers, and errors from gRPC statuses. No I/O."""
+"""The part that both clients share: target, requests, answers, and errors from gRPC. No I/O."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from shmio.wire import shmio_v1_pb2 as wire
 STEP_PATIENCE_S: Final = 60.0
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 WRITE_PATIENCE_S: Final = 30.0
-"""Time limit for the answer to a write, in addition to its own: a source may have long cycles."""
+"""Time in s that is added to the time-out of a write: a source may have long cycles."""
 _SEARCH_PATIENCE_S: Final = 600.0
-"""Time limit for a search in a recording."""
+"""Time-out of a search in a recording, in s."""
 OPTIONS: Final = [
     ("grpc.max_receive_message_length", 64 << 20),
     ("grpc.keepalive_time_ms", 20_000),
-    # Find a restarted endpoint soon.
+    # Reconnect soon after an endpoint was restarted.
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 1_000),
 ]
@@ -60,13 +60,13 @@ _PLAIN: Final = {
     "Cancelling all calls": "the endpoint has stopped",
     "Socket closed": "the endpoint has stopped",
 }
-"""Short texts for gRPC's long ones."""
+"""Short texts for long ones of gRPC."""
 _TLS: Final = {
     "Hostname Verification": "its certificate does not name this host: use a name or address that it has",
     "WRONG_VERSION_NUMBER": "it speaks plain text: leave the CA out (ca, --ca)",
     "CERTIFICATE_VERIFY_FAILED": "its certificate is not from the CA that was named (ca, --ca), or has expired",
 }
-"""Short texts for gRPC's errors of TLS."""
+"""Short texts for TLS errors of gRPC."""
 _UNIX: Final = "unix:"
 _MEANING: Final = {
     grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
@@ -79,7 +79,7 @@ _MEANING: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Address and credentials of an endpoint; arguments as of :func:`shmio.client.connect`.
+    """Address and credentials of an endpoint; see the arguments of :func:`shmio.client.connect`.
 
     Raises:
         ValueRangeError: The token would go to another host in plain text.
@@ -102,7 +102,7 @@ class Target:
 
     @property
     def credentials(self) -> grpc.ChannelCredentials | None:
-        """Return credentials for TLS, or None for plain text; OSError if a file cannot be read."""
+        """Return credentials for TLS; None for plain text. OSError: a file cannot be read."""
         if self.ca is None:
             return None
         ca, key, certificate = (
@@ -116,7 +116,7 @@ class Target:
         return () if self.token is None else (("authorization", f"Bearer {self.token}"),)
 
     def error(self, error: Any) -> ShmioError:
-        """Translate the error of a call."""
+        """Convert the error of a gRPC call to an error of shmio."""
         code, details = error.code(), error.details() or ""
         if "message larger than max" in details:  # text of gRPC
             details = f"too much for one message: give or ask for fewer values at once ({details})"
@@ -134,12 +134,12 @@ class Target:
         return error_type(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
 
     def fail(self, error: Any) -> NoReturn:
-        """Raise the translated error of a call."""
+        """Raise the error of a gRPC call as an error of shmio."""
         raise self.error(error) from None
 
 
 def unanswered(target: Target) -> RemoteError:
-    """Return the error for a call that has begun without an answer from the endpoint."""
+    """Return the error for a call that the endpoint has not answered in time."""
     return RemoteError(f"{target.address}: the endpoint has not answered within {WRITE_PATIENCE_S:g} s")
 
 
@@ -183,13 +183,17 @@ def subscribe_request(
 
 
 def write_request(values: Mapping[str, object], timeout_s: float | None, *, until_accepted: bool) -> Any:
-    """Return the request for Write; ValueRangeError if a value has an unsupported Python type."""
+    """Return the request for Write. ValueRangeError: a value has an unsupported Python type."""
     timeout_ms = round(1000 * (timeout_s or 0))
     return wire.WriteRequest(values=assignments(values), timeout_ms=timeout_ms, until_accepted=until_accepted)
 
 
 def assignments(values: Mapping[str, object]) -> list[Any]:
-    """Convert values by path to messages; ValueRangeError as for :func:`write_request`."""
+    """Convert values by path to messages.
+
+    Raises:
+        ValueRangeError: A value has an unsupported Python type.
+    """
     return [wire.Assignment(path=path, value=value_to_wire(value, path)) for path, value in values.items()]
 
 
@@ -224,19 +228,19 @@ class Stepped:
 
     @classmethod
     def of(cls, found: Any) -> Stepped:
-        """Convert from the wire."""
+        """Convert a message to a finished step."""
         return cls(found.number, found.time_ns)
 
 
 def steps_requests(count: int, dt_s: float | None) -> list[Any]:
-    """Return the requests for Steps; ValueRangeError if a number is out of range."""
+    """Return the requests for Steps. ValueRangeError: count or length is out of range."""
     if not 0 <= count < 1 << 32:
         raise ValueRangeError(f"{count} steps: from 0 to {(1 << 32) - 1} are allowed at once")
     return [wire.StepsRequest(dt_ns=ns(dt_s), count=count)] if count else []
 
 
 def status(found: Any) -> dict[str, Any]:
-    """Convert an answer to the object of ``shmio-supervisor status --json``."""
+    """Convert an answer to the object that ``shmio-supervisor status --json`` prints."""
     return {
         "instance": found.instance,
         "mode": found.mode,
@@ -296,5 +300,5 @@ def playing(found: Any) -> list[Playing]:
 
 
 def replay_patience_s(wish: Wish) -> float | None:
-    """Return the time limit for a request in s; None for the client's usual limit."""
+    """Return the time-out of a request to replay, in s; None: use that of the client."""
     return _SEARCH_PATIENCE_S if "change" in wish or "event" in wish else None

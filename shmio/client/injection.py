@@ -19,15 +19,15 @@ from shmio.model.values import Column, Outcome
 from shmio.wire import shmio_v1_pb2 as wire
 
 _MAX_WAITING: Final = 4096
-"""Messages with originals that may wait to be read."""
+"""Maximum number of unread messages with originals."""
 
 Given = Array | list[Any]
 Arrays = Mapping[Column, Given | tuple[Given, Given]]
-"""Values of whole columns as in the table, or (slots, values)."""
+"""Values by column: of the whole column in the table, or (slots, values)."""
 Raw = Iterable[Piece | tuple[int, bytes] | tuple[int, bytes, int]]
 """(offset, bytes), or (offset, bytes, mask): see :class:`Piece`."""
 Ranges = Iterable[tuple[int, int] | tuple[int, int, int]]
-"""(offset, size), or (offset, size, mask): these bits of these bytes of a frame."""
+"""(offset, size), or (offset, size, mask): bytes of a frame, or bits of them."""
 
 
 def lay(
@@ -41,7 +41,11 @@ def lay(
     for_s: float | None,
     originals: bool,
 ) -> bytes:
-    """Return the first message, which lays an injection; ValueRangeError for an invalid argument."""
+    """Return the first message, which lays an injection.
+
+    Raises:
+        ValueRangeError: An argument is invalid.
+    """
     if for_s is not None and not 0 < for_s <= 86_400:
         raise ValueRangeError(f"for_s: {for_s} is not a number of seconds above 0, at most 86400")
     lifetime_ms = 0 if for_s is None else max(1, round(1000 * for_s))
@@ -60,7 +64,7 @@ class Held:
     """An injection of this client, with its table of registers."""
 
     def __init__(self, found: Any) -> None:
-        """Take the first answer, None if there was none; RemoteError if it is invalid."""
+        """Take the first answer, or None if there was none. RemoteError: it is invalid."""
         if found is None or not found.HasField("laid"):
             raise RemoteError("the endpoint's first answer to Inject is invalid")
         self.number: int = found.laid.number
@@ -73,7 +77,11 @@ class Held:
     def request(
         self, values: Mapping[str, object], arrays: Arrays | None, raw: Raw, *, answered: bool
     ) -> tuple[int, bytes]:
-        """Return a message with values and its sequence number; ValueRangeError for a wrong value."""
+        """Return a message with values, and its sequence number.
+
+        Raises:
+            ValueRangeError: A value is wrong.
+        """
         request = InjectRequest()
         shadow = request.shadow
         if answered:
@@ -102,7 +110,7 @@ class Held:
             part.values = np.asarray(values, DTYPES[column]).tobytes()
 
     def keep(self, found: Any) -> None:
-        """Keep the originals of a message until they are read; RemoteError if nobody reads them."""
+        """Store the originals of a message. RemoteError: too many are unread."""
         if found.originals:
             if len(self._waiting) >= _MAX_WAITING:
                 raise RemoteError(
@@ -112,11 +120,11 @@ class Held:
 
     @property
     def waits(self) -> bool:
-        """Whether originals wait to be read."""
+        """True if there are unread originals."""
         return bool(self._waiting)
 
     def originals(self) -> Iterator[Update]:
-        """Yield the originals of the oldest message that was not read."""
+        """Yield the originals of the oldest unread message."""
         for update in self._waiting.popleft():
             if update.table != self.table.number:
                 raise RemoteError(f"an original of table {update.table}, which was not sent")
@@ -124,7 +132,10 @@ class Held:
 
 
 def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outcome]:
-    """Apply one outcome to every value; ``more`` adds one entry, with path "", for all arrays and raw bytes."""
+    """Return the same outcome for every value.
+
+    ``more`` adds one with path "", for all arrays and raw bytes.
+    """
     paths = [*values, *([""] if more else [])]
     return calls.outcomes(paths, [outcome])
 
@@ -133,14 +144,14 @@ def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outc
 
 
 def declare_request(declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool) -> Any:
-    """Return the request for Declare; ValueRangeError for an invalid key or value."""
+    """Return the request for Declare. ValueRangeError: a key or value is invalid."""
     given = [one if isinstance(one, Mapping) else msgspec.to_builtins(one) for one in declarations]
     tables = [declaration_to_wire(table, f"injection[{index}]") for index, table in enumerate(given)]
     return wire.DeclareRequest(declarations=tables, keep=keep)
 
 
 def declared(found: Any) -> tuple[Declared, ...]:
-    """Convert the first answer to Declare; RemoteError if it is invalid."""
+    """Convert the first answer to Declare. RemoteError: it is invalid."""
     if found is None or not found.HasField("declared"):
         raise RemoteError("the endpoint's first answer to Declare is invalid")
     return tuple(Declared(one.source, one.number, one.name, one.seed) for one in found.declared.injections)

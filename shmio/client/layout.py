@@ -23,16 +23,16 @@ MAX_REGISTERS: Final = 1 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class BlockLayout(Layout):
-    """Layout of a source's block, with its properties in the instance.
+    """Layout of a source's block, with properties of the source.
 
     Attributes:
         source: Name of the source.
-        section: Number of the source's block: a reload may give the source another one.
+        section: Number of the source's block, which a reload may replace.
         hash: Hash of the layout.
-        period_ns: Time between two cycles.
-        stale_ns: Age above which a frame is bad.
+        period_ns: Time between two cycles, in ns.
+        stale_ns: Age above which a frame is bad, in ns.
         writable: Patterns of the registers that may be written.
-        armed: Whether an injection may reach the device.
+        armed: True if an injection may reach the device.
     """
 
     registers: tuple[Register, ...]
@@ -46,7 +46,7 @@ class BlockLayout(Layout):
 
     @property
     def big_endian(self) -> bool:
-        """Whether numbers are stored big-endian."""
+        """True if numbers are stored big-endian."""
         return self.byte_order == "big"
 
     @property
@@ -103,7 +103,7 @@ class BlockLayout(Layout):
 
 
 def layouts(parts: Iterable[Any]) -> Iterator[BlockLayout]:
-    """Yield the blocks in the messages of GetLayouts; RemoteError if they are invalid."""
+    """Yield the layouts in the messages of GetLayouts. RemoteError: a message is invalid."""
     registers: list[Register] = []
     for part in parts:
         registers += map(Register.of, part.registers)

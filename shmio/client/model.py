@@ -18,9 +18,9 @@ from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 
 RETRY_S: Final = 0.25
-"""Time between two attempts to join."""
+"""Time between two attempts to join, in s."""
 PATIENCE_S: Final = 10.0
-"""Time to wait for an instance that does not run."""
+"""Time to wait for an instance that does not run, in s."""
 _WHOLE: Final = frozenset({Column.INT32, Column.INT64, Column.UINT64})
 _FAILURE_CHARACTERS: Final = 400
 
@@ -36,7 +36,7 @@ class Values(Mapping[str, Any]):
     def __init__(self, table: Table) -> None:
         self._table = table
         self.changed: tuple[str, ...] = ()
-        """Paths of the values that came with the present step; the first step has all."""
+        """Paths of the values that came with the present step: all values in the first step."""
 
     def __getitem__(self, path: str) -> Any:
         """Return a register's value; PathError if there is no such register."""
@@ -58,8 +58,8 @@ class Work:
     Attributes:
         time_s: Simulation time after the step.
         dt_s: Length of the step.
-        doubt: Why inputs may be wrong; empty if they are right.
-        refused: Why the previous answer was refused; empty if it was accepted.
+        doubt: Reason why inputs may be wrong; empty if they are right.
+        refused: Reason why the previous answer was refused; empty if it was accepted.
     """
 
     __slots__ = ("doubt", "dt_ns", "inputs", "refused", "step", "time_ns")
@@ -87,7 +87,7 @@ class Part:
     """A source that a program computes, with its inputs and outputs."""
 
     def __init__(self, found: Any) -> None:
-        """Take the first answer, None if there was none; RemoteError if it is invalid."""
+        """Take the first answer, or None if there was none. RemoteError: it is invalid."""
         if found is None or found.WhichOneof("what") != "joined":
             raise RemoteError("the endpoint's first answer to Simulate is invalid")
         joined = found.joined
@@ -102,7 +102,7 @@ class Part:
         self.period_s: float = joined.period_ns / 1e9
 
     def take(self, found: Any) -> Work:
-        """Return the step that an answer requests; RemoteError if the answer is invalid."""
+        """Return the step that an answer requests. RemoteError: the answer is invalid."""
         if found.WhichOneof("what") != "work":
             raise RemoteError("the endpoint sent something other than a step")
         work = found.work
@@ -151,10 +151,10 @@ class Member:
 
     Attributes:
         inputs: Present inputs by path.
-        outputs: Outputs by path, as shown when the client joined.
-        computed: Whether a model computed these outputs; otherwise they are initial values.
+        outputs: Outputs by path, with the values that consumers saw when the client joined.
+        computed: True if a model computed these outputs; otherwise, they are initial values.
         clock: State of the clock when the client joined.
-        period_s: Time between two steps in s while time is real.
+        period_s: Time between two steps while time is real, in s.
     """
 
     def __init__(self, part: Part) -> None:
@@ -168,26 +168,26 @@ class Member:
         self.period_s = part.period_s
 
     def _present(self) -> int:
-        """Return the number of the step that waits for an answer; RemoteError if none does."""
+        """Return the number of the step to answer. RemoteError: there is none."""
         if self._work is None:
             raise RemoteError(f"{self.source}: there is no step to answer")
         return self._work.step
 
 
 def join_request(source: str, name: str) -> bytes:
-    """Return the first message, which joins a source."""
+    """Return the first message, with which the model joins a source."""
     return wire.SimulateRequest(join=wire.Join(source=source, name=name)).SerializeToString()
 
 
 class Rejoining:
-    """Decides whether a model joins again after a lost connection, and keeps its outputs for that."""
+    """Lets a model join again after a lost connection, and stores its outputs for that."""
 
     def __init__(self, patience_s: float) -> None:
         self._patience_s = patience_s
         self._lost_s: float | None = time.monotonic()
         self._joined = False
-        self._known: dict[str, object] = {}  # the latest outputs
-        self._sent = True  # whether the present endpoint has them all
+        self._known: dict[str, object] = {}  # latest outputs by path
+        self._sent = True  # whether the present endpoint has all of them
         self._failure = ""
 
     def joined(self) -> None:
@@ -198,7 +198,7 @@ class Rejoining:
         """Return whether the model should try to join again after an error."""
         if self._lost_s is None:
             self._lost_s = time.monotonic()
-        # For a while, the endpoint may still count a client as connected whose connection was cut.
+        # For a while after a lost connection, the endpoint may still count this client as connected.
         again = isinstance(error, LostError) or (self._joined and isinstance(error, ConflictError))
         return again and time.monotonic() - self._lost_s < self._patience_s
 
@@ -208,7 +208,7 @@ class Rejoining:
             log.warning("%s: %s", part.source, work.refused)
 
     def answer(self, part: Part, work: Work, outputs: Mapping[str, object] | None) -> bytes:
-        """Return the answer with the outputs; after joining again, with all earlier ones.
+        """Return the answer with the outputs; after joining again, with earlier outputs, too.
 
         Errors are those of :meth:`Part.done`.
         """
@@ -231,7 +231,7 @@ class Rejoining:
 
 
 def explain(error: Exception) -> str:
-    """Describe an error of the program's code in one line, with its place."""
+    """Describe an error of the program's code in one line, with file and line number."""
     if isinstance(error, ShmioError):
         return _shorten(" ".join(str(error).split()))
     where = ""
@@ -261,7 +261,11 @@ def _check(value: object, register: Register) -> None:
 
 
 def _flat(value: object, register: Register) -> Iterable[object]:
-    """Return the elements of a value in the order of its column; ValueRangeError for a wrong shape."""
+    """Return the elements of a value in the order of its column.
+
+    Raises:
+        ValueRangeError: The value has the wrong shape.
+    """
     if not register.dims:
         return (_element(value, register.column),)
     array: Array = np.frombuffer(value, np.uint8) if isinstance(value, (bytes, bytearray)) else _array(value)

@@ -1,8 +1,8 @@
 """Tables of registers with their latest values as numpy arrays, and the messages that fill them.
 
-A packed field with elements of a fixed size and a ``bytes`` field look the same on the wire
-(protobuf.dev, "Encoding"). This module therefore declares the messages again, from the generated
-description: where the API has numbers, these messages have the bytes of a little-endian array.
+On the wire, a packed field of elements with a fixed size looks the same as a ``bytes`` field
+(protobuf.dev, "Encoding"). This module uses that: it derives messages from the generated
+description, in which such a field is the bytes of a little-endian array.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ FIELDS: Final = {
 _NEAR_CANDIDATES: Final = 500
 _SHOWN: Final = 200
 MAX_SLOTS: Final = 1 << 22
-"""No endpoint sends a table with more."""
+"""Maximum number of elements of a table; no endpoint sends more."""
 
 
 # -- messages with packed arrays as bytes --------------------------------------------------------------------
@@ -98,8 +98,8 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
     """A register, or an array's element, as the wire describes it.
 
     Attributes:
-        column: Column that has its values.
-        slot: Its first slot in that column.
+        column: Column with the register's values.
+        slot: The register's first slot in the column.
         comment: The source's comment; only in layouts.
         initial: The source's text of the initial value; only in layouts.
     """
@@ -109,7 +109,7 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
 
     @property
     def element(self) -> ElementType:
-        """The elementary type. RemoteError: the endpoint is newer, and this version does not know the type."""
+        """The elementary type. RemoteError: it is a type of a newer version."""
         found = element_type(self.type)
         if found is None:
             raise RemoteError(f"{self.path}: it has the type {self.type!r}, which this version does not know")
@@ -117,7 +117,7 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
 
     @classmethod
     def of(cls, found: Any) -> Register:
-        """Convert from the wire; RemoteError if the message is invalid."""
+        """Convert a message. RemoteError: it is invalid."""
         try:
             return cls(
                 found.path,
@@ -158,18 +158,18 @@ class Table:
     """
 
     def __init__(self, found: Any) -> None:
-        """Convert from the wire; RemoteError if the message is invalid."""
+        """Convert a message. RemoteError: it is invalid."""
         self.number: int = found.number
         self.source: str = found.source
         self.section: int = found.section
-        """Number of the source's block: a reload may give the source another one."""
+        """Number of the source's block, which a reload may replace."""
         self.size: int = found.size
         """Size of a frame in bytes."""
         self.hash: bytes = found.hash
         self.direction = "in" if found.direction == wire.DIRECTION_IN else "out"
-        """``in`` if its updates have what commands write to the registers, else ``out``."""
+        """``in`` if updates have what commands write, ``out`` if what consumers see."""
         self.ranges = tuple((one.offset, one.size, one.mask) for one in found.ranges)
-        """(offset, size, mask) of the bytes and bits that an injection covers besides the registers."""
+        """Bytes that an injection covers besides the registers: (offset, size, mask of bits)."""
         self.registers = tuple(map(Register.of, found.registers))
         sizes = dict(zip(Column, found.slots[1:], strict=False))
         if sum(sizes.values()) > MAX_SLOTS:
@@ -185,9 +185,9 @@ class Table:
         if Column.TEXT in self.arrays:
             self.arrays[Column.TEXT][:] = ""
         self.invalid = np.zeros(len(self.registers), bool)
-        """For each register, whether its bytes are not a valid value of its type."""
+        """True for each register whose bytes are not a valid value of its type."""
         self.injected = np.zeros(len(self.registers), bool)
-        """For each register, whether an injection covers its value."""
+        """True for each register that an injection covers."""
         self.state: object = None
         """Quality, reason, provenance and incarnation of the latest frame."""
         self._everything = {column: np.arange(len(array), dtype=np.uint32) for column, array in self.arrays.items()}
@@ -203,7 +203,11 @@ class Table:
         return [f"{self.source}/{register.path}" for register in self.registers]
 
     def place(self, path: str) -> int:
-        """Return the index of a register, by its path with or without the source; PathError."""
+        """Return the index of a register by its path, with or without the source.
+
+        Raises:
+            PathError: There is no such register.
+        """
         found = self.places.get(path)
         if found is None:
             found = self.places.get(path.removeprefix(f"{self.source}/"))
@@ -223,7 +227,7 @@ class Table:
         return None if self.invalid[place] else array[register.slot]
 
     def changed(self, changes: tuple[Change, ...]) -> list[int]:
-        """Return the indices of the registers that have changes, ascending."""
+        """Return the ascending indices of the changed registers."""
         found: set[int] = set()
         for change in changes:
             slots, places = self._starts[change.column]
@@ -232,7 +236,7 @@ class Table:
 
     @cached_property
     def _starts(self) -> Mapping[Column, tuple[Array, Array]]:
-        """First slots of the registers of each column, ascending, and the registers' indices."""
+        """For each column, the ascending first slots of its registers, and the indices of these."""
         found: dict[Column, list[tuple[int, int]]] = {}
         for place, register in enumerate(self.registers):
             found.setdefault(register.column, []).append((register.slot, place))
@@ -242,7 +246,11 @@ class Table:
         }
 
     def apply(self, values: Any) -> tuple[Change, ...]:
-        """Copy a message's values into the arrays, and return them; RemoteError if invalid."""
+        """Copy a message's values into the arrays, and return them.
+
+        Raises:
+            RemoteError: The values are invalid.
+        """
         try:
             changes = self.read(values)
             for column, slots, news in changes:
@@ -255,7 +263,7 @@ class Table:
         return changes
 
     def read(self, values: Any) -> tuple[Change, ...]:
-        """Return a message's values; RemoteError if they are invalid."""
+        """Return a message's values. RemoteError: they are invalid."""
         try:
             return tuple(self._read(values))
         except (ValueError, KeyError) as error:
@@ -275,7 +283,7 @@ class Table:
                 yield Change(column, slots, news)
 
     def mark(self, marks: Any, into: Array) -> None:
-        """Copy a message's marks into ``into``; RemoteError if they are invalid."""
+        """Copy a message's marks into ``into``. RemoteError: they are invalid."""
         places = np.frombuffer(marks.registers, np.uint32)
         into[:] = False
         try:

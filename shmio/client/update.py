@@ -13,7 +13,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 
 class Piece(NamedTuple):
-    """Raw bytes of a frame from ``offset`` on; ``mask`` selects bits of each byte (0 sends all)."""
+    """Raw bytes of a frame from ``offset`` on. ``mask`` selects bits of each byte; 0: all."""
 
     offset: int
     data: bytes
@@ -23,20 +23,20 @@ class Piece(NamedTuple):
 class Update:
     """One frame of a source, or a change of its quality.
 
-    With a table of ``in``, it has what a command wrote. ``update[path]`` is the latest value of a
-    register.
+    If its table has the direction ``in``, it has the values that a command wrote. ``update[path]``
+    is the latest value of a register.
 
     Attributes:
         changes: The received values; ``table.arrays`` has the latest values of all registers.
-        clock_ns: Time since the instance's start.
-        source_ns: UTC time of the values; 0 if there are no values yet.
-        marked: Whether the update also says which registers are invalid or injected.
-        missed: With every frame, the number of frames lost before this one.
-        ended: Whether a reload has removed the source, or all requested registers.
-        image: With raw frames, the frame as consumers see it.
-        raw: With raw frames, the frame as delivered.
-        age_ns: With reads, the age of the frame.
-        pieces: For an injection over ranges, the changes in these ranges.
+        clock_ns: Time since the instance's start, in ns.
+        source_ns: UTC time of the values, in ns; 0 if there are no values yet.
+        marked: True if the update also says which registers are invalid or injected.
+        missed: With every frame: number of frames lost before this one.
+        ended: True if a reload has removed the source, or all requested registers.
+        image: With raw frames: the frame as consumers see it.
+        raw: With raw frames: the frame as the source delivered it.
+        age_ns: With reads: the age of the frame, in ns.
+        pieces: With an injection over ranges: the changes in these ranges.
     """
 
     __slots__ = (
@@ -46,7 +46,7 @@ class Update:
     )  # fmt: skip
 
     def __init__(self, table: Table, found: Any) -> None:
-        """Convert from the wire, and copy the values into the table; RemoteError if invalid."""
+        """Convert a message, and copy its values into the table. RemoteError: it is invalid."""
         self.table = table
         self.frame: int = found.frame
         self.cycle: int = found.cycle
@@ -69,7 +69,7 @@ class Update:
             table.mark(found.invalid, table.invalid)
         if found.HasField("injected"):
             table.mark(found.injected, table.injected)
-        state = self.quality, self.reason.partition(":")[0], self.provenance, self.incarnation  # a reason holds an age
+        state = self.quality, self.reason.partition(":")[0], self.provenance, self.incarnation  # without an age
         self._everything = self.whole or self.marked or table.state != state
         table.state = state
         self._originals: Mapping[Column, Array] | None = None
@@ -89,7 +89,7 @@ class Update:
 
     @property
     def readings(self) -> list[Reading]:
-        """The registers that may have changed since the previous update, with their latest values."""
+        """Registers that may have changed since the previous update, with their latest values."""
         if self.ended:
             return []
         table = self.table
@@ -97,7 +97,10 @@ class Update:
         return [self.reading(place) for place in places]
 
     def reading(self, place: int, register: model.Register | None = None) -> Reading:
-        """Return the reading of a register by its place in the table; ``register`` describes it there."""
+        """Return the reading of the register at index ``place``.
+
+        If ``register`` is given, the reading describes the register with it.
+        """
         found = self.table.registers[place]
         value: Any = self.table.value(place) if self.source_ns else None
         quality, reason = self.quality_of(found.path)
@@ -113,14 +116,14 @@ class Update:
         )
 
     def __getitem__(self, path: str) -> Any:
-        """Return a register's latest value, whatever its quality; see :meth:`Table.value`."""
+        """Return a register's latest value, whatever its quality: see :meth:`Table.value`."""
         return self.table.value(self.table.place(path))
 
     def good(self, path: str) -> Any:
         """Return a register's value if it is good or uncertain.
 
         Raises:
-            QualityError: The value is bad; the error has the reason.
+            QualityError: The value is bad; the message gives the reason.
             PathError: There is no such register.
         """
         quality, reason = self.quality_of(path)
@@ -129,7 +132,11 @@ class Update:
         return self[path]
 
     def original(self, path: str) -> Any:
-        """Return the source's value beneath injections, after a read with ``originals``; PathError."""
+        """Return a register's value without injections, after a read with ``originals``.
+
+        Raises:
+            PathError: There is no such register.
+        """
         return self.table.value(self.table.place(path), self._originals)
 
     def quality_of(self, path: str) -> tuple[Quality, str]:
@@ -150,15 +157,15 @@ _PROVENANCES = {int(provenance): provenance for provenance in Provenance}
 
 
 class Tables:
-    """Tables of one stream, or of reads, by number."""
+    """Tables of one stream, or of a client's reads, by number."""
 
     def __init__(self) -> None:
         self.known: dict[int, Table] = {}
 
     def updates(self, found: Any) -> Iterator[Update]:
-        """Yield the updates of a message, which may also have tables; RemoteError if it is invalid.
+        """Yield the updates of a message, which may also have tables. RemoteError: it is invalid.
 
-        Use each update before the next one: it changes its table's arrays in place.
+        Use each update before the next one, which changes the table's arrays in place.
         """
         for one in found.tables:
             news = Table(one)
@@ -171,7 +178,7 @@ class Tables:
             yield Update(table, update)
 
     def all_of(self, found: Any) -> Iterator[Update]:
-        """Yield all updates of a stream's message; those of sources that a reload has removed come last."""
+        """Yield all updates of a stream's message. Those of removed sources come last."""
         yield from self.updates(found)
         for end in found.ended:
             direction = "in" if end.direction == wire.DIRECTION_IN else "out"
@@ -188,7 +195,7 @@ def _same(old: Table, news: Table) -> bool:
 
 
 class Snapshot:
-    """Result of one read, with an update for each source; registers by path with the source."""
+    """Result of one read, with an update for each source. Its paths include the source."""
 
     def __init__(self, updates: Iterable[Update]) -> None:
         self.updates = {update.source: update for update in updates}
@@ -198,7 +205,7 @@ class Snapshot:
             yield from update.table.paths
 
     def of(self, path: str) -> Update:
-        """Return the update that has a register; PathError if none has.
+        """Return the update that has a register. PathError: none has it.
 
         The path may omit the source if there is only one.
         """
@@ -210,5 +217,5 @@ class Snapshot:
         return update
 
     def __getitem__(self, path: str) -> Any:
-        """Return a register's good value; errors as of :meth:`Update.good`."""
+        """Return a register's value if it is good or uncertain: see :meth:`Update.good`."""
         return self.of(path).good(path)

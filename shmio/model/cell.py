@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class Held(Protocol):
-    """A resource that a program holds until it closes it or leaves its ``with`` block."""
+    """A resource that stays open until the program closes it or leaves its ``with`` block."""
 
     def close(self) -> None:
-        """Release it."""
+        """Release the resource."""
 
     def __enter__(self) -> Self:
         """Return the object itself."""
@@ -27,7 +27,7 @@ class Held(Protocol):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> None:
-        """Close it."""
+        """Close the resource."""
 
 
 class Update(Protocol):
@@ -51,11 +51,11 @@ class Update(Protocol):
 
     @property
     def clock_ns(self) -> int:
-        """The instance's clock when the frame was published."""
+        """The instance's clock when the frame was published, in ns."""
 
     @property
     def source_ns(self) -> int:
-        """The source's time stamp, UTC; 0 if there never were any values."""
+        """The source's time stamp, UTC in ns; 0 if there never were any values."""
 
     @property
     def quality(self) -> Quality:
@@ -63,33 +63,35 @@ class Update(Protocol):
 
     @property
     def reason(self) -> str:
-        """Why the quality is not good, or what a reload has removed."""
+        """Reason why the quality is not good, or what a reload has removed."""
 
     @property
     def provenance(self) -> Provenance:
-        """Where the source's own values come from."""
+        """Origin of the source's own values."""
 
     @property
     def missed(self) -> int:
-        """With ``every_frame``: the frames lost between the update before and this one."""
+        """Number of frames lost since the previous update; counted only with ``every_frame``."""
 
     @property
     def ended(self) -> bool:
-        """Whether a reload has removed the source, or what a pattern named in it; it sends no more updates.
+        """True if a reload has removed the source or its subscribed registers.
+
+        The source has no more updates.
 
         When all sources have ended, the iteration waits until it is closed or the instance ends.
         """
 
     @property
     def readings(self) -> Sequence[Reading]:
-        """The registers that may have changed since the update before: all of them with the first update.
+        """Registers that may have changed since the previous update; in the first update, all.
 
         Read them before you take the next update.
         """
 
 
 class Subscription(Held, Protocol):
-    """Updates as they come, for one thread; any thread may close it, which ends the iteration."""
+    """Iterator over updates, for one thread. Any thread may close it, which ends the iteration."""
 
     def __iter__(self) -> Iterator[Update]:
         """Return the object itself."""
@@ -99,16 +101,17 @@ class Subscription(Held, Protocol):
 
         Raises:
             PathError: A pattern names nothing; only the first call raises it.
-            ValueRangeError: There is no pattern, or an option is wrong; only the first call raises it.
+            ValueRangeError: There is no pattern, or an option is wrong; only the first call raises
+                it.
             NotRunningError: The instance has ended.
         """
 
 
 class Events(Held, Protocol):
-    """Events as they happen, for one thread; any thread may close it, which ends the iteration.
+    """Iterator over events, for one thread. Any thread may close it, which ends the iteration.
 
-    Those of one source come in its order. When a reload has removed all sources, the iteration waits until
-    it is closed or the instance ends.
+    Events of one source come in order. When a reload has removed all sources, the iteration waits
+    until it is closed or the instance ends.
     """
 
     def __iter__(self) -> Iterator[Event]:
@@ -119,21 +122,24 @@ class Events(Held, Protocol):
 
 
 class Shadow(Held, Protocol):
-    """An injection whose values this program gives. Closing it lifts it, unless it was laid with ``keep``."""
+    """An injection to which this program gives values.
+
+    Closing it lifts it, unless it was laid with ``keep``.
+    """
 
     @property
     def number(self) -> int:
-        """Number of the injection, by which anybody may lift it."""
+        """Number of the injection, with which any program may lift it."""
 
     def set(self, values: Mapping[str, object]) -> list[Outcome]:
         """Give values by path, and return the outcome of each.
 
-        It is ``rejected`` if the injection does not cover the path. Of a remote cell all values of one
-        call have the same outcome, the worst, and it is also ``rejected`` if a path or value is wrong.
-        If somebody has lifted the injection, the outcome is ``rejected``, or a remote cell raises RemoteError.
+        An outcome is ``rejected`` if the injection does not cover the path, or has been lifted. On
+        a remote cell, all values of one call have the same outcome, the worst of them. There, a
+        wrong path or value is also ``rejected``, and a lifted injection may raise RemoteError.
 
         Raises:
-            PathError: There is no such register on this host.
+            PathError: There is no such register (only on this host).
             ValueRangeError: A value does not fit its register, or has a type that no register has.
             CommandError: The injection is over, or the source's queue has no room.
         """
@@ -142,8 +148,8 @@ class Shadow(Held, Protocol):
 class Campaign(Held, Protocol):
     """Declared injections that this program has laid, and their events.
 
-    Iterate over it for the events: the iteration ends when all injections are lifted. Closing it lifts
-    the rest, unless they were laid with ``keep``.
+    Iterate over it for the events: the iteration ends when all injections are lifted. Closing it
+    lifts the remaining ones, unless they were laid with ``keep``.
     """
 
     @property
@@ -158,19 +164,19 @@ class Campaign(Held, Protocol):
 
 
 class ReadsClock(Protocol):
-    """Reads the instance's clock."""
+    """Function that reads the instance's clock."""
 
     def __call__(self) -> Clock:
-        """Return its present state."""
+        """Return the present state of the clock."""
 
 
 class Cell(Held, Protocol):
     """A running cell.
 
-    :func:`shmio.attach` returns one on this host, :func:`shmio.connect` one behind gRPC. The methods
-    raise the errors of :mod:`shmio.errors`; every method raises NotRunningError if the instance has
-    ended or cannot be reached. Only ``sources`` and ``clock`` of a cell on this host then still return
-    the last state.
+    :func:`shmio.attach` returns a cell on this host, :func:`shmio.connect` a remote one, by gRPC.
+    The methods raise the errors of :mod:`shmio.errors`. Every method raises NotRunningError if the
+    instance has ended or cannot be reached, except ``sources`` and ``clock`` of a cell on this
+    host: these return the last state.
     """
 
     @property
@@ -178,7 +184,11 @@ class Cell(Held, Protocol):
         """Names of the sources."""
 
     def layouts(self, *sources: str) -> Mapping[str, Layout]:
-        """Return the layouts of these sources, or of all, by source. PathError: no such source."""
+        """Return the layouts of these sources, or of all, by source.
+
+        Raises:
+            PathError: There is no such source.
+        """
 
     def get(self, *patterns: str) -> list[Reading]:
         """Read registers, whatever their quality.
@@ -187,8 +197,8 @@ class Cell(Held, Protocol):
             patterns: Paths, array elements, slices, structures, globs, or names of sources.
 
         Returns:
-            A reading of each register that the patterns name, each once, in their order. Those of one
-            source come from one frame.
+            A reading of each register that the patterns name, each once, in the order of the
+            patterns. Readings of one source come from one frame.
 
         Raises:
             PathError: A pattern names nothing.
@@ -199,16 +209,20 @@ class Cell(Held, Protocol):
 
         Args:
             patterns: As for :meth:`get`.
-            every_frame: Whether to give an update for each frame, in order, and count the lost frames;
-                otherwise a slow reader gets the newest values.
-            max_rate_hz: Without ``every_frame``: the most updates a second of each source; 0: no limit.
+            every_frame: Whether to return an update for each frame, in order, and count lost
+                frames. Otherwise, a slow reader gets only the newest values.
+            max_rate_hz: Maximum number of updates per second of each source; 0: no limit. Only
+                without ``every_frame``.
         """
 
     def events(self, *sources: str) -> Events:
-        """Follow what happens in these sources from now on, or in all that there are.
+        """Follow the events of these sources, or of all, from now on.
 
-        Events are commands and their outcomes, injections, changes of quality, notes, and starts and stops
-        of a source's process. PathError: no such source.
+        Events are about commands and their outcomes, injections, changes of quality, notes, and
+        starts and stops of a source's process.
+
+        Raises:
+            PathError: There is no such source.
         """
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
@@ -216,27 +230,28 @@ class Cell(Held, Protocol):
 
         Args:
             values: Values by path: registers, whole arrays, elements, slices or bits.
-            timeout_s: How long the values may wait for a cycle of the source; None: 2 s, or three cycles.
+            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or
+                three cycles if that is longer.
 
         Returns:
             The outcome of each value, under the path that you gave, in the same order.
 
         Raises:
-            PathError: A path names nothing, or on this host: the paths belong to several sources, to
-                none, or end in ``/out``.
-            ValueRangeError: A value does not fit its register, or a register is given twice; of a
-                remote cell also: the values belong to several sources, or there is none.
-            CommandError: A register is not writable, or the source's queue has no room; of a remote
+            PathError: A path names nothing. On this host also: the paths belong to several sources
+                or to none, or one ends in ``/out``.
+            ValueRangeError: A value does not fit its register, or a register is given twice. On a
+                remote cell also: the values belong to several sources, or there are none.
+            CommandError: A register is not writable, or the source's queue has no room. On a remote
                 cell also: a path ends in ``/out``.
-                After any of these errors nothing has been sent.
+                After any of these errors, nothing has been sent.
         """
 
     def inject(self, *patterns: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
-        """Lay an injection over registers of one source, all ``/out`` (the default) or all ``/in``.
+        """Lay an injection over registers of one source, all ``/out`` (default) or all ``/in``.
 
         Args:
             patterns: As for :meth:`get`.
-            priority: Of several injections over a register the one with the highest is outermost.
+            priority: Of several injections over a register, that with the highest is outermost.
             keep: Whether the injection stays when this program ends, until somebody lifts it.
             name: Name of the injection in events and lists.
 
@@ -246,12 +261,12 @@ class Cell(Held, Protocol):
         """
 
     def declare(self, declarations: Iterable[Any], *, keep: bool = False) -> Campaign:
-        """Lay injections that their sources run by themselves, all or none.
+        """Lay declared injections, all or none. Their sources run them without this program.
 
         Args:
             declarations: Mappings with the keys of an ``[[injection]]`` table, or
                 :class:`shmio.config.Declaration` objects.
-            keep: Whether the injections stay when this program ends, until they are over or lifted.
+            keep: Whether the injections stay when this program ends, until they end or are lifted.
 
         Raises:
             ValueRangeError: A declaration is wrong; nothing was laid.
@@ -259,7 +274,10 @@ class Cell(Held, Protocol):
         """
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all; of each source the innermost first."""
+        """Return the present injections of these sources, or of all.
+
+        Within a source, the innermost comes first.
+        """
 
     def lift(self, source: str, number: int) -> None:
         """Lift an injection, whoever laid it.
@@ -270,15 +288,15 @@ class Cell(Held, Protocol):
         """
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources, or of all, whoever laid them; returns them.
+        """Lift all injections of these sources, or of all, whoever laid them, and return them.
 
         Raises:
-            CommandError: Some could not be lifted; the message gives the reasons.
+            CommandError: Some injections were not lifted; the message gives the reasons.
         """
 
     @property
     def clock(self) -> ReadsClock:
-        """The state of the instance's clock: call it, ``clock()``."""
+        """State of the instance's clock. Call it: ``clock()``."""
 
     def real_sources(self) -> list[str]:
         """Return the names of the sources that steps do not move, such as those with a device."""
@@ -295,20 +313,40 @@ class Cell(Held, Protocol):
 
         Raises:
             TimeError: Another program owns time, or a step failed.
-            ValueRangeError: The length is out of range, or the number is below 1.
+            ValueRangeError: The length is out of range, or the count is below 1.
         """
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Let time step by itself, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
+        """Take control of time, and step it until :meth:`pause`; return the state of the clock.
+
+        Args:
+            rate: Speed relative to real time; above 0, at most 1000.
+            dt_s: Length of each step in s, from 1 us to 1 h; None: the step size.
+
+        Raises:
+            TimeError: Another program owns time.
+            ValueRangeError: The rate or the length is out of range.
+        """
 
     def pause(self) -> Clock:
-        """Take control of time, and stop it until it is stepped or played. TimeError."""
+        """Take control of time, and stop it until it is stepped or played; return its state.
+
+        Raises:
+            TimeError: Another program owns time, or a step failed while time was played.
+        """
 
     def release(self) -> Clock:
-        """Return to real time, which goes on from the present virtual time. TimeError."""
+        """Return to real time, which continues from the present virtual time; return its state.
+
+        Raises:
+            TimeError: Another program owns time, or time was virtual from the instance's start.
+        """
 
     def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
-        """Move the sources that replay recordings; without arguments, only return their status.
+        """Control the replays of recordings, and return their status; no argument: only return it.
+
+        Args:
+            wish: Requested changes: see :class:`shmio.model.replay.Wish`.
 
         Raises:
             CommandError: The instance replays no recording, or a source does not answer.

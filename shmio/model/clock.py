@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 STEP_SIZE_NS: Final = 50_000_000
-"""Default length of a step."""
+"""Default length of a step, in ns."""
 
 
 class ClockMode(IntEnum):
@@ -14,7 +14,7 @@ class ClockMode(IntEnum):
 
     WALL = 0
     VIRTUAL = 1
-    """Only steps move time, from take-over until release or the end of the instance."""
+    """Only steps move time, from take-over until release or the instance's end."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -26,17 +26,17 @@ class Clock(NamedTuple):
     Attributes:
         mode: Whether time is real or virtual.
         step: Number of the last requested step.
-        time_ns: The instance's clock after that step; in wall time the clock now.
+        time_ns: The instance's clock after that step; in wall time, the present clock.
         dt_ns: Length of that step.
         done: Number of the last step that all sources have finished.
-        step_size_ns: Default length of a step.
-        playing: Whether the owner of time steps continuously.
+        step_size_ns: Length of a step that is requested without one.
+        playing: True while the owner of time steps it continuously.
         rate: Speed of playing, relative to real time.
-        stepping: Whether the last requested step is under way.
+        stepping: True while the last requested step is under way.
         owner: Pid of the owner of time; 0: nobody.
-        note: Which processes a step waits for, why the last step failed, or what it did not move.
-        resumed_ns: In wall time: the clock at which time was released.
-        offset_ns: In wall time: how far the clock is ahead of the real time since the start.
+        note: Text about the processes that a step waits for, or the problem of the last step.
+        resumed_ns: In wall time: the clock at the last release of time.
+        offset_ns: In wall time: the clock minus the real time since the instance's start.
     """
 
     mode: ClockMode = ClockMode.WALL
@@ -54,12 +54,12 @@ class Clock(NamedTuple):
     offset_ns: int = 0
 
     def __call__(self) -> Clock:
-        """Return this state, so that ``cell.clock`` of a local cell can be called as that of a remote one."""
+        """Return this state, so that ``cell.clock()`` works with local and remote cells."""
         return self
 
     @property
     def virtual(self) -> bool:
-        """Whether time is virtual: only steps move it."""
+        """True if time is virtual: only steps move it."""
         return self.mode is ClockMode.VIRTUAL
 
     @property
@@ -69,9 +69,9 @@ class Clock(NamedTuple):
 
     @property
     def basis(self) -> tuple[ClockMode, int, int, int]:
-        """Base of clock and cycles in wall time; it changes whenever time is taken over or released."""
+        """Base of clock and cycles in wall time. It changes when time is taken over or released."""
         return self.mode, self.step, self.resumed_ns, self.offset_ns
 
     def lead(self, period_ns: int) -> int:
-        """Return how many cycles of this period are ahead of the clock, in wall time."""
+        """Return the lead of cycles over the clock in wall time: cycle = clock // period + lead."""
         return self.step - self.resumed_ns // period_ns

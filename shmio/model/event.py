@@ -1,4 +1,4 @@
-"""What happens in a source: commands and their outcomes, injections, quality, starts and stops, notes."""
+"""Events of a source: commands and outcomes, injections, quality, starts and stops, notes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class EventKind(StrEnum):
     UNKNOWN = "unknown"
     """The write was sent, but no answer came."""
     DIVERTED = "diverted"
-    """An injection took these values, which a writer or an injection further in had given."""
+    """An injection took these values, which came from a writer or from an inner injection."""
     TAKEN = "taken"
     """Injections took all of the item; nothing was left for the device."""
     INJECTED = "injected"
@@ -48,39 +48,41 @@ class EventKind(StrEnum):
     NOTED = "noted"
     """A program added a note."""
     REMOVED = "removed"
-    """A reload has removed the source: no more events come of it."""
+    """A reload has removed the source: it has no more events."""
     OTHER = "other"
-    """An event of a later version of shmio."""
+    """A kind that only a later version of shmio knows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What has happened in a source.
+    """An event of a source.
 
     A write of more than 256 bytes has several events, one for each part.
 
     Attributes:
         source: Name of the source.
-        kind: What has happened.
-        number: Number of the event, ascending in each source until a reload replaces it; 0 with ``removed``.
+        kind: Kind of the event.
+        number: Number of the event, ascending in each source until a reload replaces the source; 0
+            with ``removed``.
         frame: Number of the last frame before the event.
         cycle: Cycle of the source's schedule.
         incarnation: Number of the source's process.
-        clock_ns: The instance's clock.
-        utc_ns: UTC time.
+        clock_ns: The instance's clock, in ns.
+        utc_ns: UTC time, in ns.
         quality: Quality after the event.
         text: The reason, the note, or the name of the injection.
         injection: Number of the injection that the event is about; 0: none.
-        command: The writer's number of the command that the event is about; 0: none.
-        by: Who caused the event: ``grpc``, ``mqtt``, or a program such as ``program 1``; empty if nobody did, or it
-            is unknown.
-        direction: ``in`` for what is written toward the device, ``out`` for what consumers see; empty if the event
-            is about no registers, or it is unknown.
-        paths: The registers, elements, slices or bits that the event is about, at most 2048. Of several items of a
-            command, ``rejected`` and ``taken`` name those of the first; so do other outcomes if ``accepted`` was lost.
-        values: Values by path, where the event has them: with ``accepted``, ``diverted`` and ``shadowed``. A value
-            of None stands for bytes that are not valid for their type.
-        missed: Events of the source that were lost between the event before and this one.
+        command: Number that the writer gave the command that the event is about; 0: none.
+        by: The event's cause: ``grpc``, ``mqtt``, or a program such as ``program 1``. Empty if
+            there is none or it is unknown.
+        direction: ``in`` if the event is about data for the device, ``out`` if about data for
+            consumers. Empty if it is about no registers, or the direction is unknown.
+        paths: The registers, elements, slices or bits that the event is about, at most 2048. If a
+            command has several items, ``rejected`` and ``taken`` name only those of the first. So
+            do other outcomes if ``accepted`` was lost.
+        values: Values by path, with ``accepted``, ``diverted`` and ``shadowed``. None stands for
+            bytes that are not valid for their type.
+        missed: Number of the source's events lost since the previous event.
     """
 
     source: str

@@ -1,4 +1,4 @@
-"""Injections as programs, segments and endpoints know them."""
+"""Injections, in the form that programs, segments and endpoints share."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Running(msgspec.Struct, Generic[DeclarationT], frozen=True):
     Attributes:
         declaration: The declaration: in a segment a ``Declaration``, for programs a mapping with
             the keys of an ``[[injection]]`` table.
-        state: ``waiting``, ``active``, ``over``, or ``lifted`` before its time.
-        seed: The run's only source of randomness; drawn by the source if the declaration has none.
-        runs: How often it has become active.
+        state: ``waiting``, ``active``, ``over``, or ``lifted`` before its end.
+        seed: The run's only source of randomness. The source draws it if the declaration has none.
+        runs: Number of activations.
         cycle: Cycle of the last activation.
-        time_ns: The instance's clock at the last activation.
+        time_ns: The instance's clock at the last activation, in ns.
     """
 
     declaration: DeclarationT
@@ -32,19 +32,19 @@ class Running(msgspec.Struct, Generic[DeclarationT], frozen=True):
 
 
 class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_defaults=True):
-    """A present injection; of each source the innermost comes first in lists.
+    """A present injection. In lists, the innermost of each source comes first.
 
     Attributes:
-        number: Number of the injection, by which anybody may lift it.
+        number: Number of the injection, with which any program may lift it.
         direction: ``out`` or ``in``.
         priority: Priority; the highest is outermost.
-        keep: Whether it outlives the program that laid it.
+        keep: True if it stays when the program that laid it ends.
         name: Name of the injection.
-        writer: Command queue that it came from; 4294967295: the configuration.
-        pid: Process that it came from; 0: the configuration.
+        writer: Number of the command queue that it came from; 4294967295: from the configuration.
+        pid: Process that laid it; 0: from the configuration.
         ranges: The covered bits as (offset, size, mask).
         running: State of a declared injection; None: a program gives the values.
-        source: Name of the source; empty in the segment, where the block says it.
+        source: Name of the source; empty in the segment, where the block has the name.
     """
 
     number: int = msgspec.field(name="id")
@@ -61,7 +61,7 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """A declared injection that was laid; ``seed`` is its own, or a random one."""
+    """A declared injection that was laid; its ``seed`` is the declared one or a random one."""
 
     source: str
     number: int
@@ -76,12 +76,13 @@ class Happening:
     Attributes:
         source: Name of the source.
         number: Number of the injection.
-        what: ``injected``, ``activated``, ``deactivated``, ``lifted``, or ``unknown``.
-        clock_ns: Time of the instance's clock.
-        utc_ns: UTC time.
+        what: Kind of event: ``injected``, ``activated``, ``deactivated``, ``lifted``, or
+            ``unknown``.
+        clock_ns: The instance's clock, in ns.
+        utc_ns: UTC time, in ns.
         frame: Number of the last frame before the event.
         cycle: Cycle of the source's schedule.
-        run: Which of its activations the event is about.
+        run: Number of the activation that the event is about.
         text: With ``lifted``: the reason.
     """
 
@@ -98,7 +99,10 @@ class Happening:
 
 @dataclass(frozen=True, slots=True)
 class Lifted:
-    """Result of lifting an injection; ``failure`` says why it was not lifted, else it is empty."""
+    """Result of lifting an injection.
+
+    If it was not lifted, ``failure`` is the reason, else empty.
+    """
 
     source: str
     number: int

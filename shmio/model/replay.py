@@ -11,17 +11,17 @@ from typing import TypedDict
 class Playing:
     """Status of one source that replays a recording.
 
-    Unless it is paused, the position moves as the instance's clock does.
+    Unless paused, the position moves ``speed`` times as fast as the instance's clock.
 
     Attributes:
         source: Name of the source.
-        time_s: UTC of the position, in s.
+        time_s: UTC of the position, in s since 1970.
         position_s: The position, in s from the start of the played range.
         length_s: Length of the played range, in s.
         speed: Speed relative to the instance's clock.
-        paused: Whether the replay is paused.
-        loop: Whether it starts again at the end.
-        over: Whether it has reached the end.
+        paused: True while the replay is paused.
+        loop: True if it starts again at the end.
+        over: True if it has reached the end.
         until_s: The position at which it will pause, in s; None: at the end.
     """
 
@@ -37,14 +37,17 @@ class Playing:
 
 
 class Wish(TypedDict, total=False):
-    """What is to change in a replay. A time is seconds from the start of the played range, or a date and time."""
+    """Requested changes of a replay.
+
+    A time is given in seconds from the start of the played range, or as a date and time.
+    """
 
     paused: bool
-    """Whether to pause."""
+    """True to pause, False to resume."""
     speed: float
     """Speed relative to the instance's clock, 0.01 to 1000."""
     loop: bool
-    """Whether to start again at the end."""
+    """True to start again at the end."""
     seek: float | str
     """Time to go to."""
     until: float | str

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Quality(IntEnum):
-    """Quality of a value, as in OPC UA (OPC 10000-8, section 6.3). Zeroed memory is bad."""
+    """Quality of a value, as in OPC UA (OPC 10000-8, section 6.3). Zero is bad."""
 
     BAD = 0
     UNCERTAIN = 1
@@ -35,7 +35,10 @@ class Provenance(IntEnum):
 
 
 class Column(IntEnum):
-    """The array that holds the values of a type, numbered as the fields of ``Values`` in shmio.v1."""
+    """Array in which a client has the values of a type.
+
+    Numbers are those of ``Values`` in shmio.v1.
+    """
 
     BOOL = 1
     INT32 = 2
@@ -48,18 +51,19 @@ class Column(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The state of one register at the time it was read.
+    """State of one register when it was read.
 
     Attributes:
         source: Name of the source.
-        register: The register or array element: its path within the source, type, dimensions and comment.
+        register: The register or array element, with its path within the source, type, dimensions
+            and comment.
         value: The last known value, even while the quality is bad; None if there never was one.
         quality: Quality of the value.
-        reason: Why the quality is not good; empty if it is.
+        reason: Reason why the quality is not good; empty if it is.
         provenance: Where the value comes from: live, simulated, replayed or injected.
         source_time: The source's time stamp, UTC in s; None if there never was a value.
-        age_s: Age of the value by the source's clock, in s; None if there never was a frame. In an update
-            of a remote cell it is not known: 0, or None while the quality is bad.
+        age_s: Age of the value by the source's clock, in s; None if there never was a frame. In
+            updates of a remote cell it is unknown: 0, or None while the quality is bad.
     """
 
     source: str
@@ -73,7 +77,7 @@ class Reading:
 
     @property
     def path(self) -> str:
-        """Path of the register, with its source."""
+        """Path of the register, including its source."""
         return f"{self.source}/{self.register.path}"
 
 
@@ -95,7 +99,7 @@ class OutcomeKind(StrEnum):
     EXPIRED = "expired"
     """The value was not sent to the device, and will not be."""
     UNKNOWN = "unknown"
-    """The value was sent, or perhaps sent, but no answer came: read before you write again."""
+    """The value was or may have been sent, but no answer came: read before you write again."""
 
 
 _DONE = frozenset({OutcomeKind.WRITTEN, OutcomeKind.TAKEN, OutcomeKind.SHADOWED, OutcomeKind.ACCEPTED})
@@ -117,5 +121,5 @@ class Outcome:
 
     @property
     def done(self) -> bool:
-        """Whether the value reached its target, or an injection took it."""
+        """True if the value reached its target, or an injection took it."""
         return self.kind in _DONE

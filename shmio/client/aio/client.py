@@ -1,4 +1,4 @@
-"""The client for asyncio: its calls, and its streams of updates, steps and a model's work."""
+"""The client for asyncio: calls, and streams of updates and steps."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Client:
 
     Raises:
         PathError, ValueRangeError, CommandError, QualityError: As from a local cell.
-        EndpointError: A limit of the endpoint is reached, for one client or for all.
+        EndpointError: The endpoint has reached a limit, for this client or for all.
         RemoteError: The endpoint cannot be reached, or refuses this client.
     """
 
     def __init__(self, target: Target, timeout_s: float = 10.0) -> None:
-        """Take the target, and the time limit of calls that are answered at once."""
+        """Take the target, and the time-out in s of calls that the endpoint answers at once."""
         self.target = target
         self._channel = Channel(target, timeout_s)
         self._layouts: Mapping[str, BlockLayout] | None = None
@@ -56,27 +56,31 @@ class Client:
         self._simulate: Any = connection.stream_stream(f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString)
 
     async def layouts(self, *sources: str) -> dict[str, BlockLayout]:
-        """Return the layouts of these sources, or of all, by source; PathError: no such source."""
+        """Return the layouts of these sources, or of all, by source.
+
+        Raises:
+            PathError: There is no such source.
+        """
         request = wire.GetLayoutsRequest(sources=sources)
         parts = await Stream(self._channel, self._stub.GetLayouts, request, timeout_s=self._channel.timeout_s).to_list()
         return {block.source: block for block in layouts(parts)}
 
     @property
     async def sources(self) -> list[str]:
-        """Names of the sources."""
+        """Return the names of the sources."""
         return list(await self.layouts())
 
     async def get(self, *patterns: str) -> list[Reading]:
         """Read the registers that patterns name, whatever their quality: see :class:`shmio.Cell`.
 
-        The first call fetches the layouts, and so does a call after a reload has changed them.
+        The first call also fetches the layouts, as does the first call after a reload.
 
         Raises:
             PathError: A pattern names nothing.
             ValueRangeError: The registers are too many for one call.
         """
         if self._layouts is not None:
-            with suppress(PathError):  # the layouts may be those before a reload
+            with suppress(PathError):  # the layouts may be out of date after a reload
                 return await self._get(patterns, self._layouts)
         self._layouts = await self.layouts()
         return await self._get(patterns, self._layouts)
@@ -104,7 +108,8 @@ class Client:
 
         Args:
             patterns: Paths, elements, slices, structures, globs, or the names of sources.
-            originals: Whether to read also the source's values beneath injections.
+            originals: Whether to read also the values that the source delivered, without
+                injections.
 
         Raises:
             PathError: A pattern names nothing.
@@ -114,7 +119,12 @@ class Client:
         return Snapshot(Tables().updates(await self._call(self._read, request)))
 
     async def __getitem__(self, path: str) -> Any:
-        """Return a register's value; PathError, or QualityError with the reason if it is bad."""
+        """Return a register's value.
+
+        Raises:
+            QualityError: The quality is bad; the message gives the reason.
+            PathError: There is no such register.
+        """
         return (await self.read(path))[path]
 
     def subscribe(
@@ -129,14 +139,14 @@ class Client:
 
         Args:
             patterns: As for :meth:`read`.
-            every_frame: Whether to receive all frames in order, with losses counted. Otherwise
+            every_frame: Whether to receive each frame, in order, and count lost frames. Otherwise,
                 each update has the newest frame.
             frames: Whether to receive raw frames of the sources instead of values.
             max_rate_hz: Maximum number of updates per second of each source; 0 for no limit.
-            deadband: Changes of numbers up to this size are not reported.
+            deadband: Changes of a number by at most this are not reported.
 
         Returns:
-            An iterator of updates. PathError comes with the first one.
+            An iterator over updates. The first one raises PathError if a pattern names nothing.
         """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
@@ -144,7 +154,7 @@ class Client:
         return Subscription(Stream(self._channel, self._subscribe, request))
 
     async def events(self, *sources: str) -> Events:
-        """Follow what happens in these sources from now on, or in all that there are: see :class:`shmio.Cell`.
+        """Follow the events of these sources, or of all, from now on: see :class:`shmio.Cell`.
 
         Raises:
             PathError: There is no such source.
@@ -155,19 +165,20 @@ class Client:
         return await Events.begin(Stream(self._channel, self._stub.Events, wire.EventsRequest(sources=sources)))
 
     async def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Write values to one source as one command, and wait for the outcomes: :meth:`write` without its options."""
+        """Write values to one source, and wait for the outcomes: see :meth:`write`."""
         return await self.write(values, timeout_s)
 
     async def write(
         self, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
     ) -> list[Outcome]:
-        """Write registers, arrays or elements of one source, all or none.
+        """Write registers, arrays or elements of one source as one command: all or none.
 
         Args:
             values: Values by path.
-            timeout_s: Time limit until the source begins to write; by default 2 s, or three of its
-                cycles.
-            until_accepted: Whether to return without waiting for the device.
+            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or
+                three cycles if that is longer.
+            until_accepted: Whether to return when the source has accepted the values, without
+                waiting for the device.
 
         Returns:
             The outcome of each value.
@@ -194,7 +205,7 @@ class Client:
     ) -> Shadow:
         """Lay an injection over registers of one source, all of /out or all of /in.
 
-        It is lifted when it is closed, at the end of its ``async with`` block, when this program
+        It is lifted when you close it, at the end of its ``async with`` block, when this program
         ends, or after ``for_s``.
 
         Args:
@@ -202,10 +213,10 @@ class Client:
             ranges: Bytes and bits of a frame, in addition to the patterns or alone.
             source: Source of the ranges if there is no pattern, as ``cell`` or ``cell/in``.
             priority: Injections with a higher priority cover those with a lower one.
-            keep: Whether the injection stays until somebody lifts it.
+            keep: Whether the injection stays when this program ends, until somebody lifts it.
             name: Name in the list of injections.
             for_s: Time in s after which it is lifted.
-            originals: Whether to receive the covered values by iteration.
+            originals: Whether to receive the covered values: iterate over the injection.
 
         Raises:
             PathError: A pattern names nothing.
@@ -221,14 +232,14 @@ class Client:
     async def declare(
         self, declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool = False
     ) -> Campaign:
-        """Lay injections that their sources run by themselves, all or none.
+        """Lay declared injections, all or none. Their sources run them without this program.
 
-        They are lifted when the campaign is closed, at the end of its ``async with`` block, or when
+        They are lifted when you close the campaign, at the end of its ``async with`` block, or when
         this program ends. Iterate over the campaign for its events.
 
         Args:
-            declarations: Tables with the keys of ``[[injection]]`` in the configuration.
-            keep: Whether they stay until they have ended, or somebody lifts them.
+            declarations: Mappings with the keys of an ``[[injection]]`` table.
+            keep: Whether they stay when this program ends, until they end or somebody lifts them.
 
         Raises:
             ValueRangeError: A declaration is invalid.
@@ -238,7 +249,10 @@ class Client:
         return await Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     async def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all; the innermost come first."""
+        """Return the present injections of these sources, or of all.
+
+        Of each source, the innermost is first.
+        """
         request = wire.ListInjectionsRequest(sources=sources)
         return injection.injections(await self._call(self._stub.ListInjections, request))
 
@@ -255,7 +269,7 @@ class Client:
         """Lift all injections of these sources, or of all sources, whoever laid them.
 
         Raises:
-            CommandError: Some could not be lifted.
+            CommandError: Some injections were not lifted.
         """
         found = injection.lifted(await self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
         if left := [one for one in found if one.failure]:
@@ -263,7 +277,7 @@ class Client:
         return found
 
     async def simulation(self, source: str, name: str = "") -> Simulation:
-        """Join a source with the connector ``remote`` as its model, which answers its steps.
+        """Join a source with the connector ``remote`` as its model, to compute its steps.
 
         Args:
             source: Name of the source.
@@ -292,8 +306,7 @@ class Client:
         Args:
             source: Name of the source.
             step: Called as ``step(time_s, dt_s, inputs)``; returns outputs by path, all or some. If
-                it raises an error, the step fails with this reason, which is also logged by
-                ``shmio.client``.
+                it raises an error, the step fails, and the logger ``shmio.client`` logs the reason.
             name: Name of the model in messages.
             start: Called with the :class:`Simulation` each time the model has joined.
             patience_s: Time in s to wait for an instance that does not run.
@@ -331,7 +344,7 @@ class Client:
         return [one["name"] for one in (await self.status())["processes"] if one.get("real_time")]
 
     async def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
-        """Take control of time, and move it by steps; return when all streams have their changes.
+        """Take control of time, and move it by steps. Return when all streams have the changes.
 
         Args:
             dt_s: Length of each step in s; None for the step size.
@@ -344,7 +357,7 @@ class Client:
             TimeError: A step failed, or another program owns time.
             ValueRangeError: The count or the length is out of range.
         """
-        if count < 1:  # 0 would be a stream of steps without end
+        if count < 1:  # 0 would mean endless steps
             raise ValueRangeError(f"the number of steps must be at least 1, not {count}")
         if count == 1:
             return await self._move(self._stub.Step, wire.StepRequest(dt_ns=calls.ns(dt_s)), calls.STEP_PATIENCE_S)
@@ -357,7 +370,7 @@ class Client:
         return await self.clock()
 
     def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
-        """Take control of time, and do ``count`` steps by one call; see :class:`Steps`.
+        """Take control of time, and do ``count`` steps in one call: see :class:`Steps`.
 
         Raises:
             ValueRangeError: The count or the step size is out of range.
@@ -366,7 +379,7 @@ class Client:
         return Steps(Duplex(self._channel, self._stub.Steps, *requests), count)
 
     async def set_step_size(self, dt_s: float) -> Clock:
-        """Take control of time, and set the size of steps that are requested without one.
+        """Take control of time, and set the step size: the length of steps requested without one.
 
         Args:
             dt_s: The size in s.
@@ -378,7 +391,7 @@ class Client:
         return await self._move(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s)))
 
     async def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Take control of time, and let it step by itself.
+        """Take control of time, and let the endpoint step it until :meth:`pause`.
 
         Args:
             rate: Speed of the clock relative to real time.
@@ -391,25 +404,28 @@ class Client:
         return await self._move(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate))
 
     async def pause(self) -> Clock:
-        """Take control of time, and stop its steps. TimeError: another program owns time."""
+        """Take control of time, and stop it. TimeError: another program owns time."""
         return await self._move(self._stub.Pause, wire.PauseRequest())
 
     async def release(self) -> Clock:
-        """Return to real time, from the present time on. TimeError: another program owns time."""
+        """Return to real time, which continues from the present virtual time.
+
+        Raises:
+            TimeError: Another program owns time, or time was virtual from the instance's start.
+        """
         return await self._move(self._stub.Release, wire.ReleaseRequest())
 
     async def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
-        """Control the sources that play recordings, and return their state.
+        """Control the replays of recordings, and return their status; no argument: only return it.
 
         Args:
-            wish: Requested changes (:class:`Wish`); without any, only the state is returned. Play
-                at the end of a recording begins again.
+            wish: Requested changes: see :class:`shmio.model.replay.Wish`. A replay that is resumed
+                at its end starts again.
 
         Raises:
             ValueRangeError: A speed or a time is out of range.
             PathError: There is no such source or register.
-            CommandError: No recording is played, the search found nothing, or a source does not
-                answer.
+            CommandError: There is no replay, the search found nothing, or a source does not answer.
         """
         found = await self._call(self._stub.Replay, calls.replay_request(wish), calls.replay_patience_s(wish))
         return calls.playing(found)
@@ -439,7 +455,7 @@ class Client:
 
 
 class Subscription(AsyncIterator[Update]):
-    """Iterator of updates, for one task; it ends when it or its client is closed.
+    """Iterator over updates, for one task. It ends when it or its client is closed.
 
     Any task may call :meth:`close`.
     """
@@ -450,7 +466,7 @@ class Subscription(AsyncIterator[Update]):
         self._waiting: Iterator[Update] = iter(())
 
     async def __anext__(self) -> Update:
-        """Wait for the next update; the one after it changes the arrays of its table in place.
+        """Wait for the next update. Use each before the next one, which changes its arrays.
 
         Raises:
             RemoteError: The instance has ended.
@@ -473,11 +489,11 @@ class Subscription(AsyncIterator[Update]):
 
 
 class Steps(AsyncIterator[Stepped]):
-    """Steps of time on one stream, which costs less than one call for each step.
+    """Steps of time on one stream, which is cheaper than one call for each step.
 
-    Close it, or use ``async with``; use it in one task. Iterate over the steps that
-    :meth:`Client.steps` requested. Each comes when all streams have its changes, while the next
-    steps are already being computed. To do something between steps, call :meth:`step` instead.
+    Use it in one task, and close it, or use ``async with``. Iterate over the steps that
+    :meth:`Client.steps` requested: each comes when all streams have its changes, while the endpoint
+    already computes the next ones. To do something between steps, call :meth:`step` instead.
     """
 
     def __init__(self, stream: Duplex, count: int) -> None:
@@ -487,7 +503,7 @@ class Steps(AsyncIterator[Stepped]):
         self._waiting: Iterator[Any] = iter(())
 
     async def __anext__(self) -> Stepped:
-        """Wait for the next finished step; the iteration ends after all requested steps.
+        """Wait for the next finished step. The iteration ends after all requested steps.
 
         Raises:
             CommandError: The step failed, or another program owns time; no later step is done.
@@ -507,7 +523,10 @@ class Steps(AsyncIterator[Stepped]):
                 raise
 
     async def step(self, dt_s: float | None = None) -> Stepped:
-        """Do one more step, and wait for it and all earlier ones; errors as for iteration."""
+        """Request one more step, and wait for it and all earlier ones.
+
+        Errors: as for the iteration.
+        """
         await self._stream.write(*calls.steps_requests(1, dt_s))
         self._left += 1
         last = None
@@ -532,7 +551,8 @@ class Steps(AsyncIterator[Stepped]):
 class Simulation(Member, AsyncIterator[Work]):
     """A source that this program computes: iterate over the steps, and answer each.
 
-    Close it, or use ``async with``. Only :meth:`close` may be called from other tasks.
+    Use it in one task, and close it, or use ``async with``. Other tasks may only call
+    :meth:`close`.
     """
 
     def __init__(self, stream: Duplex, part: Part) -> None:
@@ -550,7 +570,7 @@ class Simulation(Member, AsyncIterator[Work]):
             raise
 
     async def __anext__(self) -> Work:
-        """Wait for the next step; the iteration ends when this object or its client is closed.
+        """Wait for the next step. The iteration ends when this object or its client is closed.
 
         Raises:
             LostError: The endpoint has ended, or a reload has changed the source.
@@ -560,7 +580,7 @@ class Simulation(Member, AsyncIterator[Work]):
         return self._work
 
     async def done(self, outputs: Mapping[str, object]) -> None:
-        """Answer the present step with outputs by path; outputs that are left out keep their values.
+        """Answer the present step with outputs by path. Those left out keep their values.
 
         Raises:
             PathError: There is no such output; nothing was sent.
@@ -569,11 +589,11 @@ class Simulation(Member, AsyncIterator[Work]):
         await self._answer(self._part.done(self._present(), outputs))
 
     async def fail(self, reason: str) -> None:
-        """Answer that the present step has failed; the outputs stay as they are."""
+        """Answer that the present step has failed. The outputs keep their values."""
         await self._answer(self._part.failed(self._present(), reason))
 
     async def compute(self, work: Work, step: Step, rejoining: Rejoining) -> None:
-        """Call a program's function for a step, and answer with its outputs or its error."""
+        """Call the program's function for a step, and answer with its outputs or its error."""
         rejoining.heed(self._part, work)
         try:
             outputs = await outputs_of(step(work.time_s, work.dt_s, work.inputs))

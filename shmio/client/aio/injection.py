@@ -1,4 +1,4 @@
-"""Injections of a program: one that it feeds with values, and declared ones."""
+"""Injections of a program: shadows, to which it gives values, and declared injections."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from shmio.model.values import Outcome
 
 
 class Shadow(AsyncIterator[Update]):
-    """A present injection; several tasks may give values, and one may iterate over the originals.
+    """An injection to which this program gives values; iterate over it for the originals.
 
-    ``table`` has the registers that it covers, with the latest originals.
+    Several tasks may give values, and one may iterate. ``table`` has the registers that the
+    injection covers, with the latest originals.
     """
 
     def __init__(self, channel: Channel, stream: Duplex, held: injection.Held) -> None:
@@ -25,7 +26,7 @@ class Shadow(AsyncIterator[Update]):
         self._stream = stream
         self._held = held
         self.number = held.number
-        """The injection's number, with which anybody may lift it."""
+        """Number of the injection, with which any program may lift it."""
         self.table = held.table
         self._turn = Condition()
         self._answers: dict[int, Any] = {}  # by sequence number; None until the answer comes
@@ -58,8 +59,8 @@ class Shadow(AsyncIterator[Update]):
             raw: Values as raw bytes.
 
         Returns:
-            An outcome for each value: the worst for all of them. It is ``rejected`` if a path or value is
-            wrong, or the injection does not cover it.
+            An outcome for each value: all have the worst one. It is ``rejected`` if a path or value
+            is wrong, or the injection does not cover the path.
 
         Raises:
             ValueRangeError: A value has an unsupported Python type.
@@ -100,7 +101,7 @@ class Shadow(AsyncIterator[Update]):
         await self._stream.write(data)
 
     async def __anext__(self) -> Update:
-        """Wait for the next original, if ``originals`` was given; ends with the injection."""
+        """Wait for the next originals, which come only if ``originals`` was given."""
         async with self._turn:
             if not self._updates:
                 await self._turn.wait_until(lambda: self._held.waits or self._over)
@@ -149,16 +150,16 @@ class Shadow(AsyncIterator[Update]):
 
 
 class Lift(Protocol):
-    """Lifts an injection of a source by its number."""
+    """Function that lifts an injection of a source by its number."""
 
     async def __call__(self, source: str, number: int) -> None:
         """Lift an injection; PathError, CommandError if that fails."""
 
 
 class Campaign(AsyncIterator[Happening]):
-    """Injections that were declared together.
+    """Declared injections that were laid together.
 
-    Iterate over it for their events, in one task; the iteration ends when all injections have
+    Iterate over it for their events, in one task: the iteration ends when all injections have
     ended. ``declared`` has the injections in the order of the declarations, with their seeds.
     """
 
@@ -197,7 +198,7 @@ class Campaign(AsyncIterator[Happening]):
         left, self._left = self._left, {}
         try:
             for source, number in () if self._keep else left:
-                with suppress(PathError, CommandError):  # it has ended, or a reload removed its source
+                with suppress(PathError, CommandError):  # it has ended, or a reload has removed its source
                     await self._lift(source, number)
         finally:
             self._stream.close()  # this ends what still remains

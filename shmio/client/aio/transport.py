@@ -1,4 +1,4 @@
-"""Calls and waiting with asyncio; :mod:`shmio.client.sync.transport` offers the same names for threads."""
+"""Calls and waiting with asyncio. ``shmio.client.sync.transport`` does the same with threads."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from shmio.errors import RemoteError
 
 Outputs = Mapping[str, object] | None
 Step = Callable[[float, float, Values], Outputs | Awaitable[Outputs]]
-"""Computes outputs from ``(time_s, dt_s, inputs)``: those of ``time_s``, ``dt_s`` after the step before.
+"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs at the end of a step.
 
 It may be a coroutine function.
 """
 CLOSED: Final = grpc.aio.UsageError
-"""What grpcio raises for a call on a channel that was closed."""
+"""Error that grpcio raises for a call on a closed channel."""
 sleep: Final = asyncio.sleep
 
 
@@ -37,7 +37,7 @@ class Channel:
     def __init__(self, target: Target, timeout_s: float) -> None:
         self.target = target
         self.timeout_s = timeout_s
-        """Of calls that are answered at once."""
+        """Time-out of calls that the endpoint answers at once, in s."""
         self.closed = False
         credentials = target.credentials
         self.grpc = (
@@ -53,7 +53,7 @@ class Channel:
 
 
 class Stream(AsyncIterator[Any]):
-    """Answers to one request; the iteration ends when the stream or its channel is closed.
+    """Answers to one request. The iteration ends when the stream or its channel is closed.
 
     Raises:
         ShmioError: The endpoint ended the stream.
@@ -77,7 +77,7 @@ class Stream(AsyncIterator[Any]):
         return found
 
     async def first(self) -> Any:
-        """Return the first answer, or None if the stream was closed; RemoteError after a time-out."""
+        """Return the first answer; None if the stream was closed. RemoteError: time-out."""
         try:
             async with asyncio.timeout(calls.WRITE_PATIENCE_S):
                 return await anext(self, None)
@@ -85,7 +85,7 @@ class Stream(AsyncIterator[Any]):
             raise calls.unanswered(self._channel.target) from None
 
     async def to_list(self) -> list[Any]:
-        """Return all answers; RemoteError if the channel is closed meanwhile."""
+        """Return all answers. RemoteError: the channel was closed meanwhile."""
         found = [one async for one in self]
         if self._channel.closed:
             raise RemoteError(f"{self._channel.target.address}: the client was closed")
@@ -98,7 +98,7 @@ class Stream(AsyncIterator[Any]):
 
 
 class Duplex(Stream):
-    """A stream that sends further requests; the first ones are sent at its first use."""
+    """A stream that also sends further requests. The first requests are sent at its first use."""
 
     def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
         super().__init__(channel, method)
@@ -111,7 +111,10 @@ class Duplex(Stream):
         return await super().__anext__()
 
     async def write(self, *requests: Any) -> None:
-        """Send requests; they are dropped if the stream has ended, and reading raises the reason."""
+        """Send requests.
+
+        If the stream has ended, they are dropped, and reading raises the reason.
+        """
         async with self._turn:
             requests, self._first = (*self._first, *requests), ()
             with suppress(grpc.RpcError, asyncio.InvalidStateError), _closing():
@@ -135,10 +138,10 @@ def _closing() -> Iterator[None]:
 
 
 class Condition(asyncio.Condition):
-    """Condition with a time-out, on which several tasks wait for each other."""
+    """Condition with a time-out, for which several tasks wait."""
 
     async def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until the predicate is true; return whether it became so in time."""
+        """Wait until the predicate is true. Return False after a time-out."""
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await self.wait_for(predicate)
@@ -152,5 +155,5 @@ class Background:
         self._task = asyncio.get_running_loop().create_task(run(), name=name)
 
     async def join(self, timeout_s: float | None = None) -> None:
-        """Wait for its end, at most ``timeout_s``."""
+        """Wait until the coroutine has ended, at most ``timeout_s``."""
         await asyncio.wait((self._task,), timeout=timeout_s)

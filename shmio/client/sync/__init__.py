@@ -1,5 +1,5 @@
 """The synchronous client of ``shmio.v1``: every call waits.
 
-``scripts/generate-sync-client`` makes these modules of those in :mod:`shmio.client.aio`. By hand there is only
-:mod:`~shmio.client.sync.transport`.
+``scripts/generate-sync-client`` generates these modules from :mod:`shmio.client.aio`, except for
+:mod:`~shmio.client.sync.transport`, which is written by hand.
 """

@@ -12,7 +12,7 @@ from shmio.model.event import Event
 
 
 class Events(Iterator[Event]):
-    """Iterator of events, for one thread; it ends when it or its client is closed.
+    """Iterator over events, for one thread. It ends when it or its client is closed.
 
     Any thread may call :meth:`close`.
     """

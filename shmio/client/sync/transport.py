@@ -1,4 +1,4 @@
-"""Calls and waiting with threads; :mod:`shmio.client.aio.transport` offers the same names for asyncio."""
+"""Calls and waiting with threads. ``shmio.client.aio.transport`` does the same with asyncio."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from shmio.errors import RemoteError
 
 Outputs = Mapping[str, object] | None
 Step = Callable[[float, float, Values], Outputs]
-"""Computes outputs from ``(time_s, dt_s, inputs)``: those of ``time_s``, ``dt_s`` after the step before."""
+"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs at the end of a step."""
 CLOSED: Final = ValueError
-"""What grpcio raises for a call on a channel that was closed."""
+"""Error that grpcio raises for a call on a closed channel."""
 sleep: Final = time.sleep
 
 
@@ -34,7 +34,7 @@ class Channel:
     def __init__(self, target: Target, timeout_s: float) -> None:
         self.target = target
         self.timeout_s = timeout_s
-        """Of calls that are answered at once."""
+        """Time-out of calls that the endpoint answers at once, in s."""
         self.closed = False
         credentials = target.credentials
         self.grpc = (
@@ -50,7 +50,7 @@ class Channel:
 
 
 class Stream(Iterator[Any]):
-    """Answers to one request; the iteration ends when the stream or its channel is closed.
+    """Answers to one request. The iteration ends when the stream or its channel is closed.
 
     Raises:
         ShmioError: The endpoint ended the stream.
@@ -70,7 +70,7 @@ class Stream(Iterator[Any]):
             self._channel.target.fail(error)
 
     def first(self) -> Any:
-        """Return the first answer, or None if the stream was closed; RemoteError after a time-out."""
+        """Return the first answer; None if the stream was closed. RemoteError: time-out."""
         late = threading.Event()
 
         def give_up() -> None:
@@ -91,7 +91,7 @@ class Stream(Iterator[Any]):
             timer.join()
 
     def to_list(self) -> list[Any]:
-        """Return all answers; RemoteError if the channel is closed meanwhile."""
+        """Return all answers. RemoteError: the channel was closed meanwhile."""
         found = list(self)
         if self._channel.closed:
             raise RemoteError(f"{self._channel.target.address}: the client was closed")
@@ -104,7 +104,7 @@ class Stream(Iterator[Any]):
 
 
 class Duplex(Stream):
-    """A stream that sends further requests; the first ones are sent at once."""
+    """A stream that also sends further requests. The first requests are sent at once."""
 
     def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -119,7 +119,10 @@ class Duplex(Stream):
             raise
 
     def write(self, *requests: Any) -> None:
-        """Send requests; they are dropped if the stream has ended, and reading raises the reason."""
+        """Send requests.
+
+        If the stream has ended, they are dropped, and reading raises the reason.
+        """
         for request in requests:
             self._requests.put(request)
 
@@ -134,10 +137,10 @@ class Duplex(Stream):
 
 
 class Condition(threading.Condition):
-    """Condition with a time-out, on which several threads wait for each other."""
+    """Condition with a time-out, for which several threads wait."""
 
     def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until the predicate is true; return whether it became so in time."""
+        """Wait until the predicate is true. Return False after a time-out."""
         return self.wait_for(predicate, timeout_s)
 
 
