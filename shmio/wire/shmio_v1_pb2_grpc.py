@@ -140,7 +140,7 @@ class ShmioServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def GetLayouts(self, request, context):
-        """Returns the layouts of blocks: enough to decode raw frames. A large block comes in several parts.
+        """Returns the layouts of sources, with which a client can decode raw frames. A large layout comes in several parts.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -154,14 +154,14 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Read(self, request, context):
-        """Reads registers once; those of one source come from one frame.
+        """Reads registers once. The values of one source come from one frame.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Subscribe(self, request, context):
-        """Sends the present values, then changes, or every frame.
+        """Sends the present values of registers, then changes, or every frame.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -182,21 +182,22 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Inject(self, request_iterator, context):
-        """Lays an injection for as long as the stream is open: the original values come down, the altered ones go up.
+        """Lays an injection until the stream ends. The endpoint sends the original values, the client sends injected ones.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Simulate(self, request_iterator, context):
-        """Computes a source of the connector "remote" for as long as the stream is open: steps come down, outputs go up.
+        """Makes the client the model of a source with the connector "remote" until the stream ends. The endpoint sends steps,
+        the client sends outputs.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Declare(self, request, context):
-        """Lays injections that their sources run by themselves, all or none; then sends their events.
+        """Lays declared injections, which their sources run, all or none; then sends their events.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -217,64 +218,64 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def LiftAll(self, request, context):
-        """Lifts all injections, whoever laid them: for an emergency.
+        """Lifts all injections, whoever laid them, for an emergency.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Step(self, request, context):
-        """Takes control of time, and moves it by one step. It returns when every stream has the step's changes,
-        except Events, which no step waits for.
+        """Takes control of time, and moves it by one step. Returns when every stream has the step's changes, except streams
+        of Events, for which no step waits.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Steps(self, request_iterator, context):
-        """Does many steps by one call: each request asks for a number of steps, and each step is answered.
+        """Does many steps in one call. Each request is for a number of steps, and each step has an answer.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def SetStepSize(self, request, context):
-        """Takes control of time, and sets the size of steps that are requested without one.
+        """Takes control of time, and sets the step size: the length of steps that are requested without one.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Play(self, request, context):
-        """Takes control of time, and lets it step by itself: in real time, faster or slower.
+        """Takes control of time, and steps it continuously: in real time, faster or slower.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Pause(self, request, context):
-        """Takes control of time, and stops its steps.
+        """Takes control of time, and stops it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Release(self, request, context):
-        """Returns to real time, from the present time on; does nothing if time is real.
+        """Returns to real time, which continues from the present virtual time. Does nothing if time is real.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def WatchClock(self, request, context):
-        """Sends the state of the clock: at once, then after each step and each change.
+        """Sends the state of the clock now, and after each step and each change.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Replay(self, request, context):
-        """Controls the sources that play recordings, and returns their state; a request without a wish changes nothing.
+        """Controls the sources that replay recordings, and returns their state. An empty request changes nothing.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

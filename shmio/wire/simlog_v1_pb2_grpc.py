@@ -71,7 +71,7 @@ class SimlogAPIServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def setStepSize(self, request, context):
-        """Sets the step of the simulation.
+        """Sets the step size of the simulation.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -99,7 +99,7 @@ class SimlogAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Inject(self, request, context):
-        """Lays a shadow topic over another one and streams the original's values.
+        """Lays a shadow topic over another topic, and streams the values of the other.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

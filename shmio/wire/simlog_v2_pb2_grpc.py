@@ -81,14 +81,14 @@ class SimlogAPIServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def GetTopicInfo(self, request, context):
-        """Describes a topic, also one that does not exist.
+        """Describes a topic, which need not exist.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def CreateSubscriber(self, request, context):
-        """Opens the one stream on which all values of a subscriber come.
+        """Opens a subscriber's stream, on which it receives the values of all its topics.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -116,7 +116,7 @@ class SimlogAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Write(self, request, context):
-        """Writes to one topic, and says whether that was accepted.
+        """Writes to one topic. The status says whether the write was accepted.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -130,7 +130,7 @@ class SimlogAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Read(self, request, context):
-        """Reads topics at once.
+        """Reads the present values of topics.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -73,21 +73,21 @@ class SimServerAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def start(self, request, context):
-        """Lets it go on by itself, in real time.
+        """Steps the simulation continuously, in real time.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def stop(self, request, context):
-        """Ends that, and the simulation.
+        """Pauses, and reports `alive` as false until the next step.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def pause(self, request, context):
-        """Ends that.
+        """Takes control of time, and stops it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
