@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from shmio.version import __version__
 
-TYPE_CHECKING = False  # typing's own costs every command 10 ms, in which Ctrl-C would print a traceback
+TYPE_CHECKING = False  # importing typing takes 10 ms, during which Ctrl-C would print a traceback
 if TYPE_CHECKING:
     from typing import Any
 

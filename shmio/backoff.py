@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Backoff:
-    """Rule for the waits between attempts; it has no state, and the caller counts failures.
+    """Rule for the waits between attempts. It has no state: the caller counts the attempts.
 
     Attributes:
         first_s: The first wait, in s.
         most_s: The longest wait, in s, before the jitter.
-        factor: Each wait is so many times as long as the one before.
+        factor: Ratio of each wait to the one before it.
         jitter: The largest random deviation, as a fraction of the wait. Use it where many clients
-            would otherwise all try at the same time.
+            would otherwise retry at the same time.
 
     """
 
@@ -25,8 +25,8 @@ class Backoff:
     jitter: float = 0.0
 
     def wait_s(self, waits: int = 0) -> float:
-        """Return the next wait in s, after so many ``waits`` in a row."""
-        wait_s = min(self.most_s, self.first_s * self.factor ** min(waits, 64))  # a float may not overflow
+        """Return the next wait in s. ``waits``: number of waits since the last success."""
+        wait_s = min(self.most_s, self.first_s * self.factor ** min(waits, 64))  # the bound prevents an overflow
         if self.jitter:
             wait_s *= random.uniform(1 - self.jitter, 1 + self.jitter)  # noqa: S311  not a secret
         return wait_s

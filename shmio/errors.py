@@ -9,20 +9,20 @@
     ├── ValueRangeError    a value does not fit its register's type
     ├── PathError          no such source or register
     ├── ConflictError      a name is in use for something else
-    ├── WrongInstanceError the running instance of this name was started from another configuration file
+    ├── WrongInstanceError the running instance of this name has another configuration file
     ├── SegmentError       the shared memory cannot be used
     │   ├── NotRunningError      no running instance of that name
     │   │   └── UnfinishedError      the segment is incomplete: in creation, or its creator died
-    │   ├── AlreadyRunningError  another supervisor holds the instance
-    │   └── FormatError          the segment's format is not one this version knows
+    │   ├── AlreadyRunningError  the instance already has a supervisor
+    │   └── FormatError          this version cannot read the segment's format
     ├── CommandError       a command cannot be sent to its source, or was not carried out
     │   └── TimeError            the instance's clock cannot be moved, or a step failed
-    ├── QualityError       the value exists but is not good
+    ├── QualityError       the quality of the value is bad
     ├── ConnectorError     the device did not answer as it should; carries a reason code
-    ├── ModelError         a simulation model is declared wrongly, or its code failed; names it, and the line
+    ├── ModelError         a simulation model is declared wrongly, or its code failed
     ├── RecordingError     a recording cannot be written, or this version cannot read it
     ├── MissingLibraryError  an optional library is not installed; names the command for it
-    ├── EndpointError      an address cannot be served
+    ├── EndpointError      an endpoint cannot use its address, or is at a limit
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
     │   ├── LostError            nothing serves this address at present; also a NotRunningError
     │   └── UnknownClientError   the endpoint requires a known client
@@ -49,7 +49,10 @@ class ConfigError(ShmioError):
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """An error or warning about a layout source; ``str()`` is ``file:line:col: severity: message``."""
+    """An error or warning about a layout source.
+
+    ``str()`` is ``file:line:column: severity: message``.
+    """
 
     file: str
     line: int
@@ -64,8 +67,8 @@ class Diagnostic:
 class LayoutError(ShmioError):
     """A layout source cannot be compiled; ``str()`` is one line for each diagnostic.
 
-    ``diagnostics`` holds them as objects with file, line and column, warnings included.
-    It is empty when the error is not about a source text.
+    ``diagnostics`` has them as objects with file, line and column, including warnings. It is empty
+    if the error is not about a source text.
     """
 
     def __init__(self, message: str, diagnostics: Sequence[Diagnostic] = ()) -> None:
@@ -89,7 +92,7 @@ class PathError(ShmioError, LookupError):
 
 
 class ConflictError(ShmioError):
-    """A name, such as a shadow's path, is in use for something else."""
+    """A name, such as a shadow's path, is already used for something else."""
 
 
 class WrongInstanceError(ShmioError):
@@ -109,36 +112,36 @@ class UnfinishedError(NotRunningError):
 
 
 class AlreadyRunningError(SegmentError):
-    """Another supervisor holds this instance; the message has its pid."""
+    """The instance already has a supervisor; the message has its pid."""
 
 
 class FormatError(SegmentError):
-    """The segment's magic, ABI version or structure is not one this version knows."""
+    """The segment has a magic, ABI version or structure that this version of shmio cannot read."""
 
 
 class CommandError(ShmioError):
     """A command could not be sent, or was not carried out by the source or its device.
 
-    The message says which, and why.
+    The message says what failed, and why.
     """
 
 
 class TimeError(CommandError):
     """Another program controls the instance's clock, or a step failed.
 
-    The message names that program, or what did not answer, and the reason.
+    The message names that program, or the process that failed, and the reason.
     """
 
 
 class QualityError(ShmioError):
-    """The register has no good value at present; the message gives the reason."""
+    """The quality of a register or source is bad; the message gives the reason."""
 
 
 class ConnectorError(ShmioError):
     """The device is absent or did not answer as the protocol demands.
 
-    The connectors' base loop closes the connection on this error. ``str()`` becomes the frame's
-    reason text.
+    On this error, the poll loop closes the connection, and ``str()`` becomes the reason in the
+    next frame.
     """
 
 
@@ -147,11 +150,11 @@ class MissingLibraryError(ShmioError, ImportError):
 
 
 class EndpointError(ShmioError):
-    """An address cannot be listened on, or its TLS files cannot be used."""
+    """An endpoint cannot use its address or TLS files, or has reached a limit of clients."""
 
 
 class ModelError(ShmioError):
-    """A simulation model is declared wrongly, or its code failed; the message has name and line."""
+    """A simulation model is declared wrongly, or its code failed; the message says where."""
 
 
 class RemoteError(ShmioError):

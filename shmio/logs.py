@@ -1,6 +1,6 @@
-"""Logging: lines that name process and source, in files that rotate, and a limit on how many clients can cause.
+"""Logging: the format of lines, rotating files, and a rate limit for each kind of record.
 
-One line per event, fields in fixed order, extra fields as ``key=value``::
+A record is one line that names the process; extra fields follow as ``key=value``::
 
     2026-11-21T05:20:01.123456Z INFO    cell[1234] quality good source=cell cycle=1207
 """
@@ -26,9 +26,9 @@ KEPT_FILES = 3
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as one line; a traceback follows indented.
+    """Formats a record as one line; a traceback follows, indented.
 
-    Control characters are escaped.
+    Control characters of the line are escaped.
     """
 
     def __init__(self, process: str, source: str | None) -> None:
@@ -37,7 +37,7 @@ class LineFormatter(logging.Formatter):
         self._always = {} if source is None else {"source": source}
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return a record as text."""
+        """Return the record's line, with its traceback if there is one."""
         stamp = datetime.fromtimestamp(record.created, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         fields = self._always | getattr(record, "fields", {})
         message = printable(" ".join([record.getMessage(), *(f"{key}={value}" for key, value in fields.items())]))
@@ -48,15 +48,17 @@ class LineFormatter(logging.Formatter):
 
 
 class RotatingLog(logging.handlers.RotatingFileHandler):
-    """A log file that rotates; with ``streams`` standard output and error follow it."""
+    """A rotating log file.
+
+    With ``streams``, standard output and error always go to its newest file.
+    """
 
     def __init__(self, file: Path, *, streams: bool, patient: bool) -> None:
         """Open the file.
 
-        With ``patient`` a file that cannot be opened is tried again with each record; otherwise
-        OSError is raised.
+        If that fails, raise OSError; with ``patient``, try again at each record instead.
         """
-        self._streams = False  # they lead to the file already, if it could be opened
+        self._streams = False  # they already go to this file, if it can be opened
         super().__init__(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1, delay=True)
         try:
             self.stream = self._open()
@@ -84,7 +86,7 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
     def _open(self) -> TextIOWrapper:
         """Open a new file and redirect the streams to it.
 
-        The traceback of a dying interpreter must not go to a removed file.
+        Otherwise the traceback of a crash would go to a removed file.
         """
         stream = super()._open()
         if self._streams:
@@ -108,9 +110,9 @@ def setup(
         file: The log file.
         process: The process name in each line.
         source: The source name in each line.
-        console: Whether records go to standard error too.
-        streams: Whether standard output and error lead to the file and must follow it.
-        patient: Whether a file that cannot be written is tried again with each record.
+        console: Whether records also go to standard error.
+        streams: Whether standard output and error go to the file, and must go to each new one.
+        patient: Whether to retry a file that cannot be written, instead of raising ConfigError.
 
     Returns:
         The logger named ``shmio``.
@@ -153,24 +155,28 @@ def printable(text: str) -> str:
 
 
 MAX_LINES: Final = 20
-"""Most lines of one kind in each turn, of :data:`TURN_S`."""
+"""Maximum number of records of one kind in an interval."""
 TURN_S: Final = 10.0
+"""Length of the interval, in s."""
 
 
 class LogRateLimit(logging.Filter):
-    """Limits the records of one kind per turn, so that no client can fill the log. Safe in any thread.
+    """Limits the records of each kind, so that no client can fill the log. Any thread may use it.
 
-    The unformatted text of a record is its kind. The first record of a later turn says how many
-    were left out.
+    Records with the same unformatted text are of one kind. After more than ``MAX_LINES`` of them in
+    an interval, the next record that is written says how many were left out.
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic, *, one_kind: bool = False) -> None:
-        """Create the filter; with ``one_kind`` all records are of one kind, for foreign loggers."""
+        """Create the filter.
+
+        With ``one_kind``, all records count as one kind. Use it for loggers of other libraries.
+        """
         super().__init__()
         self._clock_s = clock_s
         self._one_kind = one_kind
         self._kinds: dict[str, tuple[float, int]] = {}
-        """By kind: when its turn ends, and how many records came in it."""
+        """For each kind, the end of its interval and the number of records in it."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether the record is written."""

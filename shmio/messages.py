@@ -1,4 +1,4 @@
-"""Converts values, declared injections and events between Python or TOML and messages of ``shmio.v1``."""
+"""Convert values, declared injections and events to messages of ``shmio.v1``, and back."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _OPERATIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "drop": {},
     "flip": {"bits": "bits"},
 }
-"""Each operation's own keys, with their message fields.
+"""The keys of each operation, with their message fields.
 
-With just a value, the value is the message.
+If ``value`` is an operation's only key, the value itself is the message.
 """
 _COMMON: Final = ("probability", "start_s", "end_s", "when", "for_s", "times", "seed", "priority")
 _DISTRIBUTIONS: Final = {"uniform": wire.Noise.DISTRIBUTION_UNIFORM, "gaussian": wire.Noise.DISTRIBUTION_GAUSSIAN}
@@ -175,7 +175,7 @@ _DIRECTIONS: Final = {"out": wire.DIRECTION_OUT, "in": wire.DIRECTION_IN}
 
 
 def event_to_wire(event: Event) -> wire.Event:
-    """Convert an event."""
+    """Convert an event to a message."""
     found = wire.Event(
         source=event.source,
         kind="KIND_UNSPECIFIED" if event.kind is EventKind.OTHER else f"KIND_{event.kind.name}",
@@ -215,7 +215,7 @@ def event_from_wire(found: wire.Event) -> Event:
 
 
 def _found_to_wire(value: object, path: str) -> wire.Value:
-    """Convert a value, also one that is not valid: that is a message without a value."""
+    """Convert a value. None, which stands for invalid bytes, becomes a message without a value."""
     if value is None:
         return wire.Value()
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Real-time priority of a process, sched(7): it runs before processes without one."""
+"""Real-time priority of a process, which then runs before processes without one: sched(7)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def prioritise(priority: int) -> None:
     """Give the calling thread, and threads that it starts later, a priority of SCHED_FIFO.
 
     Raises:
-        ConfigError: The user may not have it. The message contains the remedy.
+        ConfigError: The user has no permission for it. The message contains the remedy.
 
     """
     try:
@@ -25,7 +25,7 @@ def prioritise(priority: int) -> None:
 
 
 def check(priority: int) -> None:
-    """Check that a process of this user may have the priority; ConfigError if not."""
+    """Raise ConfigError unless a process of this user may have the priority."""
     refused: list[ConfigError] = []
 
     def attempt() -> None:
@@ -34,7 +34,7 @@ def check(priority: int) -> None:
         except ConfigError as error:
             refused.append(error)
 
-    thread = threading.Thread(target=attempt, name="priority")  # a thread of its own: the caller keeps its priority
+    thread = threading.Thread(target=attempt, name="priority")  # another thread: the caller keeps its priority
     thread.start()
     thread.join()
     if refused:

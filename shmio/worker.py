@@ -1,8 +1,8 @@
-"""The common part of all child processes: attach, take the role, log, beat, stop on request.
+"""The common part of all child processes: role, log, heartbeat, report, and stop on request.
 
-A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))`` with ``run(worker)`` as
-its work. Exit status: 0 stopped as requested; 1 failed, start it again; 2 it can never work as
-configured.
+A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))``, where ``run(worker)``
+does its work. Exit status: 0 stopped as requested; 1 failed, a restart may help; 2 failed, and the
+configuration must be changed first.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_SPEC_BYTES = 1 << 26
 
 
 class Worker:
-    """A child process in its role. Use it from the main thread, except ``stopping``."""
+    """A child process of the instance. Only the main thread may use it, except for ``stopping``."""
 
     def __init__(self, spec: dict[str, Any]) -> None:
         self.name: str = spec["name"]
@@ -37,7 +37,7 @@ class Worker:
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
         self._on_reread: Callable[[], object] | None = None
-        self._rereads = False  # SIGHUP came before there was a function to call
+        self._rereads = False  # whether SIGHUP has come, perhaps before on_reread()
         self.log = self._set_up_log(Path(spec["log_file"]))
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
@@ -47,7 +47,7 @@ class Worker:
         self.slot = self.segment.processes.find(self.name)
         self._take_role()
         self.before = self.slot.report
-        """The last report of the previous process in this role."""
+        """Last report of the previous process in this role."""
         self._install_signal_handlers()
         self._report = Report(os.getpid(), Activity.STARTING, time.monotonic_ns())
         self.slot.report = self._report
@@ -55,17 +55,17 @@ class Worker:
 
     def _set_up_log(self, file: Path) -> logging.Logger:
         source = self.name if self.kind == "source" else None
-        # A controller is read with or without a log; with one as soon as the disk has room or the folder is writable.
+        # A full disk must not stop the work: the log is retried at each record.
         return logs.setup(file, self.name, source=source, streams=True, patient=True)
 
     def _take_role(self) -> None:
-        """Wait until the previous process is gone: the kernel frees its lock when it dies."""
+        """Wait until the previous process in this role has ended, and take its lock."""
         deadline = time.monotonic() + ROLE_WAIT_S
         while not self.slot.take():
             if time.monotonic() > deadline:
                 raise SegmentError(f"role {self.name} is still held by pid {self.slot.report.pid}")
             time.sleep(0.02)
-        # Its supervisor may have died meanwhile, and its successor may have removed the segment.
+        # Meanwhile the supervisor may have died, and a new one may have removed the segment.
         if not self.segment.shared.current():
             raise SegmentError(f"the segment of instance {self.segment.instance!r} was removed; this process ends")
 
@@ -80,7 +80,7 @@ class Worker:
         note: str | None = None,
         activity: Activity | None = None,
     ) -> None:
-        """Update the process table with the given values, and give a heartbeat."""
+        """Update these values in the process table, and send a heartbeat."""
         old = self._report
         self._report = Report(
             old.pid,
@@ -94,18 +94,18 @@ class Worker:
         self.slot.beat()
 
     def on_stop(self, call: Callable[[], object]) -> None:
-        """Call ``call`` once in a thread of its own when the process is to stop.
+        """Call ``call`` in another thread when the process is requested to stop.
 
-        At once if it already is.
+        If it has been requested already, call it now.
         """
         self._on_stop = call
         if self.stopping.is_set():
             call()
 
     def on_reread(self, call: Callable[[], object]) -> None:
-        """Call ``call`` in a thread of its own after each reload of the worker's rules.
+        """Call ``call`` in another thread after each reload of the worker's rules.
 
-        If a reload has happened since the process began, it is called at once.
+        If there was a reload since the process started, call it now, too.
         """
         self._on_reread = call
         if self._rereads:
@@ -114,7 +114,8 @@ class Worker:
     def _install_signal_handlers(self) -> None:
         """Make SIGTERM set ``stopping`` and SIGHUP trigger a reread; ignore Ctrl-C.
 
-        The handlers themselves take no lock, because the main thread may hold that of the event.
+        A thread does the work: a handler that waited for the event's lock could block the main
+        thread, which may have locked it.
         """
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
