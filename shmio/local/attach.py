@@ -314,8 +314,8 @@ class Attachment:
 
         Args:
             values: Values by path: registers, whole arrays, elements, slices or bits of one source.
-            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or three
-                cycles if that is longer.
+            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or
+                three cycles if that is longer.
 
         Returns:
             The outcome of each value, in the given order.

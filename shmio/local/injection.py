@@ -100,8 +100,8 @@ class Shadow:
 
         Args:
             values: Values by path, with or without the source.
-            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or three
-                cycles if that is longer.
+            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or
+                three cycles if that is longer.
 
         Returns:
             The outcome of each value, under the path that you gave: SHADOWED if consumers see it,

@@ -156,7 +156,7 @@ class ClockPage:
 
         It is comparable to CLOCK_MONOTONIC. In wall time, both are equal until the first take-over.
         """
-        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # no more than needed: this is called often
+        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # a part: this is called often
         if not mode:
             offset_ns: int = time_ns - dt_ns
             return time.monotonic_ns() + offset_ns
