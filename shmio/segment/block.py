@@ -288,10 +288,10 @@ class Block:
 
     @cached_property
     def layout(self) -> Layout:
-        """The layout of the block, which is read from the segment when it is first needed.
+        """Layout of the block. It is read from the segment when it is first used.
 
         Raises:
-            FormatError: It is inconsistent.
+            FormatError: The layout is inconsistent.
         """
         return self._load_layout()
 
@@ -366,7 +366,7 @@ class Block:
 
 
 class Layouts(Mapping[str, "Layout"]):
-    """The layouts of blocks, by source. A layout that nobody asks for is not read."""
+    """Layouts of blocks, by source. Each is read from the segment when it is first used."""
 
     def __init__(self, blocks: Mapping[str, Block]) -> None:
         self._blocks = blocks
@@ -376,7 +376,7 @@ class Layouts(Mapping[str, "Layout"]):
         return source in self._blocks
 
     def __getitem__(self, source: str) -> Layout:
-        """Return the layout of a source. FormatError: it is inconsistent."""
+        """Return the layout of a source. FormatError: the layout is inconsistent."""
         return self._blocks[source].layout
 
     def __iter__(self) -> Iterator[str]:

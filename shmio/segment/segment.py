@@ -158,10 +158,10 @@ def read_block(
     layout_at: int,
     clock: ClockPage,
 ) -> Block:
-    """Open the block whose layout is in section ``layout_at``; the layout itself is read later.
+    """Open the block whose layout is in section ``layout_at``, without reading the layout yet.
 
     Raises:
-        FormatError: It is inconsistent.
+        FormatError: The block is inconsistent.
     """
     name = shared.name
     described = entries[layout_at]
