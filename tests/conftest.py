@@ -1,4 +1,4 @@
-"""What holds for every test: nothing is left behind, and each instance has a name of its own."""
+"""Fixtures and hooks for all tests: each instance has its own name, and no test leaves anything behind."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from xdist.scheduler import LoadScopeScheduling
 
 from shmio.testing.mosquitto import missing
 
-# Tests interrupt themselves and others. In the background, or beside others, Python begins with SIGINT ignored.
+# Tests interrupt themselves and other processes with SIGINT. In the background, and in workers of xdist,
+# Python starts with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-if "PYTEST_XDIST_WORKER" in os.environ:  # and under nohup with SIGHUP ignored, which only the main process is to keep
+if "PYTEST_XDIST_WORKER" in os.environ:  # under nohup, SIGHUP is ignored too, which is right for the main process only
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-# No deadline: the machine may be busy with other things. Each run has the same examples, --fast fewer of them;
-# --hypothesis-profile=search looks for others.
+# No deadline, as the host may be busy. Each run uses the same examples, with --fast fewer of them;
+# --hypothesis-profile=search looks for new ones.
 settings.register_profile("repeat", deadline=None, derandomize=True)
 settings.register_profile("fast", deadline=None, derandomize=True, max_examples=20)
 settings.register_profile("search", deadline=None, max_examples=1000)
@@ -38,12 +39,12 @@ PREFIX = f"test-{os.getpid()}-"
 
 
 ONE_AFTER_THE_OTHER = (
-    # the ports of the README
+    # these use the ports shown in the README
     (
         "tests/system/test_docs.py",
         "tests/unit/cli/test_supervisor_cell.py::test_configuration_from_init_runs",
     ),
-    # an instance that all of a module use
+    # all tests of such a module use one instance
     ("tests/system/test_inject.py",),
     ("tests/system/test_inject_grpc.py",),
     ("tests/system/test_running.py",),
@@ -103,31 +104,31 @@ APART = ("tests/system/test_benchmarks.py",)
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     tiers = parser.getgroup("tiers").addoption
-    tiers("--fast", action="store_true", help="only quick tests that start no process")
-    tiers("--all", action="store_true", help="also the tests that are not run unless you name them")
+    tiers("--fast", action="store_true", help="run only quick tests that start no process")
+    tiers("--all", action="store_true", help="also run the tests that otherwise run only if you name them")
 
 
 def left_out(config: pytest.Config) -> tuple[str, ...]:
-    """Beginnings of the names of tests that are not in the tier that was asked for."""
+    """Return the beginnings of the names of tests that are not in the chosen tier."""
     if config.option.fast:
         return (*START_PROCESSES, *SLOW, *APART)
     return () if config.option.all else tuple(name for name in APART if not any(name in given for given in config.args))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave out files of which no test is in the tier, without importing them."""
+    """Leave out files that have no test in the chosen tier, without importing them."""
     name = collection_path.relative_to(config.rootpath).as_posix() + "/" * collection_path.is_dir()
     return name.startswith(left_out(config)) or None
 
 
 class StarterFinder:
-    """Finds the tests that start a process, by the names in their code, and in that of their helpers and fixtures."""
+    """Finds the tests that start a process, from the names in the code of tests, helpers and fixtures."""
 
     def __init__(self) -> None:
         self._known: dict[object, bool] = {}
 
     def starts_process(self, item: pytest.Item) -> bool:
-        """Whether a test or a fixture of it has one of STARTERS."""
+        """Return whether the test or one of its fixtures uses one of STARTERS."""
         if not isinstance(item, pytest.Function):
             return False
         test = getattr(item.obj, "hypothesis", None)
@@ -137,14 +138,14 @@ class StarterFinder:
         return any(self._names(one) for one in used)
 
     def _names(self, used: object) -> bool:
-        """Whether a function or class has one of STARTERS, itself or in a helper of the tests that it uses."""
+        """Return whether a function or class uses one of STARTERS, itself or through a helper."""
         used = inspect.unwrap(used) if callable(used) else used
         if isinstance(used, MethodType):
             used = used.__func__
         if not (getattr(used, "__module__", None) or "").startswith(("tests.", "shmio.testing")):
             return False
         if used not in self._known:
-            self._known[used] = False  # until it is known, for those that use one another
+            self._known[used] = False  # ends the recursion if two helpers use each other
             if isinstance(used, type):
                 self._known[used] = any(self._names(one) for one in vars(used).values() if callable(one))
             elif isinstance(used, FunctionType):
@@ -155,7 +156,7 @@ class StarterFinder:
 
 
 def code_names(code: CodeType) -> Iterator[str]:
-    """Names that a function uses, and those of functions within it."""
+    """Yield the names that a function uses, including its nested functions."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -163,7 +164,7 @@ def code_names(code: CodeType) -> Iterator[str]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests that are not in the tier."""
+    """Leave out the tests that are not in the chosen tier."""
     names, finder = left_out(config), StarterFinder()
     out = {
         item for item in items if item.nodeid.startswith(names) or (config.option.fast and finder.starts_process(item))
@@ -186,7 +187,9 @@ class NoProcesses:
         sys.addaudithook(self._audit)
 
     def _audit(self, event: str, arguments: tuple[object, ...]) -> None:
-        if self._testing and event in NEW_PROCESS and arguments[:1] != ("lscpu",):  # import of numpy.testing before 2
+        if (
+            self._testing and event in NEW_PROCESS and arguments[:1] != ("lscpu",)
+        ):  # numpy.testing before 2 runs it when imported
             self._started.append(f"{event} {arguments[0] if arguments else ''}")
             raise RuntimeError("a test of the fast tier may start no process")
 
@@ -201,41 +204,41 @@ class NoProcesses:
 
     @pytest.hookimpl(trylast=True)
     def pytest_runtest_teardown(self) -> None:
-        """Fail the test even if the code under test took the exception for its own."""
+        """Fail the test even if the code under test caught the exception."""
         started, self._started = self._started, []
         if started:
-            pytest.fail(f"not for the fast tier, add the test to START_PROCESSES in {__file__}: it starts {started}")
+            pytest.fail(f"starts {started}, which the fast tier forbids: add the test to START_PROCESSES in {__file__}")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Prepare the fast tier."""
+    """Watch for new processes in the fast tier."""
     if config.option.fast:
         settings.load_profile("fast")
         config.pluginmanager.register(NoProcesses())
 
 
 class Scheduling(LoadScopeScheduling):  # type: ignore[misc]
-    """Of the processes that run tests each gets one whenever it has time, or a whole group."""
+    """Gives each xdist worker one test at a time, or one group of ONE_AFTER_THE_OTHER."""
 
     def _split_scope(self, nodeid: str) -> str:
-        """The group of a test. (The mark for that, xdist_group, has no effect with pytest 9.2.)"""
+        """Return the group of a test. The mark xdist_group has no effect with pytest 9.2."""
         return next((group[0] for group in ONE_AFTER_THE_OTHER if nodeid.startswith(group)), nodeid)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling:
-    """Instead of those that --dist names."""
+    """Use Scheduling in place of the schedulers that --dist names."""
     return Scheduling(config, log)
 
 
 def pytest_collection_finish() -> None:
-    """Have the garbage of each test found without going through all that there is before the first."""
+    """Exclude what exists by now from garbage collection, so that collecting after each test is fast."""
     gc.collect()
     gc.freeze()
 
 
 def segments() -> set[str]:
-    """Those of this run: other instances on this host are none of our business."""
+    """Return this run's segments; other instances on this host do not count."""
     return {entry.name for entry in SHM.iterdir() if entry.name.startswith(f"shmio-{PREFIX}")}
 
 
@@ -245,7 +248,7 @@ def children() -> set[int]:
         try:
             found.update(int(pid) for pid in (task / "children").read_text().split())
         except OSError:
-            continue  # a thread that has just ended
+            continue  # the thread has just ended
     return found
 
 
@@ -271,18 +274,18 @@ def left_over(before: tuple[set[str], set[int], set[str]]) -> tuple[set[str], se
 
 @pytest.fixture(autouse=True)
 def nothing_left_behind() -> Iterator[None]:
-    """Fail a test that leaves a segment, a process, a socket, or a signal in other hands."""
+    """Fail a test that leaves a segment, a process, a socket or a changed signal handler behind."""
     before = segments(), children(), sockets()
     heeded = handlers()
     yield
     deadline = time.monotonic() + 2.0
-    while any(left := left_over(before)) and time.monotonic() < deadline:  # what is just ending may end
+    while any(left := left_over(before)) and time.monotonic() < deadline:  # processes and sockets may just be closing
         if not gc.collect():
             time.sleep(0.005)
     now = handlers()
     for sign, handler in heeded.items():
-        signal.signal(sign, handler)  # the next test is not to suffer
-    assert now == heeded, f"signals go elsewhere now: {now}"
+        signal.signal(sign, handler)  # protects the next test
+    assert now == heeded, f"signal handlers left behind: {now}"
     assert not any(left), f"left behind: segments {left[0]}, processes {left[1]}, sockets {left[2]}"
 
 
@@ -294,26 +297,28 @@ def _named() -> Iterator[str]:
 
 @pytest.fixture
 def instance() -> Iterator[str]:
-    """A name that no other instance has; whatever a failing test leaves of it is cleared."""
+    """Yield a unique instance name; after the test, remove the segment that a failing test left."""
     yield from _named()
 
 
 @pytest.fixture
 def runtime() -> Iterator[Path]:
-    """A folder for ``XDG_RUNTIME_DIR``: a socket's path is at most 107 bytes long, and ``tmp_path`` may be longer."""
+    """Yield a folder for ``XDG_RUNTIME_DIR``.
+
+    A socket's path has at most 107 bytes, and ``tmp_path`` may be longer."""
     with tempfile.TemporaryDirectory(prefix="shmio-run-") as folder:
         yield Path(folder)
 
 
 @pytest.fixture(scope="module")
 def shared_instance() -> Iterator[str]:
-    """The same for an instance that several tests of a module use."""
+    """Yield a unique name for an instance that several tests of a module share."""
     yield from _named()
 
 
 @pytest.fixture(params=["mosquitto", "embedded"])
 def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """What our own broker is asked to be: with mosquitto on the machine, and without."""
+    """Run the test with both brokers: mosquitto, and the embedded one as if mosquitto were missing."""
     if request.param == "mosquitto":
         if reason := missing():
             pytest.skip(reason)

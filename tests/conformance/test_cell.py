@@ -1,4 +1,4 @@
-"""A local and a remote cell are the same thing to a program: each test runs against both, on one running cell."""
+"""A program can use a local and a remote cell alike: each test runs on both, with one running cell."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_sources_and_layouts(cell: shmio.Cell) -> None:
         cell.layouts("nix")
 
 
-def test_get_reads_what_patterns_name_in_their_order(cell: shmio.Cell) -> None:
+def test_get_returns_the_matches_in_the_order_of_the_patterns(cell: shmio.Cell) -> None:
     found = cell.get("cell/Robot_800/Axs*_Pos", "Outputs/101..102", AT, AT)
     axes = [f"cell/Robot_800/Axs{number}_Pos" for number in range(1, 7)]
     assert [one.path for one in found] == [*axes, "cell/Outputs/101", "cell/Outputs/102", AT]
@@ -99,7 +99,7 @@ def test_get_reads_what_patterns_name_in_their_order(cell: shmio.Cell) -> None:
     last = found[-1]
     assert (last.source, last.register.type, last.value) == ("cell", "BYTE", 0)
     assert (last.quality, last.reason, last.provenance) == (Quality.GOOD, "", str(Provenance.LIVE))
-    assert {one.source_time for one in found} == {last.source_time}, "all are of one frame"
+    assert {one.source_time for one in found} == {last.source_time}, "all values are of one frame"
     assert last.age_s is not None
     (array,) = cell.get("cell/Outputs")
     assert isinstance(array.value, list)
@@ -108,7 +108,7 @@ def test_get_reads_what_patterns_name_in_their_order(cell: shmio.Cell) -> None:
 
 
 @pytest.mark.parametrize("pattern", ["cell/nix", "nix/Outputs", "cell/x*", f"{AT}/in", "cell/Outputs/1100"])
-def test_a_pattern_that_names_nothing_is_refused(cell: shmio.Cell, pattern: str) -> None:
+def test_a_pattern_that_matches_nothing_is_refused(cell: shmio.Cell, pattern: str) -> None:
     with pytest.raises(PathError):
         cell.get(pattern)
     with cell.subscribe(pattern.removesuffix("/in") + "/nix") as updates, pytest.raises(PathError):
@@ -119,14 +119,14 @@ def test_a_pattern_that_names_nothing_is_refused(cell: shmio.Cell, pattern: str)
     ("patterns", "options"),
     [((), {}), ((AT,), {"max_rate_hz": -1.0}), ((AT,), {"max_rate_hz": 5.0, "every_frame": True})],
 )
-def test_a_subscription_that_cannot_be_is_refused(
+def test_invalid_subscription_options_are_refused(
     cell: shmio.Cell, patterns: tuple[str, ...], options: dict[str, Any]
 ) -> None:
     with cell.subscribe(*patterns, **options) as updates, pytest.raises(ValueRangeError):
         next(updates)
 
 
-def test_a_subscription_gives_the_present_values_then_changes(cell: shmio.Cell) -> None:
+def test_a_subscription_yields_the_current_values_and_then_changes(cell: shmio.Cell) -> None:
     with cell.subscribe(AT, "cell/Outputs/101") as updates:
         first = next(updates)
         assert [(one.path, one.value) for one in first.readings] == [(AT, 0), ("cell/Outputs/101", 0)]
@@ -162,11 +162,11 @@ def test_closing_the_cell_ends_its_subscriptions(running: Cell) -> None:
 
 
 def until_kind(events: Iterator[Event], *kinds: str) -> Event:
-    """The next event of one of these kinds."""
+    """Return the next event of one of these kinds."""
     return next(event for event in events if event.kind in kinds)
 
 
-def test_events_say_what_is_written_and_what_became_of_it(cell: shmio.Cell) -> None:
+def test_a_write_is_reported_as_accepted_and_written_events(cell: shmio.Cell) -> None:
     with cell.events("cell") as events:
         cell.set({AT: 3, "Outputs/101": 4}, timeout_s=20)
         accepted = until_kind(events, "accepted")
@@ -185,7 +185,7 @@ def test_events_say_what_is_written_and_what_became_of_it(cell: shmio.Cell) -> N
     assert list(events) == []
 
 
-def test_events_say_what_injections_do(cell: shmio.Cell) -> None:
+def test_injections_are_reported_as_events(cell: shmio.Cell) -> None:
     with cell.events() as events:
         with cell.inject(AT, name="test") as shadow:
             laid = until_kind(events, "injected")
@@ -204,7 +204,7 @@ def test_events_say_what_injections_do(cell: shmio.Cell) -> None:
         assert found[0].text == "drift"
 
 
-def test_events_say_which_writer_it_was(cell: shmio.Cell, running: Cell) -> None:
+def test_events_name_the_writer(cell: shmio.Cell, running: Cell) -> None:
     with cell.events("cell") as events, shmio.attach(running.instance, writable=True) as other:
         other.note("gripper changed")
         noted = until_kind(events, "noted")
@@ -216,13 +216,13 @@ def test_events_of_an_unknown_source_are_refused_at_once(cell: shmio.Cell) -> No
         cell.events("cell", "nix")
 
 
-def test_another_thread_may_close_events(cell: shmio.Cell) -> None:
+def test_another_thread_can_close_the_event_iterator(cell: shmio.Cell) -> None:
     events = cell.events()
     threading.Timer(0.05, events.close).start()
     assert list(events) == []
 
 
-def test_events_go_on_over_a_restart_of_the_sources_process(cell: shmio.Cell, running: Cell) -> None:
+def test_events_continue_after_the_sources_process_was_killed(cell: shmio.Cell, running: Cell) -> None:
     with cell.events() as events:
         kill(running.processes()["cell"]["pid"])
         started = until_kind(events, "started")
@@ -232,7 +232,7 @@ def test_events_go_on_over_a_restart_of_the_sources_process(cell: shmio.Cell, ru
     until(lambda: cell.get(AT)[0].quality is Quality.GOOD, "good values")
 
 
-def test_set_writes_and_tells_what_became_of_each_value(cell: shmio.Cell) -> None:
+def test_set_returns_an_outcome_for_each_value(cell: shmio.Cell) -> None:
     outcomes = cell.set({AT: 3, "Outputs/101": 4}, timeout_s=20)
     assert [(one.path, one.kind, one.text, one.done) for one in outcomes] == [
         (AT, OutcomeKind.WRITTEN, "", True),
@@ -252,7 +252,7 @@ def test_set_writes_and_tells_what_became_of_each_value(cell: shmio.Cell) -> Non
         ({AT: 1, "cell/Robot_800/Axs1_Pos": 1.0}, CommandError),
     ],
 )
-def test_what_cannot_be_written_is_refused_whole(
+def test_one_invalid_value_makes_set_write_nothing(
     cell: shmio.Cell, values: Mapping[str, object], error: type[Exception]
 ) -> None:
     with pytest.raises(error):
@@ -260,7 +260,7 @@ def test_what_cannot_be_written_is_refused_whole(
     assert cell.get(AT)[0].value == 0
 
 
-def test_an_injection_stands_until_it_is_closed(cell: shmio.Cell) -> None:
+def test_an_injection_is_in_effect_until_it_is_closed(cell: shmio.Cell) -> None:
     with cell.inject(AT, name="test", priority=3) as shadow:
         (outcome,) = shadow.set({AT: 9})
         assert (outcome.path, outcome.kind, outcome.done) == (AT, "shadowed", True)
@@ -275,14 +275,14 @@ def test_an_injection_stands_until_it_is_closed(cell: shmio.Cell) -> None:
     until(lambda: cell.get(AT)[0].provenance == "live", "the source's value")
 
 
-def test_an_injection_over_in_takes_what_is_written(cell: shmio.Cell) -> None:
+def test_an_injection_on_in_intercepts_writes(cell: shmio.Cell) -> None:
     with cell.inject(f"{AT}/in"):
         (outcome,) = cell.set({AT: 8})
         assert (outcome.kind, outcome.done) == (OutcomeKind.TAKEN, True)
     assert cell.get(AT)[0].value == 0
 
 
-def test_anybody_may_lift_an_injection(cell: shmio.Cell) -> None:
+def test_any_client_may_lift_an_injection(cell: shmio.Cell) -> None:
     with cell.inject(AT, name="one") as shadow, cell.inject("cell/Outputs/101", name="other"):
         cell.lift("cell", shadow.number)
         assert [one.name for one in cell.injections()] == ["other"]
@@ -296,7 +296,7 @@ def test_anybody_may_lift_an_injection(cell: shmio.Cell) -> None:
         cell.injections("nix")
 
 
-def test_an_injection_of_nothing_is_refused(cell: shmio.Cell) -> None:
+def test_an_injection_whose_pattern_matches_nothing_is_refused(cell: shmio.Cell) -> None:
     for patterns in (("cell/nix",), (AT, "cell/Outputs/101/in"), ("nix/x",)):
         with pytest.raises(PathError):
             cell.inject(*patterns)
@@ -327,7 +327,7 @@ def test_declared_injections_and_their_events(cell: shmio.Cell) -> None:
     assert cell.injections() == []
 
 
-def test_a_wrong_declaration_lays_nothing(cell: shmio.Cell) -> None:
+def test_one_invalid_declaration_makes_declare_start_none(cell: shmio.Cell) -> None:
     for wrong in ({"target": "cell/nix"}, {"operation": "melt"}, {"end_s": -1.0}):
         with pytest.raises(ValueRangeError, match="injection"):
             cell.declare([DRIFT, DRIFT | {"name": "wrong"} | wrong])
@@ -352,7 +352,7 @@ def test_time_is_stepped_played_and_released(cell: shmio.Cell) -> None:
     assert not cell.clock().virtual
 
 
-def test_time_of_another_program_is_refused(cell: shmio.Cell, running: Cell) -> None:
+def test_step_is_refused_while_another_program_plays_time(cell: shmio.Cell, running: Cell) -> None:
     with shmio.attach(running.instance, writable=True) as other:
         other.play()
         with pytest.raises(TimeError, match="play"):
@@ -361,14 +361,14 @@ def test_time_of_another_program_is_refused(cell: shmio.Cell, running: Cell) -> 
     assert not cell.clock().virtual
 
 
-def test_there_is_nothing_to_replay(cell: shmio.Cell) -> None:
+def test_replay_is_refused_if_no_source_plays_a_recording(cell: shmio.Cell) -> None:
     with pytest.raises(CommandError, match="plays no recording"):
         cell.replay()
     with pytest.raises(CommandError, match="plays no recording"):
         cell.replay(paused=True)
 
 
-def test_events_go_on_over_a_reload_and_say_what_it_removes(tmp_path: Path, instance: str) -> None:
+def test_events_continue_after_a_reload_and_report_removed_sources(tmp_path: Path, instance: str) -> None:
     with started(tmp_path, instance) as running, ExitStack() as stack:
         file = tmp_path / "supervisor.toml"
         config = file.read_text()
@@ -395,7 +395,7 @@ def test_events_go_on_over_a_reload_and_say_what_it_removes(tmp_path: Path, inst
         assert texts == {f"source 'extra' was removed from instance {instance!r} by a reload"}
 
 
-def test_an_instance_that_has_ended_says_so(tmp_path: Path, instance: str) -> None:
+def test_calls_fail_with_not_running_error_after_the_instance_has_ended(tmp_path: Path, instance: str) -> None:
     with ExitStack() as stack:
         with started(tmp_path, instance) as running:
             cells = [stack.enter_context(opens(running)) for opens in BOTH]

@@ -1,4 +1,6 @@
-"""Classic S7 against the emulated PLC, held to the common suites: reads of one PDU, of several, several at once."""
+"""The common conformance suites, run with the S7 connector against the emulated PLC.
+
+Frames are read in one PDU, in several, and in several at once."""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ TAIL = SPARE + 2
 
 
 class Shared:
-    """The counter's program, which leaves a few bytes to clients and counts in the flags, from what it finds there."""
+    """PLC program: counts in the flag bytes, and leaves a few bytes to clients.
+
+    It continues the count from the flag bytes that it finds."""
 
     period_ms = 1
 
@@ -43,7 +47,7 @@ class Shared:
 
 
 class S7Rig:
-    """The emulated PLC with this program."""
+    """The emulated PLC, running this program."""
 
     def __init__(self, proxy: FaultProxy, plc: Emulator, size: int) -> None:
         self.proxy = proxy
@@ -59,10 +63,12 @@ class S7Rig:
         return S7Connector(S7Options(host=address.host, port=address.port, timeout=200, dbNumber=7), self.layout)
 
     def generation(self, raw: bytes) -> int:
-        """A read of one PDU is one cycle of the PLC; one of several may span a few."""
+        """Return the cycle that the frame was read in.
+
+        A read of one PDU is of one cycle of the PLC; one of several PDUs may span a few cycles."""
         found = generations(raw[:-TAIL])
         assert len(found) == 1 or not self.one_pdu, f"mixed cycles {found}"
-        assert found[-1] - found[0] < 10_000, f"not the PLC's bytes: {found}"
+        assert found[-1] - found[0] < 10_000, f"bytes that the PLC never had: {found}"
         assert raw[-2] & 0xFE == raw[-1], "a write has changed the neighbours of its bit"
         return found[0]
 
@@ -88,16 +94,16 @@ class TestS7(WriteConformance):
         ):
             yield S7Rig(proxy, plc, size)
 
-    def test_a_wrong_reference_is_never_taken(self, run: Run, rig: S7Rig) -> None:
-        """An answer that names another request than any under way drops the connection."""
+    def test_a_reply_with_a_wrong_reference_is_never_accepted(self, run: Run, rig: S7Rig) -> None:
+        """A reply with a number that matches no open request drops the connection."""
         run.good()
         rig.proxy.rewrite_reference(lambda reference: reference + 1000, frames=1)
         run.until(lambda frame: frame.quality is Quality.BAD)
         rig.proxy.pass_all()
         run.good()
 
-    def test_a_confirmation_with_a_wrong_reference(self, run: Run, writer: Writer, rig: S7Rig) -> None:
-        """It confirms nothing: nobody knows, and the connection is dropped."""
+    def test_a_confirmation_with_a_wrong_reference_confirms_nothing(self, run: Run, writer: Writer, rig: S7Rig) -> None:
+        """It confirms nothing: the write's outcome is unknown, and the connection is dropped."""
 
         def rename(frame: bytes) -> bytes:
             return frame[:11] + bytes((frame[11] ^ 0x40,)) + frame[12:] if frame[19:20] == b"\x05" else frame
@@ -111,7 +117,7 @@ class TestS7(WriteConformance):
         run.good()
 
     def test_stop_makes_values_uncertain(self, run: Run, rig: S7Rig) -> None:
-        """The image is right, but stands still: uncertain, with the remedy, until the PLC runs again."""
+        """The image is correct but no longer changes: uncertain, with the remedy, until the PLC runs again."""
         run.good()
         peer = snap7.Client()
         peer.connect(rig.plc.address.host, 0, 1, rig.plc.address.port)

@@ -1,9 +1,9 @@
 """Fuzzes the layout compiler, the layout document and the codec.
 
-A finding is an exception that should not be, more than ``--cpu-s`` seconds of processor time, or more memory
-than ``--memory-mb``. Its input is kept; naming it on the command line repeats it.
+A finding is an unexpected exception, more than ``--cpu-s`` seconds of processor time, or more memory
+than ``--memory-mb``. The script saves its input to a file; name the file on the command line to repeat it.
 
-Inputs are made from the golden files by mutation. ``--guided`` leaves that to atheris, which watches what code
+The inputs are mutations of the golden files. With ``--guided``, atheris makes them, which watches what code
 each input reaches.
 """
 
@@ -29,11 +29,11 @@ from tests.fuzz.layout_inputs import FRAGMENTS, MAX_INPUT, Mutator, seeds
 
 
 class TooSlow(BaseException):
-    """An input took more than its time."""
+    """An input exceeded its processor time."""
 
 
 def guarded(check: Callable[[bytes], None], cpu_s: float) -> Callable[[bytes], None]:
-    """Return the check with a limit of processor time; its findings are kept and told."""
+    """Return the check with a limit of processor time; it saves the input of a finding and exits."""
 
     def expire(_signal: int, _frame: FrameType | None) -> None:
         raise TooSlow
@@ -59,15 +59,23 @@ def guarded(check: Callable[[bytes], None], cpu_s: float) -> Callable[[bytes], N
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the script; return 0 when nothing was found."""
+    """Run the script; return 0 if nothing was found."""
     parser = argparse.ArgumentParser(prog="fuzz-layout", description="Fuzz the layout compiler and codec.")
-    parser.add_argument("inputs", nargs="*", type=Path, metavar="INPUT", help="repeat these findings and nothing else")
-    parser.add_argument("--seconds", type=float, help="at most how long (20; with --count: as long as that takes)")
-    parser.add_argument("--count", type=int, help="so many inputs, unless --seconds end it before")
-    parser.add_argument("--seed", type=int, default=int(time.time()), help="of the inputs (the time)")
-    parser.add_argument("--cpu-s", type=float, default=20.0, help="processor time that one input may take (20)")
-    parser.add_argument("--memory-mb", type=int, default=2048, help="address space of the process (2048; 0: no limit)")
-    parser.add_argument("--guided", action="store_true", help="by atheris (the extra 'fuzz'), which watches coverage")
+    parser.add_argument("inputs", nargs="*", type=Path, metavar="INPUT", help="check only these saved inputs")
+    parser.add_argument("--seconds", type=float, help="time limit (default: 20; none with --count)")
+    parser.add_argument("--count", type=int, help="number of inputs; --seconds may end the run earlier")
+    parser.add_argument(
+        "--seed", type=int, default=int(time.time()), help="seed of the inputs (default: the current time)"
+    )
+    parser.add_argument(
+        "--cpu-s", type=float, default=20.0, help="processor time that one input may take (default: 20)"
+    )
+    parser.add_argument(
+        "--memory-mb", type=int, default=2048, help="limit of the process's address space (default: 2048; 0: none)"
+    )
+    parser.add_argument(
+        "--guided", action="store_true", help="make inputs with atheris (extra 'fuzz'), guided by coverage"
+    )
     options = parser.parse_args(arguments)
     if options.seconds is None:
         options.seconds = 20.0 if options.count is None else math.inf
@@ -82,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     started, count, slowest_s = time.monotonic(), 0, 0.0
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with suppress(KeyboardInterrupt):  # Ctrl-C ends it early
+    with suppress(KeyboardInterrupt):  # Ctrl-C ends the run early
         for data in itertools.islice(Mutator(options.seed), options.count):
             before = time.process_time()
             run(data)
@@ -97,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def guide(options: argparse.Namespace) -> int:
-    """Let atheris make the inputs; it ends the process itself."""
+    """Let atheris make the inputs; it exits the process at the end."""
     atheris = importlib.import_module("atheris")
     for name in [name for name in sys.modules if name.startswith("shmio.layout") or name == layout_checks.__name__]:
         del sys.modules[name]

@@ -1,6 +1,6 @@
-"""What must hold for the layout compiler, the layout document and the codec, whatever the input.
+"""Invariants of the layout compiler, the layout document and the codec, for any input.
 
-An input either gives a layout, whose values then go through the codec and back, or ends in a LayoutError or
+An input gives a layout, and then its values must survive encoding and decoding, or it raises LayoutError or
 ValueRangeError.
 """
 
@@ -19,12 +19,12 @@ from shmio.layout.values.frame_codec import FrameCodec
 from shmio.layout.values.literal import parse_literal
 from shmio.layout.values.text import from_text, json_value, to_text
 
-SPLIT = b"\x00\xff\x00"  # between the sources of one input
-MAX_DECODED = 10  # registers of a layout that go through the codec
+SPLIT = b"\x00\xff\x00"  # separates the sources of an input
+MAX_DECODED = 10  # registers of a layout that are decoded and encoded
 
 
 def check(data: bytes) -> None:
-    """Run one input; its first byte says on what."""
+    """Check one input; its first byte chooses the check."""
     if not data:
         return
     targets = (check_sources, check_sources, check_document, check_values)
@@ -32,7 +32,7 @@ def check(data: bytes) -> None:
 
 
 def check_sources(data: bytes) -> None:
-    """Sources end in layouts that are possible, or in errors that name a place."""
+    """Sources give a consistent layout, or an error with a position."""
     sources = [Source(f"{index}.db", part) for index, part in enumerate(data.split(SPLIT, 3))]
     compiled = _outcome(sources)
     if isinstance(compiled, LayoutError):
@@ -54,7 +54,7 @@ def _outcome(sources: list[Source]) -> Compiled | LayoutError:
 
 
 def check_document(data: bytes) -> None:
-    """A layout's JSON is taken or refused, and what is taken can be used."""
+    """The JSON of a layout is accepted or refused; an accepted layout works."""
     try:
         layout = load_layout(data)
     except LayoutError:
@@ -65,7 +65,7 @@ def check_document(data: bytes) -> None:
 
 
 def check_values(data: bytes) -> None:
-    """Bytes of a controller, and texts of a user, for a register and an array of the type that byte 0 chooses."""
+    """Decode raw bytes and parse user text, for the two registers that byte 0 chooses: a scalar and an array."""
     layout = _every_type()
     which, body = (data[0] if data else 0), data[1:] or b"\0"
     frame = (body * (layout.size // len(body) + 1))[: layout.size]
@@ -88,7 +88,7 @@ def _check_frame(layout: Layout, frame: bytes) -> None:
     step = max(1, len(layout.registers) // MAX_DECODED)
     for register in layout.registers[::step]:
         _check_register(layout, register, frame)
-    if frame and len(frame) % 64 == 0:  # slow to build: now and then is enough
+    if frame and len(frame) % 64 == 0:  # building one is slow, so only for some inputs
         FrameCodec(layout).decode(frame)
 
 

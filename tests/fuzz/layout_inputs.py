@@ -1,4 +1,4 @@
-"""Inputs for fuzzing layouts: the golden files, changed at random, and pieces of sources in any order."""
+"""Inputs for fuzzing layouts: random changes of the golden files, and random combinations of source text."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ SHAPES = (
 
 
 def seeds() -> list[bytes]:
-    """The golden files, alone and together, and their layouts' JSON."""
+    """Return the golden files, singly and together, and the JSON of their layouts."""
     texts = [path.read_bytes() for path in sorted((GOLDEN / "rules").iterdir())]
     small = [text[:MAX_INPUT] for text in texts]
     found = [b"\0" + text for text in small]
@@ -118,7 +118,7 @@ def seeds() -> list[bytes]:
 
 
 class Mutator:
-    """Makes inputs, the same ones for the same seed: some sensible, some nearly, some not at all."""
+    """Yields inputs, the same ones for the same seed: some valid, some nearly valid, some garbage."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
@@ -146,7 +146,7 @@ class Mutator:
         return b"\3" + bytes([rng.randrange(256)]) + (text.encode() if rng.random() < 0.5 else rng.randbytes(64))
 
     def _declarations(self) -> bytes:
-        """A block or a function block with its instance, right but for chance."""
+        """A data block, or a function block with an instance, valid but for random errors."""
         rng = self._random
 
         def members(name: str) -> str:
@@ -170,7 +170,7 @@ class Mutator:
         return f'\0{KNOWN}FUNCTION_BLOCK "f" {sections} END_FUNCTION_BLOCK DATA_BLOCK "b" "f" {begin}'.encode()
 
     def _nested(self) -> bytes:
-        """Types that use the next one several times over, as deep as they may be; the last is often empty."""
+        """Types that each use the next one several times, up to the limit of depth; the last is often empty."""
         rng = self._random
         count = rng.randrange(1, 34)
         text = ""
@@ -200,7 +200,7 @@ class Mutator:
         return b"\0" + text.encode()
 
     def _fragments(self) -> bytes:
-        """Fragments in any order, in a frame that often makes them sensible."""
+        """Fragments in random order, in a frame that often makes them valid."""
         rng = self._random
         words = " ".join(rng.choices(FRAGMENTS, k=rng.randrange(1, 40)))
         shape = rng.choice(SHAPES)

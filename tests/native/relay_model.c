@@ -1,7 +1,7 @@
 /* Runs all interleavings of the parties of relay.h: its thread, an event loop, and the one that rings.
  *
  * The header itself is compiled here. Each of its accesses to shared memory and each of its system calls
- * is replaced by one that first lets another party continue. Every party is tried from each state. A state
+ * is replaced by one that first lets another party continue. From each state, every party is tried next. A state
  * is identified by what each party has seen and by the shared data, so that each is explored once. Memory
  * is assumed to be sequentially consistent, and a futex may also wake without a reason, as after a signal.
  * Exit status 0: no ring of the doorbell was lost, and a stopped thread ends. */
@@ -19,8 +19,8 @@
 #include <ucontext.h>
 #include <unistd.h>
 
-static void turn(void);          /* another party may continue here */
-static uint64_t saw(uint64_t value); /* what a party has seen decides what it does next */
+static void turn(void);          /* lets another party continue */
+static uint64_t saw(uint64_t value); /* records what a party has read, which decides what it does next */
 static long model_syscall(long number, const volatile void *word, int operation, uint32_t value, ...);
 static ssize_t model_read(int descriptor, void *data, size_t size);
 static ssize_t model_write(int descriptor, const void *data, size_t size);
@@ -62,11 +62,11 @@ static void forget(void);
 enum { THREAD, LOOP, RINGER, STOPPER, PARTIES, DEEPEST = 400, SPURIOUS = 1, STATES = 1 << 22, DESCRIPTOR = 7 };
 
 static struct {
-    ucontext_t context; /* where it begins */
-    jmp_buf at;         /* where it continues */
+    ucontext_t context; /* its start */
+    jmp_buf at;         /* its next step */
     bool begun;
-    uint64_t seen;             /* digest of all that it has seen */
-    const volatile void *waits; /* for this futex; for the descriptor, if it is the loop */
+    uint64_t seen;             /* digest of everything that it has read */
+    const volatile void *waits; /* the futex that it waits for; the descriptor, if it is the loop */
     bool done;
 } parties[PARTIES];
 static jmp_buf chooser;
@@ -93,7 +93,7 @@ static void forget(void) { parties[now].seen = 0; }
 
 static void turn(void)
 {
-    saw(~0u); /* where it is */
+    saw(~0u); /* its position is part of its state */
     if (!_setjmp(parties[now].at)) _longjmp(chooser, 1); /* unlike swapcontext(3), without a system call */
 }
 
@@ -138,7 +138,7 @@ static ssize_t model_write(int descriptor, const void *data, size_t size)
 
 static void run_thread(void) { relay_run(&shared, &word, DESCRIPTOR, 1); }
 
-/* Handles each wake-up and looks. Once, something else wakes it, too, as happens to event loops. */
+/* Handles each wake-up and looks. One more wake-up has no cause, as happens to event loops. */
 static void run_loop(void)
 {
     for (bool once = !stopping;; once = false) {
@@ -194,7 +194,7 @@ static void begin(bool with_stop)
     }
 }
 
-/* One more choice: a party, or (PARTIES) the thread is woken without a reason. */
+/* A choice is a party that continues, or PARTIES: the thread wakes without a reason. */
 static bool possible(int choice)
 {
     if (choice == PARTIES) return parties[THREAD].waits && !parties[THREAD].done && spurious < SPURIOUS && !stopping;
@@ -248,7 +248,7 @@ static bool is_new(uint64_t hash)
     if (known[at]) return false;
     known[at] = hash;
     if (++states > STATES / 2) {
-        fprintf(stderr, "more states than there is room for\n");
+        fprintf(stderr, "too many states: enlarge STATES\n");
         exit(2);
     }
     return true;
@@ -262,15 +262,15 @@ static int broken(const char *what, int depth)
     return 1;
 }
 
-/* Nobody can continue: check whether that is right. */
+/* No party can continue: check whether that is right. */
 static const char *wrong_end(void)
 {
     if (!stopping) return looked_at == rings ? NULL : "a ring was lost";
     if (parties[THREAD].done) return NULL;
     /* The thread was just about to wait for its turn_ns: whoever waits for its end stops it again. */
     if (parties[THREAD].waits == &word)
-        return shared.state == RELAY_STOPPED ? NULL : "one that was stopped goes on";
-    return "one that was stopped waits for the loop";
+        return shared.state == RELAY_STOPPED ? NULL : "a stopped thread keeps running";
+    return "a stopped thread waits for the loop";
 }
 
 static void replay(int depth)

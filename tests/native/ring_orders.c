@@ -1,4 +1,4 @@
-/* Checks the memory orders in ring.h by trying everything that C11 lets a reader see of a writer's actions.
+/* Checks the memory orders in ring.h by trying every value that C11 lets a reader load while a writer works.
  *
  * The header itself is compiled here. Each atomic access is replaced by one to a memory of messages: a
  * location keeps all values that it ever had, each with the view that a reader gains by reading it with
@@ -52,7 +52,7 @@ static message messages[LOCATIONS][MESSAGES];
 static int counts[LOCATIONS], locations;
 static party writer, reader, *self;
 
-static unsigned char choices[DEEPEST], limits[DEEPEST]; /* in this run: number chosen, of how many */
+static unsigned char choices[DEEPEST], limits[DEEPEST]; /* for each load of this run: message chosen, of how many */
 static int depth;
 static jmp_buf over;
 static uint64_t first_loaded;
@@ -65,7 +65,7 @@ static int location(const volatile void *at)
         if (places[i] == at) return i;
     if (locations == LOCATIONS) abort();
     places[locations] = at;
-    counts[locations] = 1; /* zero, which everybody has seen */
+    counts[locations] = 1; /* the initial zero */
     return locations++;
 }
 
@@ -99,7 +99,7 @@ static uint64_t model_load(const volatile void *at, memory_order order)
 {
     int where = location(at), oldest = self->now.of[where], number = counts[where] - 1;
     if (self == &reader && number > oldest) {
-        if (depth == DEEPEST) longjmp(over, 1); /* a repeated attempt shows nothing new */
+        if (depth == DEEPEST) longjmp(over, 1); /* a retry of the reader adds nothing new */
         limits[depth] = (unsigned char)(number - oldest + 1);
         number = oldest + choices[depth++];
     }
@@ -126,7 +126,7 @@ static ring_view ring = {memory, SLOTS, RAW_OFFSET + SIZE, SIZE, 0};
 static void check(bool right, const char *what)
 {
     if (right) return;
-    fprintf(stderr, "%s; what was read, as a place among what might have been:", what);
+    fprintf(stderr, "%s; message chosen by each load, of how many:", what);
     for (int i = 0; i < depth; i++) fprintf(stderr, " %d/%d", choices[i], limits[i]);
     fprintf(stderr, "\n");
     exit(1);
@@ -144,7 +144,7 @@ static void read_a_frame(void)
         party before = reader;
         loaded = false;
         bool there = ring_read(&ring, frame, &info, reason, (uint8_t *)&raw, NULL);
-        check(frame > head || first_loaded >= WHOLE(frame), "head is there, but its frame is not");
+        check(frame > head || first_loaded >= WHOLE(frame), "head has advanced, but its frame is not there");
         if (there) check(info.cycle == frame && info.publish_ns == -(int64_t)frame && raw == 3 * frame, "a frame is mixed");
         reader = before;
     }

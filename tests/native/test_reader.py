@@ -1,4 +1,4 @@
-"""The C reader of examples/, as its user builds it and under the sanitizers, on live segments and on hostile ones."""
+"""The C reader of examples/, built plainly and with sanitizers, on live segments and on corrupted ones."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def image(values: Mapping[str, object] = VALUES) -> bytes:
 
 
 class Running:
-    """A reader at work, attached for certain."""
+    """A running reader that has attached."""
 
     def __init__(self, program: Path, writer: BlockWriter, instance: str, path: str, *arguments: str) -> None:
         command = [str(program), instance, path, *arguments]
@@ -110,7 +110,9 @@ class Running:
         poll = select.poll()
         poll.register(self._out, select.POLLIN)
         self.first = 0
-        for _ in range(100 * PATIENCE_S):  # nobody knows when it is attached, so publish until it shows something
+        for _ in range(
+            100 * PATIENCE_S
+        ):  # publish until it prints something, as nothing else shows that it is attached
             self.first = writer.publish(image(), cycle=0)
             if poll.poll(10):
                 break
@@ -119,14 +121,14 @@ class Running:
             number, *_ = self.line()
 
     def line(self) -> tuple[str, ...]:
-        """Frame, cycle, missed, quality, value, reason."""
+        """Return frame, cycle, missed, quality, value and reason of the next line."""
         text = self._out.readline()
         match = LINE.fullmatch(text.rstrip("\n"))
         assert match, (text, self.popen.poll())
         return match.groups()
 
     def end(self) -> tuple[int, str]:
-        """Wait for its end; exit status and what it said."""
+        """Wait until it exits; return its exit status and the rest of its output."""
         _, errors = self.popen.communicate(timeout=PATIENCE_S)
         return self.popen.returncode, errors
 
@@ -148,12 +150,12 @@ def test_values_of_all_types(reader: Path, instance: str, path: str) -> None:
             assert line[:4] == (str(number), "7", "0", "good")
             shown: object = json.loads(line[4])
             assert shown == VALUES[path]
-            writer.publish(image({}), cycle=8, effective=image())  # what consumers see, not what the device said
+            writer.publish(image({}), cycle=8, effective=image())  # readers see this image, not the device's
             assert json.loads(running.line()[4]) == VALUES[path]
 
 
 def test_every_frame_once_and_losses_counted(reader: Path, instance: str) -> None:
-    """A reader that is held up while its ring turns several times knows how many frames it has lost."""
+    """A reader that is stopped while its ring wraps several times counts the frames that it lost."""
     with segment(instance, ring_bytes=16 << 10) as made:
         writer = made.writer("device")
         slots = made.blocks["device"].ring.slot_count
@@ -177,7 +179,7 @@ def test_every_frame_once_and_losses_counted(reader: Path, instance: str) -> Non
             assert [int(line[4]) for line in lines] == list(range(3 * slots))[-len(lines) :]
 
 
-def test_it_ends_after_so_many_frames(reader: Path, instance: str) -> None:
+def test_it_exits_after_the_given_number_of_frames(reader: Path, instance: str) -> None:
     with segment(instance) as made:
         writer = made.writer("device")
         with Running(reader, writer, instance, "device/int", "100") as running:
@@ -186,7 +188,7 @@ def test_it_ends_after_so_many_frames(reader: Path, instance: str) -> None:
             assert running.end() == (0, "")
 
 
-def test_bad_and_stale_are_said(reader: Path, instance: str) -> None:
+def test_bad_and_stale_frames_are_printed_with_the_reason(reader: Path, instance: str) -> None:
     with segment(instance) as made:
         writer = made.writer("device")
         with Running(reader, writer, instance, "device/on") as running:
@@ -198,11 +200,11 @@ def test_bad_and_stale_are_said(reader: Path, instance: str) -> None:
             number = writer.publish(image(), cycle=5)
             shown = running.line()
             while shown[3] == "good":
-                shown = running.line()  # nothing new comes: it says so itself, once
+                shown = running.line()  # no new frame comes: it prints the line by itself, once
             assert shown == (str(number), "5", "0", "bad", "true", "stale")
 
 
-def test_what_lives_on_the_clock_is_as_old_as_that_says(reader: Path, instance: str) -> None:
+def test_the_instance_clock_decides_how_old_a_stepped_source_is(reader: Path, instance: str) -> None:
     with segment(instance, stale_ns=300_000_000, stepped=True) as made:
         hour_ns = 3600 * 10**9
         made.clock.write(Clock(ClockMode.VIRTUAL, 7, hour_ns, 10**7, 7))
@@ -210,19 +212,19 @@ def test_what_lives_on_the_clock_is_as_old_as_that_says(reader: Path, instance: 
         with Running(reader, writer, instance, "device/on") as running:
             made.clock.write(Clock(ClockMode.VIRTUAL, 8, 2 * hour_ns, hour_ns, 7, stepping=True))
             number = writer.publish(image(), cycle=7)
-            assert running.line()[:4] == (str(number), "7", "0", "good"), "the step is under way"
+            assert running.line()[:4] == (str(number), "7", "0", "good"), "the step is not done yet"
             made.clock.write(Clock(ClockMode.VIRTUAL, 8, 2 * hour_ns, hour_ns, 8))
             assert running.line() == (str(number), "7", "0", "bad", "true", "stale")
             writer.at_ns = made.clock.monotonic_ns(2 * hour_ns)
             number = writer.publish(image(), cycle=8)
             assert running.line()[:4] == (str(number), "8", "0", "good")
-            made.clock.write(Clock(step=8, resumed_ns=2 * hour_ns, offset_ns=-10 * hour_ns))  # real time again
-            writer.at_ns = made.clock.now_ns() + hour_ns  # is not old, however slow the host is
+            made.clock.write(Clock(step=8, resumed_ns=2 * hour_ns, offset_ns=-10 * hour_ns))  # back to real time
+            writer.at_ns = made.clock.now_ns() + hour_ns  # not stale, however slow the host is
             number = writer.publish(image(), cycle=9)
             assert running.line()[:4] == (str(number), "9", "0", "good")
 
 
-def test_an_instance_that_stops_ends_it(reader: Path, instance: str) -> None:
+def test_it_exits_when_the_instance_stops(reader: Path, instance: str) -> None:
     with segment(instance) as made:
         running = Running(reader, made.writer("device"), instance, "device/on")
     with running:
@@ -234,7 +236,7 @@ def run(program: Path, *arguments: str) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
-def test_wrong_use_is_one_clear_line(reader: Path, instance: str) -> None:
+def test_wrong_arguments_give_one_clear_line(reader: Path, instance: str) -> None:
     assert run(reader) == (1, "", "usage: reader INSTANCE SOURCE/REGISTER [FRAMES]\n")
     assert run(reader, instance, "device/on")[2] == f"no instance {instance}, or no permission to read it\n"
     with segment(instance):
@@ -247,7 +249,7 @@ def test_wrong_use_is_one_clear_line(reader: Path, instance: str) -> None:
             assert run(reader, instance, path) == (1, "", message + "\n")
 
 
-def test_a_half_made_segment_is_an_error(reader: Path, instance: str) -> None:
+def test_an_unfinished_segment_is_an_error(reader: Path, instance: str) -> None:
     file = SHM / f"shmio-{instance}"
     early = f"instance {instance} is starting, or died during its start\n"
     for content, message in (
@@ -265,7 +267,7 @@ def test_a_half_made_segment_is_an_error(reader: Path, instance: str) -> None:
 
 
 def places(whole: bytes) -> list[int]:
-    """Offsets of the words that lead a reader: header, section table, ring headers."""
+    """Return the offsets of the words that lead a reader: header, section table, ring headers."""
     (table,) = struct.unpack_from("<Q", whole, 56)
     (count,) = struct.unpack_from("<I", whole, 52)
     found = [0, *range(8, 90, 4)]
@@ -278,7 +280,7 @@ def places(whole: bytes) -> list[int]:
 
 
 def test_hostile_bytes_never_crash_it(reader: Path, instance: str) -> None:
-    """Random words in header, section table and ring headers: an error, or an answer, but no crash."""
+    """Random words in header, section table and ring headers cause an error or an answer, but no crash."""
     with segment(instance, ring_bytes=1 << 12) as made:
         writer = made.writer("device")
         for cycle in range(20):
@@ -317,7 +319,7 @@ def test_hostile_bytes_never_crash_it(reader: Path, instance: str) -> None:
             command = [str(reader), f"{instance}-{copy}", "device/on", "1"]
             popen = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
             stack.callback(popen.communicate)
-            stack.callback(popen.kill)  # one that found all sound waits for a frame
+            stack.callback(popen.kill)  # a reader that found no error waits for a frame
             readers.append(popen)
         sound = 0
         for popen in readers:
@@ -332,7 +334,7 @@ def test_hostile_bytes_never_crash_it(reader: Path, instance: str) -> None:
 
 
 def test_hostile_rings_never_crash_it(reader: Path, instance: str) -> None:
-    """Heads, sequences, sizes and texts that no writer writes, under a reader at work."""
+    """Write heads, sequences, sizes and texts that no writer produces, while a reader follows the ring."""
     chance = random.Random(2)
     with segment(instance, ring_bytes=1 << 12) as made:
         writer = made.writer("device")

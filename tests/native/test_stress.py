@@ -1,4 +1,4 @@
-"""The C core under the sanitizers, many threads on one ring, two on one queue; and models of all that may happen."""
+"""The C core under sanitizers, with many threads on one ring and two on one queue; and exhaustive models of it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ COMPILER = shutil.which("cc") or shutil.which("gcc") or "cc"
 
 @pytest.mark.parametrize("sanitizers", ["thread", "address,undefined"])
 @pytest.mark.parametrize("name", ["ring_stress", "queue_stress"])
-def test_no_sanitizer_finds_anything(name: str, sanitizers: str, tmp_path: Path) -> None:
+def test_sanitizers_find_nothing(name: str, sanitizers: str, tmp_path: Path) -> None:
     source, program = Path(__file__).with_name(f"{name}.c"), tmp_path / name
-    # -Wno-tsan: the thread sanitizer does not model fences; all shared words are atomic, so it has no race to miss.
+    # -Wno-tsan: the thread sanitizer does not model fences. All shared words are atomic, so it misses no race.
     command = [COMPILER, "-std=c11", "-D_DEFAULT_SOURCE", "-O1", "-g", "-Wall", "-Wextra", "-Werror", "-pthread"]
     if sanitizers == "thread":
         command.append("-Wno-tsan")
@@ -26,8 +26,8 @@ def test_no_sanitizer_finds_anything(name: str, sanitizers: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("name", ["relay_model", "ring_orders"])
-def test_nothing_wrong_can_be_reached(name: str, tmp_path: Path) -> None:
-    """No interleaving loses a ring, or keeps a relay that was stopped; no memory order in the ring is too weak."""
+def test_the_models_find_no_error(name: str, tmp_path: Path) -> None:
+    """No interleaving loses a ring or keeps a stopped relay running; no memory order in the ring is too weak."""
     source, program = Path(__file__).with_name(f"{name}.c"), tmp_path / name
     command = [COMPILER, "-std=gnu11", "-D_GNU_SOURCE", "-O1", "-Wall", "-Wextra", "-Werror", str(source)]
     subprocess.run([*command, "-o", str(program)], check=True, capture_output=True, text=True)

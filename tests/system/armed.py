@@ -1,4 +1,4 @@
-"""The A50 cell for tests that inject toward its controller."""
+"""The A50 cell, armed for injections toward its controller."""
 
 from __future__ import annotations
 

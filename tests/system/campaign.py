@@ -1,4 +1,4 @@
-"""A campaign against models in virtual time: what it writes and injects, how it steps, what its streams bring."""
+"""A campaign with models in virtual time: it writes, injects, steps, and collects what its streams deliver."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ Streams = dict[str, list[bytes]]
 
 
 class Campaign:
-    """The clients of one campaign, against a running instance that nobody has stepped yet."""
+    """The clients of one campaign, with a running instance that has not been stepped yet."""
 
     def __init__(self, instance: str, channel: grpc.aio.Channel, slow: grpc.aio.Channel, pause_s: float) -> None:
         self._instance = instance
@@ -103,7 +103,7 @@ class Campaign:
         self._readers: dict[str, asyncio.Task[list[bytes]]] = {}
 
     async def run(self) -> Streams:
-        """Do it; the messages of each stream."""
+        """Run the campaign; return the messages of each stream."""
         await self._subscribe()
         outgoing: Any = self._old.Publish(timeout=PATIENCE_S)
         with shmio.attach(self._instance, writable=True) as self._local:
@@ -165,7 +165,7 @@ class Campaign:
     async def _follow(
         self, name: str, channel: grpc.aio.Channel, method: str, request: Any, over: Callable[[bytes], bool]
     ) -> None:
-        """Read a stream's messages as they are, in a task, up to the last one."""
+        """Read a stream's raw messages in a task, up to the last one."""
         stream: Any = channel.unary_stream(method)(request.SerializeToString(), timeout=PATIENCE_S)
         await stream.initial_metadata()
 
@@ -183,7 +183,7 @@ class Campaign:
     # ---- acting ----------------------------------------------------------------------------------------------------
 
     async def _act(self, number: int) -> None:
-        """What is done before a step, and acknowledged before it."""
+        """Write and inject before a step, and wait for each acknowledgement."""
         if number % 2:
             await self._write(f"SIM://{J2}/in", number_value=1 / number)
         if number % 3 == 0:
@@ -214,7 +214,7 @@ class Campaign:
             assert (await self._old.step(v1.StepRequest(), timeout=PATIENCE_S)).code == 0
 
     def _step_here(self) -> None:
-        """As another program on the host, when the endpoint has given time up."""
+        """Step as another program on the host does, after the endpoint has released control of the clock."""
         with shmio.attach(self._instance, writable=True) as program:
             program.step()
 
@@ -224,7 +224,9 @@ def _published(path: str, value: str) -> v1.PubRequest:
 
 
 def _updates(message: bytes) -> list[bytes]:
-    """Those of a message, which holds as many as have come meanwhile, without what another process counts anew."""
+    """Return the updates of a message, without the fields that differ between processes.
+
+    A message has all updates that were due when it was sent."""
     updates = ours.SubscribeResponse.FromString(message).updates
     for update in updates:
         for name in ("table", "frame", "incarnation"):
@@ -237,7 +239,9 @@ def _step_ms(number: int) -> int:
 
 
 async def run(instance: str, address: str, *, pause_s: float = 0.0) -> Streams:
-    """Run the campaign; what each stream has brought. ``pause_s``: so long one subscriber pauses after each message."""
+    """Run the campaign; return the messages of each stream.
+
+    One subscriber pauses for ``pause_s`` after each message."""
     async with AsyncExitStack() as stack:
         channel = await stack.enter_async_context(grpc.aio.insecure_channel(address))
         slow = await stack.enter_async_context(grpc.aio.insecure_channel(address, options=_SMALL_WINDOW))

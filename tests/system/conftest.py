@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 
 @contextmanager
 def _cells(folder: Path, instance: str) -> Iterator[Callable[..., Cell]]:
-    """What writes a cell's folder; whatever runs of it at the end is stopped."""
+    """Yield a function that writes a cell's folder; at the end, stop each cell."""
     with ExitStack() as stack:
         made: list[Cell] = []
 
@@ -37,14 +37,14 @@ def _cells(folder: Path, instance: str) -> Iterator[Callable[..., Cell]]:
 
 @pytest.fixture
 def make_cell(tmp_path: Path, instance: str) -> Iterator[Callable[..., Cell]]:
-    """Write a cell's folder, for this test alone."""
+    """Return a function that writes a cell's folder, for one test."""
     with _cells(tmp_path, instance) as make:
         yield make
 
 
 @pytest.fixture(scope="module")
 def make_shared_cell(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Iterator[Callable[..., Cell]]:
-    """Write a cell's folder, for tests of one group that leave the cell as they find it."""
+    """Return a function that writes a cell's folder, for tests that leave the cell as they find it."""
     with _cells(tmp_path_factory.mktemp("cell"), shared_instance) as make:
         yield make
 

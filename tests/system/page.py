@@ -1,4 +1,4 @@
-"""A page of the documentation, as its reader's shell runs it."""
+"""Runs a documentation page's commands as its reader's shell does."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from shmio.testing.cell import BIN, PATIENCE_S
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Ours, in which the commands are found; and ``more``."""
+    """Return this process's environment, with shmio's commands on the PATH, and ``more``."""
     return {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}", **more}
 
 
 def shell(commands: str, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run commands in a folder, until the first that fails. ``more``: of their environment."""
+    """Run commands in a folder, up to the first that fails. ``more``: environment variables."""
     return subprocess.run(
         ["bash", "-euo", "pipefail", "-c", commands],
         cwd=folder,
@@ -28,7 +28,7 @@ def shell(commands: str, folder: Path, **more: str) -> subprocess.CompletedProce
 
 
 def printed(commands: str, folder: Path, **more: str) -> str:
-    """What commands print, all of which must go well."""
+    """Return what the commands print; all of them must succeed."""
     done = shell(commands, folder, **more)
     assert done.returncode == 0, f"{commands}\n{done.stdout}\n{done.stderr}"
     return done.stdout

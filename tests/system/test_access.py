@@ -1,4 +1,4 @@
-"""A cell that asks who is there: on loopback, on a UNIX socket, through reloads and deaths of its endpoint."""
+"""A cell that requires tokens: on loopback, on a UNIX socket, and across reloads and deaths of its endpoint."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def guarded(make_cell: Callable[..., Cell]) -> Cell:
 
 
 def subscribe(cell: Cell, address: str, *options: str) -> subprocess.CompletedProcess[str]:
-    """The example, as its user runs it."""
+    """Run the example as its user does."""
     command = [sys.executable, str(ROOT / "examples/subscribe.py"), "--count", "2", *options, address, TOPIC]
     return subprocess.run(command, cwd=cell.folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
 
-@pytest.mark.timeout(600)  # a dozen commands, one after the other
-def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
+@pytest.mark.timeout(600)  # runs a dozen commands in sequence
+def test_a_reload_adds_and_removes_tokens(guarded: Cell) -> None:
     address = str(guarded.grpc)
     guarded.up()
     nobody = subscribe(guarded, address)
@@ -71,7 +71,7 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
         reload = guarded.supervisor("reload")
         assert (reload.returncode, "grpc: asked to reload its tokens and roles" in reload.stdout) == (0, True)
         until(lambda: subscribe(guarded, address, "--token-file", "other").returncode == 0, "the new token taken")
-        assert next(stream).value, "the stream of a token that stays goes on"
+        assert next(stream).value, "the stream of a token that is still valid continues"
         (guarded.folder / "other").chmod(0o644)
         refused = guarded.supervisor("reload")
         assert (refused.returncode, "mode 0644 lets other users read it" in refused.stderr) == (1, True)
@@ -89,7 +89,7 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
     assert OTHER not in told
 
 
-def test_bad_handshakes_leave_nothing_in_the_log(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
+def test_failed_handshakes_log_nothing(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
     """gRPC itself would print a line for each."""
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     words = [
@@ -118,7 +118,7 @@ def test_bad_handshakes_leave_nothing_in_the_log(make_cell: Callable[..., Cell],
     assert log.read_text() == before
 
 
-def test_a_unix_socket_is_cleared_after_a_death_and_removed_at_the_end(guarded: Cell) -> None:
+def test_a_unix_socket_is_replaced_after_a_death_and_removed_at_the_end(guarded: Cell) -> None:
     socket = guarded.folder / "run/a50.sock"
     guarded.up()
     assert stat.S_IMODE(socket.stat().st_mode) == 0o660

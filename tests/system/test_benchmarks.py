@@ -1,4 +1,4 @@
-"""The benchmarks of single mechanisms still run, check what they time, and print ratios. Not how fast anything is."""
+"""The benchmarks of single mechanisms run, check what they time, and print ratios. No speed is asserted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SPREAD = re.compile(r"^(\S.*?) +(\d+\.\d+) +(\d+\.\d+) +(\d+\.\d+)" + RATIO, re.
 
 
 def printed(benchmark: str) -> str:
-    """Run a benchmark; all it prints."""
+    """Run a benchmark; return its output."""
     command = [sys.executable, f"benchmarks/{benchmark}.py", "--quick"]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
     assert (run.returncode, run.stderr) == (0, ""), run.stdout + run.stderr
@@ -80,8 +80,8 @@ def printed(benchmark: str) -> str:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_benchmark_compares(benchmark: str, row: re.Pattern[str], tables: dict[str, int]) -> None:
-    """Each table has all contenders: ours, which is listed first or is part of ours, without a ratio."""
+def test_each_table_lists_all_contenders(benchmark: str, row: re.Pattern[str], tables: dict[str, int]) -> None:
+    """Each table has all contenders; shmio's row is first, or part of it, and has no ratio."""
     found = [match.groups("") for match in row.finditer(printed(benchmark))]
     assert all(float(value) > 0 for _, *values, _ in found for value in values)
     assert {name: sum(name == other for other, *_ in found) for name in tables} == tables
@@ -89,7 +89,7 @@ def test_a_benchmark_compares(benchmark: str, row: re.Pattern[str], tables: dict
     assert all((ratio == "") == (name == ours) for name, *_, ratio in found if name in (ours, *list(tables)[1:2]))
 
 
-def test_recording_is_measured() -> None:
+def test_benchmark_of_recording() -> None:
     found = printed("recording")
     sizes = re.findall(
         r"^(?:emulated cell|with noise|at rest) +(\d\.\d+) +(\d\.\d+) +(\d\.\d+) +7$", found, re.MULTILINE
@@ -102,7 +102,7 @@ def test_recording_is_measured() -> None:
     assert 0 < float(ours) < 0.9 * float(whole)
 
 
-def test_what_kills_of_the_recorder_cost_is_measured() -> None:
+def test_benchmark_of_killed_recorders() -> None:
     found = re.findall(
         r"^\d+ +\d+\.\d+ +\d+ +\d+\.\d+ +([1-9]\d*) of (\d+) +(\d+) +(\d+)$", printed("recorder_kills"), re.MULTILINE
     )
@@ -111,7 +111,7 @@ def test_what_kills_of_the_recorder_cost_is_measured() -> None:
         assert (recovered, lost) == (written, told)
 
 
-def test_reading_recordings_is_measured() -> None:
+def test_benchmark_of_reading_recordings() -> None:
     found = printed("dump_read")
     for contender in ("shmio columns", "shmio, frame by frame", "mcap library and struct"):
         assert re.search(rf"^{contender} +[1-9]\d* +[1-9]\d*", found, re.MULTILINE)
@@ -119,7 +119,7 @@ def test_reading_recordings_is_measured() -> None:
     assert len(re.findall(r"^(?:parquet|csv|mcap) +[1-9]\d* +\d+\.\d$", found, re.MULTILINE)) == 3
 
 
-def test_cycles_under_way_are_counted() -> None:
+def test_benchmark_of_cycles_in_progress() -> None:
     assert len(re.findall(r"^[0-9]+ jobs: [124] under way +[1-9]", printed("s7_cycle"), re.MULTILINE)) == 3
 
 
@@ -127,7 +127,7 @@ def test_cycles_under_way_are_counted() -> None:
     shutil.which("node") is None or not (ROOT / "tests/unit/endpoints/node/node_modules").exists(),
     reason="needs Node and its packages",
 )
-def test_streams_are_measured_beside_a_bare_server() -> None:
+def test_benchmark_of_streams_against_a_plain_server() -> None:
     found = printed("grpc_streams")
     rates = re.findall(r"^(version [12]|bare.*?)  +([1-9]\d*) +\d+\.\d+ +\d+\.\d+ +\d+\.\d+$", found, re.MULTILINE)
     assert [name for name, _ in rates] == [
@@ -142,28 +142,28 @@ def test_streams_are_measured_beside_a_bare_server() -> None:
 
 
 @pytest.mark.skipif(bool(missing()) or shutil.which("mosquitto_sub") is None, reason="needs mosquitto and its clients")
-def test_large_cells_by_mqtt_are_measured() -> None:
+def test_benchmark_of_large_cells_by_mqtt() -> None:
     found = re.findall(r"^(20|200) registers, (\S.*?) +\d+ +(\d+) +\d+$", printed("mqtt_cells"), re.MULTILINE)
     assert len(found) == 12
     assert all(int(told) > 0 for _, way, told in found if "max_rate_hz" not in way)
 
 
 @pytest.mark.skipif(bool(missing()), reason=missing())
-def test_mqtt_is_measured_beside_a_bare_publisher() -> None:
+def test_benchmark_of_mqtt_against_a_plain_publisher() -> None:
     found = printed("mqtt")
     rates = re.findall(r"^(shmio's bridge|paho, bare) +([1-9]\d*) +([1-9]\d*)", found, re.MULTILINE)
     assert [name for name, *_ in rates] == ["shmio's bridge", "paho, bare"] * 2
     assert len(re.findall(r"^QoS [01] +\d+\.\d+ +\d+\.\d+ +\d+\.\d+ +\d+\.\d+$", found, re.MULTILINE)) == 2
 
 
-def test_one_client_of_our_own_service_is_measured() -> None:
+def test_benchmark_of_one_client_of_shmio_v1() -> None:
     found = re.findall(
         r"^(every frame|latest|raw frames, every one) +([1-9]\d*) +([1-9]\d*) ", printed("grpc_client"), re.MULTILINE
     )
     assert [name for name, *_ in found] == ["every frame", "latest", "raw frames, every one"] * 2
 
 
-def test_a_growing_load_is_measured_row_by_row() -> None:
+def test_benchmark_of_a_growing_load() -> None:
     found = re.search(r"^2 of each +(.+)$", printed("scaling"), re.MULTILINE)
     assert found is not None
     cells = [float(cell) for cell in found[1].split()]
@@ -172,7 +172,7 @@ def test_a_growing_load_is_measured_row_by_row() -> None:
     assert cells[10] == 0  # frames that readers missed
 
 
-def test_what_neighbours_cost_is_measured() -> None:
+def test_benchmark_of_neighbouring_clients() -> None:
     found = re.findall(
         r"^(alone|one never reads|50 come and go) +\d+\.\d+ +\d+\.\d+ +\d+\.\d+ +[1-9]\d*\.\d +[1-9]\d*\.\d$",
         printed("neighbours"),
@@ -181,14 +181,14 @@ def test_what_neighbours_cost_is_measured() -> None:
     assert found == ["alone", "one never reads", "50 come and go"]
 
 
-def test_a_replays_timing_and_speed_are_measured() -> None:
+def test_benchmark_of_replay_timing_and_speed() -> None:
     text = printed("replay")
     assert re.findall(r"^(50|1000) Hz +([1-9]\d*)( +\d+){4}$", text, re.MULTILINE)
     [missed] = re.findall(r"^50 Hz +[1-9]\d* +[1-9]\d* +(\d+)$", text, re.MULTILINE)
     assert missed == "0"
 
 
-def test_a_soak_watches_all_processes_and_the_recording() -> None:
+def test_the_soak_run_watches_all_processes_and_the_recording() -> None:
     found = printed("soak")
     rows = re.findall(r"^(plc|cell|grpc|recorder) +\d+\.\d\d +\d+\.\d\d +[1-9]\d* +[1-9]\d*$", found, re.MULTILINE)
     assert sorted(rows) == ["cell", "grpc", "plc", "recorder"]

@@ -1,4 +1,4 @@
-"""Bits and slices of a cell's bytes, by every interface: read, written without their neighbours, injected."""
+"""Bits and slices of a cell's bytes, by every interface: read, written without neighbours, injected."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.system.armed import ARMED
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell; each test has bytes of its own, from 100 on: they are of no meaning to the controller's program."""
+    """The A50 cell; each test uses other bytes from 100 on, which the controller's program ignores."""
     cell = make_shared_cell(config=ARMED.replace('["Outputs"]', '["Outputs[*]"]'))
     cell.up()
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
@@ -48,12 +48,12 @@ def lines(text: str) -> list[str]:
     return [" ".join(line.split()) for line in text.splitlines()]
 
 
-def test_commands_take_them(cell: Cell, local: Attachment) -> None:
+def test_commands_accept_bits_and_slices(cell: Cell, local: Attachment) -> None:
     assert local.write({"cell/Outputs/100": 0b1010_0101, "cell/Outputs/101": 7})[0].done
     done = cell.run("shmio", "set", "cell/Outputs/100.%X1", "true", "cell/Outputs/100.%X7", "false")
     assert (done.returncode, done.stderr) == (0, "")
     assert lines(done.stdout) == ["cell/Outputs/100.%X1 written", "cell/Outputs/100.%X7 written"]
-    assert local["cell/Outputs/100"] == 0b0010_0111, "the others are as they were"
+    assert local["cell/Outputs/100"] == 0b0010_0111, "the other bits are unchanged"
 
     done = cell.run("shmio", "set", "--json", "cell/Outputs/102..104", "[1, 2, 3]")
     assert json.loads(done.stdout) == {"cell/Outputs/102..104": {"outcome": "written", "reason": ""}}
@@ -77,14 +77,14 @@ def test_commands_take_them(cell: Cell, local: Attachment) -> None:
         assert message in done.stderr
 
 
-def test_version_1(cell: Cell, local: Attachment) -> None:
+def test_simlog_version_1(cell: Cell, local: Attachment) -> None:
     bit, part = "cell/Outputs/110.%X3", "cell/Outputs/111..113"
     with client(cell) as (stub, _):
         assert stub.GetTopic(v1.TopicDescriptor(path=bit), timeout=PATIENCE_S).msgType == "bool"
         bits = stub.Subscribe(v1.TopicDescriptor(path=bit), timeout=PATIENCE_S)
         parts = stub.Subscribe(v1.TopicDescriptor(path=part), timeout=PATIENCE_S)
         assert [next(bits).value, next(parts).value] == ["false", "[0,0,0]"]
-        assert local.write({"cell/Outputs/110": 0xF0})[0].done  # not the bit: nothing is said
+        assert local.write({"cell/Outputs/110": 0xF0})[0].done  # the bit is unchanged, so nothing is sent
         messages = [(bit, "bool", "true"), (part, "string", "[4, 5, 6]")]
         stub.Publish(
             iter(
@@ -97,7 +97,7 @@ def test_version_1(cell: Cell, local: Attachment) -> None:
     assert local["cell/Outputs/110..114"] == [0xF8, 4, 5, 6, 0]
 
 
-def test_version_2_and_its_injection_of_a_bit(cell: Cell, local: Attachment) -> None:
+def test_simlog_version_2_with_injection_of_a_bit(cell: Cell, local: Attachment) -> None:
     bit, part = "cell/Outputs/120.%X3", "cell/Outputs/121..122"
     with client(cell) as (_, stub):
         stream = stub.CreateSubscriber(v2.Subscriber(name="s", uuid="bits"), timeout=PATIENCE_S)
@@ -128,7 +128,7 @@ def test_version_2_and_its_injection_of_a_bit(cell: Cell, local: Attachment) -> 
         stream.cancel()
 
 
-def test_our_own_version(cell: Cell, local: Attachment) -> None:
+def test_shmio_v1(cell: Cell, local: Attachment) -> None:
     with connect(str(cell.grpc)) as remote:
         assert local.write({"cell/Outputs/130": 0x81})[0].done
         values = {"cell/Outputs/130.%X1": True, "cell/Outputs/130.%X7": False, "cell/Outputs/131..132": [8, 9]}
@@ -148,7 +148,7 @@ def test_our_own_version(cell: Cell, local: Attachment) -> None:
         assert local["cell/Outputs/129..133"] == [0, 0x03, 8, 9, 0]
 
 
-def test_an_injection_toward_the_device_takes_one_bit(cell: Cell, local: Attachment) -> None:
+def test_an_injection_on_in_intercepts_one_bit(cell: Cell, local: Attachment) -> None:
     with local.inject("cell/Outputs/140.%X2/in") as shadow:
         assert local.write({"cell/Outputs/140": 0xFF})[0].done
         until(lambda: local["cell/Outputs/140"] == 0xFB, "all but the bit")

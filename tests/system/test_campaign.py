@@ -1,4 +1,4 @@
-"""Campaigns in the whole A50 cell: by a file, twice with the same seed, recorded; and from the configuration."""
+"""Injection campaigns in the A50 cell: from a file, repeated with a seed, recorded, and from the configuration."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ operation = "set"
 value = 77
 when = "cell/Outputs/99.%X7"
 """
-# Bytes from 90 on are of no meaning to the controller's program.
+# The controller's program ignores bytes from 90 on.
 CAMPAIGN = """
 [[injection]]
 name = "noise"
@@ -90,7 +90,7 @@ def start(cell: Cell) -> None:
 
 @contextmanager
 def campaign(cell: Cell, *options: str) -> Iterator[list[str]]:
-    """The command at work, and what it had told when it was laid; afterwards all that it told."""
+    """Run ``shmio inject --file``; yield its first lines, and after the block all its lines."""
     command = [str(BIN / "shmio"), "inject", "--file", "campaign.toml", *options]
     with subprocess.Popen(command, cwd=cell.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as popen:
         try:
@@ -114,7 +114,7 @@ def event(events: Cursor[Event], kind: EventKind, name: str = "noise") -> Event:
 
 
 def noise_of(cell: Cell, local: Attachment, seed: int) -> dict[int, tuple[object, object]]:
-    """What consumers see in a run of the campaign, by cycles since its noise began."""
+    """Return what consumers see in a run of the campaign, by cycles since its noise began."""
     local.write({"cell/Outputs/98": 0, "cell/Outputs/99": 0, "cell/Outputs/100": 100, "cell/Outputs/101": 100})
     block = local.block("cell")
     frames, events = block.cursor(), block.events.cursor()
@@ -129,7 +129,7 @@ def noise_of(cell: Cell, local: Attachment, seed: int) -> dict[int, tuple[object
     seen: dict[int, tuple[object, object]] = {}
     at = block.layout.registers[block.layout.by_path["Outputs"]].offset + 100
     while (frame := frames.next(PATIENCE_S)) is not None and frame.cycle < end.cycle:
-        assert frame.raw[at : at + 2] == b"\x64\x64", "the device's own values are there, too"
+        assert frame.raw[at : at + 2] == b"\x64\x64", "the device's own values are in the frame, too"
         if frame.cycle >= begin.cycle:
             seen[frame.cycle - begin.cycle] = (frame.image[at], frame.image[at + 1])
     assert any(re.search(rf"cycle {begin.cycle}  {begin.injection} activated: noise", line) for line in told), told
@@ -137,7 +137,7 @@ def noise_of(cell: Cell, local: Attachment, seed: int) -> dict[int, tuple[object
     return seen
 
 
-def test_a_campaign_runs_twice_with_the_same_seed_and_is_in_the_recording(cell: Cell) -> None:
+def test_a_seed_repeats_a_campaign_and_is_recorded(cell: Cell) -> None:
     start(cell)
     with shmio.attach(cell.instance, writable=True) as local:
         first, second, other = (noise_of(cell, local, seed) for seed in (7, 7, 8))
@@ -152,10 +152,10 @@ def test_a_campaign_runs_twice_with_the_same_seed_and_is_in_the_recording(cell: 
     events = [line for line in map(json.loads, recorded.splitlines()) if line.get("text") == "noise"]
     assert [line["kind"] for line in events].count("activated") == 3, events[:5]
     seeds = [line["laid"]["seed"] for line in events if line["laid"]]
-    assert seeds == [7, 7, 8], "what is needed for doing it again"
+    assert seeds == [7, 7, 8], "the seeds that repeat the runs"
 
 
-def test_a_recorded_campaign_is_run_again_and_does_the_same(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
+def test_a_campaign_derived_from_a_recording_repeats_it(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
     cell = make_cell(config=STEPPED + RECORDER)
     (tmp_path / "campaign.toml").write_text(OF_STEPS)
 
@@ -186,7 +186,7 @@ def test_a_recorded_campaign_is_run_again_and_does_the_same(make_cell: Callable[
     assert " deactivated" in told
 
 
-def test_the_configuration_declares_and_a_reload_changes_without_a_restart(cell: Cell) -> None:
+def test_a_reload_changes_configured_injections_without_a_restart(cell: Cell) -> None:
     file = cell.folder / "supervisor.toml"
     plain = file.read_text()
     file.write_text(plain + CONFIGURED)

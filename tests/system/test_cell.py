@@ -1,4 +1,4 @@
-"""The whole cell as a user has it: started, watched from outside, killed part by part, stopped."""
+"""The A50 cell as a user has it: started, watched from outside, its processes killed one by one, stopped."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_ctrl_c_leaves_nothing(make_cell: Callable[[], Cell]) -> None:
 
 
 class Load:
-    """Readers at work: one follows every frame, others hammer the newest, and two subscribe by gRPC."""
+    """Readers under load: one follows every frame, others poll the newest, and two subscribe by gRPC."""
 
     def __init__(self, cell: Cell) -> None:
         self._stopping = threading.Event()
@@ -105,12 +105,12 @@ class Load:
 
 
 @pytest.mark.parametrize("victim", ["plc", "cell", "grpc"])
-def test_each_process_comes_back_and_no_other_is_touched(
+def test_a_killed_process_is_restarted_and_no_other(
     cell: Cell, victim: str, record_property: Callable[[str, object], None]
 ) -> None:
     five_values(str(cell.grpc))
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
-    before = cell.processes()  # first: what the load itself costs is to be among the overruns counted from here
+    before = cell.processes()  # before the load starts, as overruns that it causes count from here
     load = Load(cell)
     try:
         until(lambda: load.newest > 0, "frames")
@@ -135,7 +135,7 @@ def test_each_process_comes_back_and_no_other_is_touched(
     assert numbers == list(range(numbers[0], numbers[-1] + 1))
     assert load.missed == 0
     assert {incarnation for _, _, incarnation in load.cycles} == ({1, 2} if victim == "cell" else {1})
-    if victim == "grpc":  # nothing else may lose a cycle
+    if victim == "grpc":  # no other process may lose a cycle
         cycles = [cycle for _, cycle, _ in load.cycles]
         lost = cycles[-1] - cycles[0] + 1 - len(cycles)
         until(
@@ -151,7 +151,7 @@ def test_a_frozen_process_is_replaced(cell: Cell) -> None:
     assert len(five_values(str(cell.grpc))) == 5
 
 
-def test_an_unplugged_plc_is_seen_and_comes_back(cell: Cell) -> None:
+def test_an_unplugged_plc_turns_values_bad_until_it_is_back(cell: Cell) -> None:
     five_values(str(cell.grpc))
     with shmio.attach(cell.instance) as attached:
         plc = cell.processes()["plc"]["pid"]
@@ -164,7 +164,7 @@ def test_an_unplugged_plc_is_seen_and_comes_back(cell: Cell) -> None:
         assert cell.processes()["cell"]["restarts"] == 0
 
 
-def test_a_killed_supervisor_is_followed_by_the_next(cell: Cell) -> None:
+def test_a_new_supervisor_takes_over_from_a_killed_one(cell: Cell) -> None:
     five_values(str(cell.grpc))
     pids = [process["pid"] for process in cell.status()["processes"]]
     with shmio.attach(cell.instance) as attached:
@@ -172,11 +172,11 @@ def test_a_killed_supervisor_is_followed_by_the_next(cell: Cell) -> None:
         kill(supervisor)
         until(lambda: not attached._segment.supervised, "no supervisor")
         stream = attached.stream("cell", timeout_s=PATIENCE_S)
-        assert next(stream).frame.number < next(stream).frame.number  # the children live on
+        assert next(stream).frame.number < next(stream).frame.number  # the child processes continue
         del stream
     cell.up()
     assert len(five_values(str(cell.grpc))) == 5
-    assert [process["pid"] for process in cell.status()["processes"]] == pids, "it took them over"
+    assert [process["pid"] for process in cell.status()["processes"]] == pids, "the new supervisor has taken them over"
 
 
 @pytest.mark.parametrize(

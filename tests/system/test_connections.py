@@ -1,4 +1,4 @@
-"""More connections than the endpoint has descriptors for, as only a limit that is lowered later brings about."""
+"""More connections than the endpoint has descriptors for, which needs a limit lowered at run time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shmio.testing.cell import PATIENCE_S, Cell, until
 from shmio.wire.simlog_v1_pb2 import ROSMessage, TopicDescriptor
 
 SUBSCRIBE = "/simulation.server.SimlogAPI/Subscribe"
-TOPIC = TopicDescriptor(path="cell/Robot_800/Axs1_Pos")  # moves all the time
+TOPIC = TopicDescriptor(path="cell/Robot_800/Axs1_Pos")  # changes all the time
 FEW = 5
 
 
@@ -27,7 +27,7 @@ def cell(make_cell: Callable[..., Cell]) -> Cell:
     return cell
 
 
-def test_streams_go_on_without_descriptors_for_others_and_these_come_when_there_are_some(cell: Cell) -> None:
+def test_without_free_descriptors_streams_continue_and_new_clients_wait(cell: Cell) -> None:
     pid: int = cell.processes()["grpc"]["pid"]
     with ExitStack() as stack:
         channel = stack.enter_context(grpc.insecure_channel(str(cell.grpc)))

@@ -20,7 +20,7 @@ BURN = "while True: pass"
 
 @pytest.fixture
 def cell(make_cell: Callable[..., Cell]) -> Cell:
-    """Models, noise and a memory, whose time stands at 0; not running."""
+    """Models, noise and a memory, with time at 0; not running."""
     cell = make_cell(config=CONFIG)
     (cell.folder / "panel.toml").write_text(PANEL)
     (cell.folder / "noisy.py").write_text(NOISY)
@@ -38,7 +38,7 @@ def campaign(
     before: Callable[[Cell], None] = lambda _: None,
     beside: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> Streams:
-    """A run of its own: up, the campaign, down."""
+    """Start the cell, run the campaign, stop the cell."""
     cell.up()
     until(lambda: good(cell), "good quality")
     before(cell)
@@ -50,7 +50,7 @@ def campaign(
 
 @contextmanager
 def load() -> Iterator[None]:
-    """More to do than the machine can."""
+    """Keep more processes busy than the host has processors."""
     burners = [subprocess.Popen([sys.executable, "-c", BURN]) for _ in range(BURNERS)]
     try:
         yield
@@ -61,7 +61,7 @@ def load() -> Iterator[None]:
 
 
 def restarted(cell: Cell) -> None:
-    """Kill every process but the supervisor, and wait until their successors do their work."""
+    """Kill every process but the supervisor, and wait until their successors work."""
     before = {name: process["pid"] for name, process in cell.processes().items()}
     for pid in before.values():
         kill(pid)
@@ -82,7 +82,7 @@ def test_a_campaign_repeats_exactly(cell: Cell) -> None:
     first = campaign(cell)
     assert_same(first, campaign(cell, beside=load))
     assert_same(first, campaign(cell, before=restarted, pause_s=SLOW_S))
-    # What is compared has in it what it should.
+    # Check that the compared streams are not empty of what they should contain.
     two = [v2.SimlogMessage.FromString(message) for message in first["v2 two"]]
     assert [m.value.number_value for m in two if m.header.path == "SIMLOG://step"] == list(range(1, STEPS + 1))
     assert {"joints/Kuka.j1/R", "/sim/joints/Kuka.j1/R", "panel/lamps", "noise/glitches/20"} < {
@@ -90,6 +90,8 @@ def test_a_campaign_repeats_exactly(cell: Cell) -> None:
     }
     assert len(first["v1 noise/measured"]) == STEPS + 1
     assert len(first["shmio.v1"]) > 2 * STEPS
-    assert -20.0 in [m.value.number_value for m in two if m.header.path == J1], "the injection"
+    assert -20.0 in [m.value.number_value for m in two if m.header.path == J1], "the injected value"
     second_joint = [m.value.number_value for m in two if m.header.path == J2]
-    assert any(value not in (0.0, *(1 / n for n in range(1, STEPS, 2))) for value in second_joint), "the declared one"
+    assert any(value not in (0.0, *(1 / n for n in range(1, STEPS, 2))) for value in second_joint), (
+        "values of the declared injection"
+    )

@@ -1,4 +1,4 @@
-"""Every command shown in the README is run as shown, in one shell after another, with the demo running."""
+"""Every command in the README runs as shown, in a shell of its own, while the demo is running."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_readme_runs_as_shown() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_have_existing_targets(page: Path) -> None:
     for target in LINK.findall(page.read_text()):
         assert (page.parent / target).exists(), f"{page}: {target}"
 

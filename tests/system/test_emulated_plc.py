@@ -1,4 +1,4 @@
-"""The page on emulated controllers, done as it says: its files written, its commands run, its output compared."""
+"""The how-to page on emulated controllers, followed step by step: its files, commands and shown output."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
 class Reader:
-    """Somebody who follows the page, with another port and other names of instances."""
+    """Follows the page, with another port and other instance names."""
 
     def __init__(self, folder: Path, instance: str, port: int) -> None:
         text = PAGE.read_text().replace("127.0.0.1:1102", f"127.0.0.1:{port}").replace(" 1102", f" {port}")
@@ -38,7 +38,7 @@ class Reader:
         (self.folder / name).write_text(text)
 
     def steps(self) -> Iterator[tuple[str, str]]:
-        """Each block of commands, with what the page shows it to print, if it does."""
+        """Yield each block of commands with the output that the page shows for it, if any."""
         for at, (kind, text) in enumerate(self.blocks):
             if kind == "sh":
                 following, shown = self.blocks[at + 1] if at + 1 < len(self.blocks) else ("", "")
@@ -48,7 +48,7 @@ class Reader:
         return shell(commands, self.folder)
 
     def follow(self, commands: str, shown: str) -> None:
-        """Run commands; those that only look, until they print what is shown."""
+        """Run commands; repeat those that only read until they print what the page shows."""
         if shown:
             until(lambda: self.run(commands).stdout == shown, f"{commands}{shown}", 2 * PATIENCE_S)
             return
@@ -65,7 +65,7 @@ def reader(tmp_path: Path, instance: str) -> Iterator[Reader]:
             reader.run(f"shmio-supervisor down -c {file.name}")
 
 
-def test_the_page_on_emulated_controllers(reader: Reader) -> None:
+def test_the_page_on_emulated_controllers_runs_as_shown(reader: Reader) -> None:
     reader.write("my.db", reader.source)
     reader.write("supervisor.toml", reader.configuration)
     *steps, (unplug, nothing) = reader.steps()

@@ -1,4 +1,4 @@
-"""A flood of calls that nobody serves: the short form of ``python -m tests.faults.flood``."""
+"""A flood of calls to unknown methods: the short form of ``python -m tests.faults.flood``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Injections in a whole cell: by the command and from a program, seen by every consumer, gone with their client."""
+"""Injections in the A50 cell, by command and by program: every consumer sees them until their client ends."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ connector = "memory"
 layout = "panel.toml"
 writable = ["**"]
 """
-PLACE = "cell/Outputs/100"  # of no meaning to the controller's program
+PLACE = "cell/Outputs/100"  # the controller's program ignores it
 POSITION = "cell/Robot_800/Axs1_Pos"
 
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell, armed, and not, and a memory; each test lifts what it lays."""
+    """The A50 cell, armed; a second source, not armed; and a memory. Each test lifts its injections."""
     cell = make_shared_cell(config=ARMED + UNARMED + MEMORY)
     (cell.folder / "panel.toml").write_text('[registers]\nspeed = { type = "REAL", initial = 0.5 }\n')
     cell.up()
@@ -85,7 +85,7 @@ def test_all_consumers_see_the_injected_value_until_the_command_ends(cell: Cell)
         assert cell.output("shmio", "inject") == ""
 
 
-def test_what_is_written_meets_the_injection_and_not_the_device(cell: Cell) -> None:
+def test_an_injection_on_in_intercepts_writes_before_the_device(cell: Cell) -> None:
     with injecting(cell, f"{PLACE}/in", "7"):
         until(lambda: get(cell, PLACE)["value"] == 7, "the device has the injected value")
         done = cell.run("shmio", "set", PLACE, "9")
@@ -94,7 +94,7 @@ def test_what_is_written_meets_the_injection_and_not_the_device(cell: Cell) -> N
     until(lambda: cell.run("shmio", "set", PLACE, "9").stdout == f"{PLACE}  written\n", "lifted")
 
 
-def test_a_killed_client_leaves_no_shadow_and_a_killed_source_keeps_it(cell: Cell) -> None:
+def test_injections_end_with_their_client_but_survive_a_killed_source(cell: Cell) -> None:
     with injecting(cell, POSITION, "55.5") as command:
         pid = cell.processes()["cell"]["pid"]
         kill(pid)
@@ -106,14 +106,14 @@ def test_a_killed_client_leaves_no_shadow_and_a_killed_source_keeps_it(cell: Cel
         until(lambda: get(cell, POSITION)["value"] != 55.5, "lifted")
 
 
-def test_one_is_kept_or_lifted_after_a_time(cell: Cell) -> None:
+def test_keep_and_for_exclude_each_other(cell: Cell) -> None:
     both = cell.run("shmio", "inject", "--for", "1", "--keep", POSITION, "11")
     assert (both.returncode, both.stdout) == (2, "")
     assert "argument --keep: not allowed with argument --for" in both.stderr
     assert cell.output("shmio", "inject") == ""
 
 
-def test_a_kept_one_stays_until_it_is_lifted(cell: Cell) -> None:
+def test_a_kept_injection_stays_until_it_is_lifted(cell: Cell) -> None:
     kept = cell.run("shmio", "inject", "--keep", POSITION, "11")
     assert kept.returncode == 0, kept.stderr
     number = kept.stdout.partition(":")[0]
@@ -140,7 +140,7 @@ def test_a_program_injects(cell: Cell) -> None:
             shadow.lift()
 
 
-def test_a_source_that_is_not_armed_refuses(cell: Cell) -> None:
+def test_a_source_that_is_not_armed_refuses_injections(cell: Cell) -> None:
     until(lambda: cell.processes()["unarmed"]["quality"] == "good", "good quality")
     refused = cell.run("shmio", "inject", "unarmed/Outputs/100/in", "7")
     assert refused.returncode == 1
@@ -149,7 +149,7 @@ def test_a_source_that_is_not_armed_refuses(cell: Cell) -> None:
     )
 
 
-def test_a_publisher_cannot_tell_that_an_injection_took_its_value(cell: Cell) -> None:
+def test_an_intercepted_write_succeeds_for_its_publisher(cell: Cell) -> None:
     with grpc.insecure_channel(str(cell.grpc)) as channel, injecting(cell, f"{PLACE}/in", "7"):
         stub = SimlogV2Stub(channel)  # type: ignore[no-untyped-call]
         message = SimlogMessage(value=Value(number_value=9))

@@ -1,4 +1,4 @@
-"""Inject of both versions of SimlogAPI in whole cells: as in the contract, and when clients or endpoints are killed."""
+"""Inject of both SimlogAPI versions in whole cells: as specified, and when clients or endpoints are killed."""
 
 from __future__ import annotations
 
@@ -33,12 +33,14 @@ writable = ["**"]
 """
 JOINTS = '[registers]\n"joints/R3200/Link1/R/position" = "LREAL"\n"joints/Kuka.j1/R" = "REAL"\n'
 POSITION = "joints/R3200/Link1/R/position"
-PLACE = "cell/Outputs/100"  # of no meaning to the controller's program
+PLACE = "cell/Outputs/100"  # the controller's program ignores it
 
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell, armed, and not, and a memory with the joints of old clients; each test lifts what it lays."""
+    """The A50 cell, armed; another source, not armed; and a memory with the joints of existing clients.
+
+    Each test lifts its injections."""
     cell = make_shared_cell(config=(ARMED + UNARMED + MEMORY).replace("[grpc]\n", '[grpc]\ndefault_source = "sim"\n'))
     (cell.folder / "joints.toml").write_text(JOINTS)
     cell.up()
@@ -54,7 +56,7 @@ def local(cell: Cell) -> Iterator[Attachment]:
 
 @contextmanager
 def client(cell: Cell) -> Iterator[tuple[Any, Any]]:
-    """Both versions over a connection of their own."""
+    """Both versions, over a connection of their own."""
     with grpc.insecure_channel(str(cell.grpc), [("grpc.use_local_subchannel_pool", 1)]) as channel:
         grpc.channel_ready_future(channel).result(PATIENCE_S)
         yield SimlogAPIStub(channel), SimlogV2Stub(channel)  # type: ignore[no-untyped-call]
@@ -81,9 +83,7 @@ def standing(local: Attachment) -> int:
     return len(local.injections())
 
 
-def test_version_1_between_a_publisher_and_a_memory_and_between_that_and_consumers(
-    cell: Cell, local: Attachment
-) -> None:
+def test_version_1_on_in_and_on_out_of_a_memory(cell: Cell, local: Attachment) -> None:
     with client(cell) as (stub, _), client(cell) as (other, _):
         watching = other.Subscribe(v1.TopicDescriptor(path=f"{POSITION}/out"), timeout=PATIENCE_S)
         assert next(watching).value == "0.0"
@@ -105,7 +105,7 @@ def test_version_1_between_a_publisher_and_a_memory_and_between_that_and_consume
         publish(other, POSITION, "4.5")
         assert next(originals).value == "4.5"
         originals.cancel()
-        assert next(watching).value == "4.5", "without subscribing anew"
+        assert next(watching).value == "4.5", "the same subscription continues"
 
 
 def test_version_2_toward_an_emulated_controller(cell: Cell, local: Attachment) -> None:
@@ -143,7 +143,7 @@ sys.stdin.read()
 """
 
 
-def test_a_killed_client_and_a_killed_endpoint_leave_no_shadow(cell: Cell, local: Attachment) -> None:
+def test_injections_end_with_a_killed_client_or_endpoint(cell: Cell, local: Attachment) -> None:
     command = [sys.executable, "-c", CLIENT, str(cell.grpc), "cell/Robot_800/Axs1_Pos"]
     for victim in ("client", "grpc"):
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as injecting:
@@ -171,7 +171,7 @@ def newest(local: Attachment) -> Frame:
     return frame
 
 
-def test_the_sources_own_process_goes_on_with_the_injections_of_clients(cell: Cell, local: Attachment) -> None:
+def test_injections_of_clients_survive_a_killed_source_process(cell: Cell, local: Attachment) -> None:
     with client(cell) as (stub, _):
         originals = inject(stub, f"{PLACE}/in", "s")
         before = newest(local)
@@ -186,7 +186,7 @@ def test_the_sources_own_process_goes_on_with_the_injections_of_clients(cell: Ce
         until(lambda: standing(local) == 0, "lifted")
 
 
-def test_a_source_that_is_not_armed_refuses_by_name(cell: Cell) -> None:
+def test_a_source_that_is_not_armed_is_named_in_the_refusal(cell: Cell) -> None:
     until(lambda: cell.processes()["unarmed"]["quality"] == "good", "good quality")
     place = "unarmed/Outputs/100"
     with client(cell) as (stub, other):
@@ -201,7 +201,7 @@ def test_a_source_that_is_not_armed_refuses_by_name(cell: Cell) -> None:
         assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
 
 
-def test_an_emergency_lifts_what_clients_have_laid(cell: Cell, local: Attachment) -> None:
+def test_lift_all_lifts_the_injections_of_clients(cell: Cell, local: Attachment) -> None:
     with client(cell) as (stub, other):
         originals = inject(stub, f"{PLACE}/in", "s")
         other.Inject(v2.InjectRequest(targetPath=POSITION, shadowPathPrefix="p"), timeout=PATIENCE_S)

@@ -1,4 +1,4 @@
-"""Several instances on a host: the list of them, and several starts of one."""
+"""Several instances on one host: listing them, and starting one several times at once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ period_ms = 20
 """
 
 
-def test_each_instance_with_its_file_state_and_addresses(make_cell: Callable[..., Cell], instance: str) -> None:
+def test_list_shows_each_instance_with_file_state_and_addresses(make_cell: Callable[..., Cell], instance: str) -> None:
     cell = make_cell()
     cell.up()
     with Segment.create(f"{instance}-b", [], []) as silent:
@@ -44,7 +44,7 @@ def test_each_instance_with_its_file_state_and_addresses(make_cell: Callable[...
     assert "cannot be reached" in other["note"]
 
 
-def test_of_five_that_start_it_at_once_one_wins(tmp_path: Path, instance: str) -> None:
+def test_of_five_simultaneous_starts_one_succeeds(tmp_path: Path, instance: str) -> None:
     (tmp_path / "cell.toml").write_text('[registers]\nMode = "INT"\n')
     (tmp_path / "supervisor.toml").write_text(MEMORY.format(instance))
     command = [str(BIN / "shmio-supervisor"), "up", "--detach"]

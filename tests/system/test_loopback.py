@@ -1,4 +1,4 @@
-"""examples/loopback as existing clients use it: started from its file, on ports of the test."""
+"""examples/loopback, started from its file on ports of the test, with existing clients."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def channel(loopback: Cell) -> Iterator[grpc.Channel]:
 
 
 def values(stream: Any) -> Iterator[v1.ROSMessage]:
-    """What comes on a stream of version 1, without what has not changed."""
+    """Yield the messages of a stream of version 1, without repeated values."""
     before = None
     for message in stream:
         if (message.value, message.safety_zone) != before:
@@ -53,7 +53,7 @@ def values(stream: Any) -> Iterator[v1.ROSMessage]:
 
 
 class Publisher:
-    """One long Publish stream, as clients have it."""
+    """One long Publish stream, as existing clients use it."""
 
     def __init__(self, stub: Any) -> None:
         self._queue: SimpleQueue[v1.PubRequest | None] = SimpleQueue()
@@ -68,7 +68,7 @@ class Publisher:
         self._call.result(PATIENCE_S)
 
 
-def test_in_real_time_what_is_published_comes_out(loopback: Cell, channel: grpc.Channel) -> None:
+def test_published_values_come_out_in_real_time(loopback: Cell, channel: grpc.Channel) -> None:
     for part in ('name = "loopback"', '"127.0.0.1:8089", "127.0.0.1:8090"', 'name = "sim"'):
         assert part in EXAMPLE
     checked = loopback.supervisor("check")
@@ -92,7 +92,7 @@ def test_in_real_time_what_is_published_comes_out(loopback: Cell, channel: grpc.
     publisher.close()
 
 
-def test_a_client_of_version_1_steps_and_gets_its_values_one_step_later(channel: grpc.Channel) -> None:
+def test_a_client_of_version_1_steps_and_sees_its_values_one_step_later(channel: grpc.Channel) -> None:
     stub: Any = V1Stub(channel)  # type: ignore[no-untyped-call]
     stub.setStepSize(v1.StepSizeRequest(step=50), timeout=PATIENCE_S)
     stream = values(stub.Subscribe(v1.TopicDescriptor(path=f"{JOINTS[0]}/out"), timeout=PATIENCE_S))

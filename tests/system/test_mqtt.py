@@ -1,4 +1,4 @@
-"""A whole cell with a broker of its own, as clients of MQTT see it, and as its user does."""
+"""A cell with its own broker, as MQTT clients and the user of the cell see it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def counts(listener: Listener, topic: str, count: int) -> None:
         listener.until(topic)
 
 
-def test_clients_see_and_drive_the_cell(make_cell: Callable[..., Cell], broker: Address, program: str) -> None:
+def test_clients_read_and_command_the_cell(make_cell: Callable[..., Cell], broker: Address, program: str) -> None:
     with running(make_cell, broker, more=f'broker = "{program}"\n{EVERYBODY}') as cell:
         assert cell.status()["state"] == "running", cell.logs()
         with listening(broker, protocol=4) as listener:
@@ -62,7 +62,7 @@ def test_clients_see_and_drive_the_cell(make_cell: Callable[..., Cell], broker: 
     assert not list(Path(os.environ.get("XDG_RUNTIME_DIR", "/tmp")).glob(f"shmio*/{cell.instance}*"))
 
 
-def test_a_killed_broker_comes_back_and_its_bridge_goes_on(
+def test_a_killed_broker_is_restarted_and_its_bridge_continues(
     make_cell: Callable[..., Cell], broker: Address, program: str
 ) -> None:
     with running(make_cell, broker, more=f'broker = "{program}"\n{EVERYBODY}') as cell:
@@ -78,7 +78,9 @@ def test_a_killed_broker_comes_back_and_its_bridge_goes_on(
 
 
 @pytest.mark.skipif(bool(missing()), reason=missing())
-def test_a_killed_edge_node_leaves_its_will_and_is_born_again(make_cell: Callable[..., Cell], broker: Address) -> None:
+def test_a_killed_edge_node_leaves_its_will_and_sends_a_new_birth(
+    make_cell: Callable[..., Cell], broker: Address
+) -> None:
     def told(listener: Listener, kind: str) -> Payload:
         while (message := listener.message()).topic != f"spBv1.0/plant/{kind}":
             pass
@@ -106,7 +108,9 @@ def test_a_killed_edge_node_leaves_its_will_and_is_born_again(make_cell: Callabl
 
 
 @pytest.mark.skipif(bool(missing()), reason=missing())
-def test_accounts_do_what_their_roles_allow(make_cell: Callable[..., Cell], broker: Address, tmp_path: Path) -> None:
+def test_accounts_can_do_only_what_their_roles_allow(
+    make_cell: Callable[..., Cell], broker: Address, tmp_path: Path
+) -> None:
     (tmp_path / "accounts").write_text("anna:secret\nbert:hidden\n")
     (tmp_path / "accounts").chmod(0o600)
     more = f'password_file = "accounts"\n{EVERYBODY}name = "bert"\n'
@@ -149,13 +153,13 @@ def test_accounts_do_what_their_roles_allow(make_cell: Callable[..., Cell], brok
             return told["commands"] >= 2
 
         until(both_commands, "the bridge tells of both commands")
-        assert told["connects"] == 1, "nobody has pushed it out"
+        assert told["connects"] == 1, "no other client has taken over its session"
         for account in ({}, {"username": "anna", "password": "guess"}):
             assert connected(broker, "me", **account) in (4, 5)
 
 
 def connected(broker: Address, client_id: str, **account: str) -> int:
-    """What the broker says to a client, by MQTT 3.1.1; 0: it is let in."""
+    """Return the broker's MQTT 3.1.1 return code for a client; 0: accepted."""
     who = b"".join(len(text).to_bytes(2, "big") + text.encode() for text in (client_id, *account.values()))
     flags = 0xC2 if account else 2
     variable = b"\0\x04MQTT\x04" + bytes([flags]) + b"\0\x3c" + who
@@ -166,7 +170,7 @@ def connected(broker: Address, client_id: str, **account: str) -> int:
     return answer[3]
 
 
-def test_a_port_that_is_taken_is_told_before_anything_starts(make_cell: Callable[..., Cell], broker: Address) -> None:
+def test_an_occupied_port_is_reported_before_anything_starts(make_cell: Callable[..., Cell], broker: Address) -> None:
     with socket.create_server((broker.host, broker.port)):
         cell = make_cell(config=CONFIG + MQTT.replace("{broker}", str(broker)) + EVERYBODY)
         done = cell.supervisor("up", "--detach")

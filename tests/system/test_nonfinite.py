@@ -1,4 +1,4 @@
-"""NaN and infinities, written by every way there is, and allowed by a reload."""
+"""NaN and infinities: refused by every interface until a reload of the configuration allows them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ listen = ["{grpc}"]
 REASON = "NaN and infinities are written only if"
 
 
-def test_they_are_refused_until_the_configuration_allows_them(make_cell: Callable[..., Cell]) -> None:
+def test_every_interface_refuses_nonfinite_values_until_a_reload_allows_them(make_cell: Callable[..., Cell]) -> None:
     cell = make_cell(config=CONFIG)
     (cell.folder / "sim.toml").write_text('[registers]\na = "REAL"\nb = "ARRAY[0..3] OF LREAL"\n')
     cell.up()
@@ -75,7 +75,7 @@ def test_they_are_refused_until_the_configuration_allows_them(make_cell: Callabl
         def written() -> bool:
             try:
                 return local.write({"sim/a": math.nan})[0].done
-            except CommandError:  # the reload is not over
+            except CommandError:  # the reload is not finished
                 return False
 
         until(written, "written")

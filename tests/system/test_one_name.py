@@ -1,4 +1,4 @@
-"""Two folders whose configurations have one instance name, of which one runs: no file reaches the other's plant."""
+"""Two configurations with the same instance name, of which one runs: the other file cannot reach that plant."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def write_folder(folder: Path, instance: str, writable: str) -> Path:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Iterator[tuple[Path, Path]]:
-    """The file of the one that runs, in which all is writable, and of the other, in which nothing is."""
+    """Return the running instance's file, with all writable, and the other file, with nothing writable."""
     folder = tmp_path_factory.mktemp("cells").resolve()
     running = write_folder(folder / "a", shared_instance, '["**"]')
     other = write_folder(folder / "b", shared_instance, "[]")
@@ -78,7 +78,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Ite
 
 
 def unchanged(instance: str) -> None:
-    """That nothing has reached the plant that runs."""
+    """Assert that nothing has changed in the running plant."""
     status = read_status(instance)
     assert (status.state, [process.restarts for process in status.processes]) == ("running", [0])
     assert status.clock is not None
@@ -87,7 +87,7 @@ def unchanged(instance: str) -> None:
 
 @pytest.mark.parametrize("named", ["by option", "in this folder"])
 @pytest.mark.parametrize("words", VERBS)
-def test_every_verb_refuses_by_the_file_of_another_plant(
+def test_every_command_refuses_the_file_of_another_plant(
     words: str,
     named: str,
     files: tuple[Path, Path],
@@ -113,7 +113,7 @@ def test_every_verb_refuses_by_the_file_of_another_plant(
     unchanged(shared_instance)
 
 
-def test_a_name_reaches_it_from_anywhere(
+def test_instance_option_reaches_the_plant_from_any_folder(
     files: tuple[Path, Path],
     shared_instance: str,
     monkeypatch: pytest.MonkeyPatch,
@@ -131,7 +131,7 @@ def test_a_name_reaches_it_from_anywhere(
         assert run(words, *name) == 0, words
 
 
-def test_the_file_is_the_same_by_another_path_and_when_it_was_edited(
+def test_another_path_to_the_same_file_and_an_edited_file_are_accepted(
     files: tuple[Path, Path],
     tmp_path: Path,
     shared_instance: str,
@@ -156,9 +156,7 @@ def test_the_file_is_the_same_by_another_path_and_when_it_was_edited(
     moved.rename(running)
 
 
-def test_what_a_dead_supervisor_left_is_neither_taken_over_nor_cleared_by_another_file(
-    tmp_path: Path, instance: str
-) -> None:
+def test_another_file_neither_takes_over_nor_clears_a_dead_supervisors_instance(tmp_path: Path, instance: str) -> None:
     running = write_folder(tmp_path.resolve() / "a", instance, "[]")
     other = write_folder(tmp_path.resolve() / "b", instance, "[]")
     with reserved_port() as address:

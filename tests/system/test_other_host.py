@@ -1,4 +1,4 @@
-"""Another host: a network namespace of its own, joined by a virtual cable."""
+"""Clients on another host: a network namespace with a virtual cable to this one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def ip(*arguments: str) -> None:
 
 @pytest.fixture
 def other_host() -> Iterator[tuple[str, str]]:
-    """(name of the namespace, our address on the cable to it)."""
+    """Yield the namespace's name and this host's address on the cable."""
     tag = secrets.token_hex(3)
     host, ours, theirs = f"shmio-{tag}", f"sh{tag}a", f"sh{tag}b"
     third = secrets.randbelow(250)
@@ -66,7 +66,7 @@ def test_another_host_receives_changing_values(make_cell: Callable[..., Cell], o
     assert all(float(value) is not None for value in values)
 
 
-def test_another_host_in_plain_text_may_what_its_address_gives(
+def test_the_roles_of_an_address_apply_to_another_host_in_plain_text(
     make_cell: Callable[..., Cell], other_host: tuple[str, str]
 ) -> None:
     host, address = other_host

@@ -1,4 +1,4 @@
-"""The service unit: what systemd thinks of it, and what it relies on."""
+"""The systemd unit: systemd's own check of it, and the behaviour that it relies on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UNIT = ROOT / "packaging" / "shmio@.service"
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
-def test_systemd_finds_no_fault(tmp_path: Path) -> None:
+def test_systemd_verifies_the_unit(tmp_path: Path) -> None:
     installed = UNIT.read_text().replace("/opt/shmio/bin/shmio-supervisor", str(BIN / "shmio-supervisor"))
     installed = installed.replace("User=shmio", "User=root")
     (tmp_path / "shmio@a50.service").write_text(installed)
@@ -28,8 +28,8 @@ def test_systemd_finds_no_fault(tmp_path: Path) -> None:
     ("result", "cleared"),
     [("success", True), ("timeout", True), ("signal", False), ("watchdog", False), ("oom-kill", False)],
 )
-def test_only_a_stop_clears_what_is_left(result: str, cleared: bool) -> None:
-    """After a crash the processes live on, for the restart to take over."""
+def test_only_a_stop_clears_remaining_processes(result: str, cleared: bool) -> None:
+    """After a crash the processes continue, for the restart to take over."""
     (line,) = [line for line in UNIT.read_text().splitlines() if line.startswith("ExecStopPost=")]
     script = line.partition("-c ")[2].strip("'").replace("%i", "a50").replace(">/dev/null 2>&1", "")
     ran = subprocess.run(
@@ -42,6 +42,6 @@ def test_only_a_stop_clears_what_is_left(result: str, cleared: bool) -> None:
     assert ran.stdout == ("down -c /etc/shmio/a50/supervisor.toml\n" if cleared else "")
 
 
-def test_out_of_memory_costs_one_process() -> None:
-    """By systemd's own default the whole service would be stopped."""
+def test_out_of_memory_ends_one_process_only() -> None:
+    """By systemd's default it would stop the whole service."""
     assert "OOMPolicy=continue" in UNIT.read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Time that the endpoint of a whole instance plays, and what becomes of it when the endpoint's process ends."""
+"""Time that an instance's endpoint plays, and what happens to it when the endpoint's process ends."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.timeout(240)
 
 @pytest.fixture
 def cell(make_cell: Callable[..., Cell]) -> Cell:
-    """Models, noise and a memory, whose time stands at 0."""
+    """Models, noise and a memory, with time at 0."""
     cell = make_cell(config=CONFIG)
     (cell.folder / "panel.toml").write_text(PANEL)
     (cell.folder / "noisy.py").write_text(NOISY)
@@ -32,7 +32,7 @@ def cell(make_cell: Callable[..., Cell]) -> Cell:
 
 
 def markers(channel: grpc.Channel, uuid: str) -> Any:
-    """A stream of the numbers of steps."""
+    """Return a stream of step numbers."""
     stub: Any = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
     stream = stub.CreateSubscriber(v2.Subscriber(name=uuid, uuid=uuid), timeout=PATIENCE_S, wait_for_ready=True)
     stub.Subscribe(v2.SubscriptionRequest(path="SIMLOG://step", subscriberUUID=uuid), timeout=PATIENCE_S)
@@ -40,7 +40,7 @@ def markers(channel: grpc.Channel, uuid: str) -> Any:
 
 
 def end(cell: Cell, how: str) -> None:
-    """Have the endpoint's process end, and another one take its place."""
+    """End the endpoint's process, and wait for its successor."""
     pid = cell.processes()["grpc"]["pid"]
     if how == "killed":
         kill(pid)
@@ -50,7 +50,7 @@ def end(cell: Cell, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["killed", "restarted"])
-def test_the_endpoints_successor_goes_on_playing(cell: Cell, how: str) -> None:
+def test_the_endpoints_successor_continues_playing(cell: Cell, how: str) -> None:
     with shmio.attach(cell.instance) as local:
         with grpc.insecure_channel(str(cell.grpc)) as channel:
             time: Any = SimServerAPIStub(channel)  # type: ignore[no-untyped-call]
@@ -74,7 +74,7 @@ def test_the_endpoints_successor_goes_on_playing(cell: Cell, how: str) -> None:
             assert (status.clock, status.deltaTime) == (clock.time_ns // 1_000_000 + 50, 50)
 
 
-def test_a_model_that_dies_while_time_is_played_comes_back_into_it(cell: Cell) -> None:
+def test_a_model_that_is_killed_while_time_plays_rejoins(cell: Cell) -> None:
     with grpc.insecure_channel(str(cell.grpc)) as channel:
         time: Any = SimServerAPIStub(channel)  # type: ignore[no-untyped-call]
         stream = markers(channel, "one")

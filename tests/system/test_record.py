@@ -1,4 +1,4 @@
-"""A whole cell is recorded, killed and looked into through the commands alone."""
+"""A cell is recorded, killed and inspected by commands only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ AXIS = "cell/Robot_800/Axs1_Pos"
 
 
 def info(cell: Cell, file: Path) -> dict[str, Any]:
-    """``info --json`` of a file of the cell."""
+    """Return ``info --json`` of one of the cell's files."""
     found: dict[str, Any] = json.loads(cell.output("shmio-dump", "info", "--json", str(file)))
     return found
 
@@ -25,7 +25,7 @@ def values(cell: Cell, file: Path) -> list[dict[str, Any]]:
     return [line for line in map(json.loads, lines) if "frame" in line]
 
 
-def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[..., Cell]) -> None:
+def test_log_mode_records_everything_though_its_recorder_is_killed(make_cell: Callable[..., Cell]) -> None:
     cell = make_cell(config=RECORDED)
     up = cell.supervisor("up", "--detach", "--mode", "log")
     assert up.returncode == 0, up.stderr
@@ -58,7 +58,7 @@ def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[.
     assert (checked.returncode, checked.stdout.count("no damage")) == (0, 2), checked.stdout
     assert len(values(cell, second)) > 1
     events = [json.loads(line) for line in cell.output("shmio-dump", "cat", "--json", str(second)).splitlines()]
-    assert [event for event in events if "source" in event][-1]["kind"] == "stopped", "to the source's last event"
+    assert [event for event in events if "source" in event][-1]["kind"] == "stopped", "up to the source's last event"
     assert values(cell, second)[-1]["quality"] == "bad"
 
 
@@ -79,7 +79,7 @@ def test_a_live_cell_is_recorded_from_outside(cell: Cell) -> None:
 
 
 def test_a_reload_is_recorded_in_the_same_file(make_cell: Callable[..., Cell]) -> None:
-    """A source comes, and the layout of the other changes; the recorder goes on."""
+    """One source is added, and the layout of the other changes; the recorder keeps running."""
     cell = make_cell(config=RECORDED)
     cell.up()
     recorder = cell.processes()["recorder"]["pid"]
@@ -117,7 +117,7 @@ def test_a_reload_is_recorded_in_the_same_file(make_cell: Callable[..., Cell]) -
     )
 
 
-def test_notes_and_deaths_stand_in_the_recording(make_cell: Callable[..., Cell]) -> None:
+def test_notes_and_process_deaths_are_recorded(make_cell: Callable[..., Cell]) -> None:
     cell = make_cell(config=RECORDED)
     cell.up()
     done = cell.run("shmio-dump", "note", "Greifer getauscht")
@@ -142,4 +142,4 @@ def test_notes_and_deaths_stand_in_the_recording(make_cell: Callable[..., Cell])
     assert f"process cell died, pid {pid}: killed by SIGKILL" in printed
     assert "process recorder is, pid" in printed
     notes = re.findall(r": noted by program \d: (.*)", printed)
-    assert notes == ["Greifer getauscht", rf"\x1b[2J{'ö' * 126}"], "whole, and moving no cursor"
+    assert notes == ["Greifer getauscht", rf"\x1b[2J{'ö' * 126}"], "complete, with control characters escaped"

@@ -1,4 +1,4 @@
-"""A whole cell whose configuration changes while it runs and is used."""
+"""A cell whose configuration changes while it runs and has clients."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def stub(cell: Cell) -> Iterator[SimlogAPIStub]:
         yield SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
 
 
-def test_a_source_comes_and_goes_and_who_listens_to_another_hears_on(cell: Cell, stub: SimlogAPIStub) -> None:
+def test_adding_and_removing_a_source_leaves_other_streams_alone(cell: Cell, stub: SimlogAPIStub) -> None:
     stream = stub.Subscribe(TopicDescriptor(path=f"cell/{PATH}"), timeout=4 * PATIENCE_S, wait_for_ready=True)
     next(stream)
     pids = {name: process["pid"] for name, process in cell.processes().items()}
@@ -70,7 +70,7 @@ def test_a_source_comes_and_goes_and_who_listens_to_another_hears_on(cell: Cell,
     assert {name: process["pid"] for name, process in cell.processes().items() if name in pids} == pids
     second = stub.Subscribe(TopicDescriptor(path=f"second/{PATH}"), timeout=4 * PATIENCE_S)
     assert next(second).value
-    assert next(stream).value, "the stream of the other source goes on"
+    assert next(stream).value, "the stream of the other source continues"
     with shmio.attach(cell.instance) as reader:
         assert reader.read(f"second/{PATH}").quality is Quality.GOOD
         assert set(reader.sources) == {"cell", "second"}
@@ -88,7 +88,7 @@ def test_a_source_comes_and_goes_and_who_listens_to_another_hears_on(cell: Cell,
     stream.cancel()
 
 
-def test_a_new_layout_keeps_the_streams_whose_register_is_still_there(cell: Cell, stub: SimlogAPIStub) -> None:
+def test_a_new_layout_keeps_the_streams_of_registers_that_remain(cell: Cell, stub: SimlogAPIStub) -> None:
     kept = stub.Subscribe(TopicDescriptor(path=f"cell/{PATH}"), timeout=4 * PATIENCE_S, wait_for_ready=True)
     ended = stub.Subscribe(TopicDescriptor(path="cell/Inputs/3"), timeout=4 * PATIENCE_S)
     next(kept), next(ended)
@@ -109,7 +109,7 @@ def test_a_new_layout_keeps_the_streams_whose_register_is_still_there(cell: Cell
     kept.cancel()
 
 
-def test_what_is_odd_is_told_as_check_tells_it(cell: Cell) -> None:
+def test_reload_prints_the_same_warnings_as_check(cell: Cell) -> None:
     edit(cell, "period_ms = 20", 'period_ms = 20\nwritable = ["Outpts"]')
     done = cell.supervisor("reload")
     file = cell.folder / "supervisor.toml"

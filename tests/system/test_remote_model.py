@@ -1,4 +1,4 @@
-"""A whole instance whose drive a program of its own computes: as the page shows it, repeated, killed, joined again."""
+"""A drive model computed by a client program: as the page shows it, repeated, killed and rejoined."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ Frames = dict[int, tuple[int, bytes]]
 
 @contextmanager
 def served(cell: Cell, tremble: float = 0.0) -> Iterator[subprocess.Popen[str]]:
-    """The drive's model, which has joined."""
+    """Run the drive's model; yield when it has joined."""
     command = [sys.executable, "serve.py", str(cell.grpc), str(tremble)]
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{cell.folder}"}
     with subprocess.Popen(command, cwd=cell.folder, env=environment, stdout=subprocess.PIPE, text=True) as process:
@@ -111,7 +111,7 @@ def served(cell: Cell, tremble: float = 0.0) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.fixture
 def make_drive(make_cell: Callable[..., Cell], tmp_path: Path) -> Callable[[str], Cell]:
-    """An instance that is not running."""
+    """Return a function that makes an instance, not yet running."""
     for name, text in (("drive.toml", TABLE), ("line.py", MODEL), ("serve.py", SERVE)):
         (tmp_path / name).write_text(text)
     return lambda drive: make_cell(config=CONFIG.replace("DRIVE", drive))
@@ -128,7 +128,7 @@ def put(cell: Cell, path: str, value: str) -> None:
 
 
 def frames(cell: Cell, source: str) -> Frames:
-    """What the source has answered to each step: the instance's clock, and the bytes."""
+    """Return the source's frame for each step: instance clock and bytes."""
     found: Frames = {}
     with shmio.attach(cell.instance) as reader:
         cursor = reader.block(source).cursor(after=0)
@@ -140,7 +140,7 @@ def frames(cell: Cell, source: str) -> Frames:
 
 
 def campaign(cell: Cell, between: Callable[[], None] = lambda: None) -> tuple[Frames, Frames]:
-    """Steps and writes; of both sources, what they have shown."""
+    """Step and write; return the frames of both sources."""
     step(cell, "--dt-ms", "20", "--count", "4")
     put(cell, "sim/joints/Kuka.j1/R", "1.0")
     step(cell, "--dt-ms", "50", "--count", "4")
@@ -159,7 +159,7 @@ def remote_campaign(cell: Cell, tremble: float) -> tuple[Frames, Frames]:
 
 
 @pytest.mark.timeout(300)
-def test_a_campaign_repeats_exactly_and_is_that_of_the_same_class_in_the_instance(
+def test_a_remote_model_repeats_exactly_and_equals_the_same_class_as_a_source(
     make_drive: Callable[[str], Cell],
 ) -> None:
     cell = make_drive(REMOTE)
@@ -171,11 +171,11 @@ def test_a_campaign_repeats_exactly_and_is_that_of_the_same_class_in_the_instanc
     until(lambda: cell.processes()["drive"]["quality"] == "good", "good quality")
     assert campaign(cell) == first
     assert list(first[0]) == list(range(1, 13))
-    assert len({raw for _, raw in first[0].values()}) == 12, "each step shows something else"
+    assert len({raw for _, raw in first[0].values()}) == 12, "each step gives another frame"
 
 
 @pytest.mark.timeout(300)
-def test_a_model_that_is_killed_between_steps_goes_on_when_it_has_joined_again(
+def test_a_model_killed_between_steps_continues_after_rejoining(
     make_drive: Callable[[str], Cell],
 ) -> None:
     cell = make_drive(REMOTE)
@@ -195,12 +195,12 @@ def test_a_model_that_is_killed_between_steps_goes_on_when_it_has_joined_again(
             again.__exit__(None, None, None)
 
 
-def test_whoever_is_killed_within_a_step_fails_it_and_the_next_one_works(make_drive: Callable[[str], Cell]) -> None:
+def test_a_kill_during_a_step_fails_it_and_the_next_step_works(make_drive: Callable[[str], Cell]) -> None:
     cell = make_drive(REMOTE)
     cell.up()
 
     def failing(killed: Callable[[], None]) -> str:
-        """A step within which somebody is killed: what is said of it."""
+        """Kill a process during a step; return the error of the step."""
         put(cell, "drive/speed", "5000")
         with (
             subprocess.Popen([BIN / "shmio", "step"], cwd=cell.folder, stderr=subprocess.PIPE, text=True) as command,
@@ -220,7 +220,7 @@ def test_whoever_is_killed_within_a_step_fails_it_and_the_next_one_works(make_dr
         step(cell)
         pid = cell.processes()["drive"]["pid"]
         assert "drive: its process was restarted during this step" in failing(lambda: kill(pid))
-    with served(cell) as model:  # the one before hangs in its step
+    with served(cell) as model:  # the previous model hangs in its step
         step(cell)
         pid = cell.processes()["grpc"]["pid"]
         assert "drive: model 'serve.py' disconnected before it answered" in failing(lambda: kill(pid))
@@ -231,7 +231,7 @@ def test_whoever_is_killed_within_a_step_fails_it_and_the_next_one_works(make_dr
         assert cell.processes()["drive"]["quality"] == "good"
 
 
-def test_an_endpoint_that_is_started_anew_is_joined_again(make_drive: Callable[[str], Cell]) -> None:
+def test_a_model_rejoins_a_restarted_endpoint(make_drive: Callable[[str], Cell]) -> None:
     cell = make_drive(REMOTE)
     cell.up()
     with served(cell) as model:

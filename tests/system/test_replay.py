@@ -1,4 +1,4 @@
-"""A whole cell is recorded, and its recording played in its place: nobody can tell, but by the provenance."""
+"""A cell is recorded and replayed in its place: clients see no difference but the provenance."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as V2Stub
 from tests.system.armed import ARMED
 from tests.unit.endpoints.mqtt.harness import PREFIX, listening
 
-# A host that is busy for a moment is in no recording: it is to make no value stale, the first time or the second.
+# A busy host's delays are not in the recording: no value may turn stale, neither live nor in the replay.
 RECORDED = (
     ARMED.replace('connector = "s7"\n', 'connector = "s7"\nstale_ms = 10_000\n') + '\n[recorder]\ndirectory = "dumps"\n'
 )
@@ -47,7 +47,7 @@ PLACE = "cell/Outputs/100"
 
 
 class Streams:
-    """What clients of all interfaces get until the instance ends."""
+    """What clients of all interfaces receive until the instance ends."""
 
     def __init__(self, cell: Cell, broker: Address) -> None:
         self._stack = ExitStack()
@@ -74,11 +74,11 @@ class Streams:
             thread.start()
 
     def await_frames(self, count: int) -> None:
-        """Until shmio.v1 has brought so many."""
+        """Wait until shmio.v1 has delivered this many frames."""
         until(lambda: len(self.native) >= count, f"{count} frames")
 
     def close(self) -> None:
-        """When the instance has ended, so that the streams have."""
+        """Join the readers; call it after the instance has ended, which ends the streams."""
         for thread in self._threads:
             thread.join(PATIENCE_S)
             assert not thread.is_alive()
@@ -137,7 +137,7 @@ def broker() -> Iterator[Address]:
 
 @pytest.mark.skipif(bool(missing()), reason=missing())
 @pytest.mark.timeout(240 + FRAMES // 10)
-def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cells(
+def test_a_replay_gives_the_same_recording_and_the_same_streams(
     make_cell: Callable[..., Cell], broker: Address
 ) -> None:
     cell = make_cell(config=RECORDED + MQTT.replace("{broker}", str(broker)))
@@ -173,18 +173,20 @@ def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cell
     found = cell.run("shmio-dump", "diff", "--json", str(first), str(second))
     [told] = json.loads(found.stdout)["sources"]
     events = told["events"]
-    assert (events["differing"], events["only_first"], events["only_second"]) == (0, 0, 2), "what the replay refused"
+    assert (events["differing"], events["only_first"], events["only_second"]) == (0, 0, 2), (
+        "the writes that the replay refused"
+    )
     assert found.returncode == 1
     assert (told["frames"]["differing"], told["frames"]["only_first"], told["frames"]["only_second"]) == (0, 0, 0)
     assert told["frames"]["compared"] >= FRAMES
-    assert told["timing_ms"]["max"] == 0, "each at its time, to the ns"
+    assert told["timing_ms"]["max"] == 0, "each frame has its recorded time, to the ns"
     same_events(cell, first, second)
     for name in ("v1", "v2", "native", "mqtt"):
         assert_continues(name, getattr(live, name), getattr(replayed, name))
 
 
 def same_events(cell: Cell, first: Path, second: Path) -> None:
-    """All that happened is told again, in the same order; what was refused in the replay, beside it."""
+    """Assert that the replay has all recorded events, in the same order, and the writes that it refused."""
     with shmio.open_dump(first) as one, shmio.open_dump(second) as other:
         told, again = (
             [
@@ -200,13 +202,15 @@ def same_events(cell: Cell, first: Path, second: Path) -> None:
 
 
 def assert_continues(name: str, live: list[Any], replayed: list[Any]) -> None:
-    """What a client got behind its first message, the other got, too, who was there earlier, and longer."""
+    """Assert that the replay's client received all that the live client did after its first message.
+
+    It may have received more, as it was connected for longer."""
     assert len(live) > 10, name
     at = replayed.index(live[1])
     assert replayed[at : at + len(live) - 1] == live[1:], name
 
 
-def test_a_replay_beside_a_model_and_kills(make_cell: Callable[..., Cell]) -> None:
+def test_a_replay_with_a_model_and_killed_processes(make_cell: Callable[..., Cell]) -> None:
     cell = make_cell(config=RECORDED)
     cell.up()
     until(lambda: cell.processes()["recorder"]["counters"]["frames"] >= 100, "frames")
@@ -263,8 +267,8 @@ directory = "again"
     with shmio.open_dump(file) as found:
         known = [entry.item.cycle for entry in found.frames("cell")]
     lost = [(one, two) for one, two in pairwise(cycles) if two - one not in (0, 1) and two > one]
-    if "frames were skipped" not in cell.logs():  # a host that took 10 s for the new process
-        assert all(two == known[known.index(one) + 1] for one, two in lost), "the kill has lost nothing"
+    if "frames were skipped" not in cell.logs():  # the host took 10 s to start the process
+        assert all(two == known[known.index(one) + 1] for one, two in lost), "the kill has lost no frame"
 
 
 @pytest.mark.parametrize(
@@ -275,7 +279,7 @@ directory = "again"
         (lambda file: file.unlink(), "replay.file: "),
     ],
 )
-def test_what_cannot_be_played_is_told_in_one_line(
+def test_a_file_that_cannot_be_played_gives_one_clear_line(
     make_cell: Callable[..., Cell], spoil: Callable[[Path], object], error: str
 ) -> None:
     cell = make_cell(config=RECORDED)

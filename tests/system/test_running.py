@@ -1,4 +1,4 @@
-"""The whole cell as a user has it who looks at it from outside."""
+"""The running A50 cell, seen by another process and by the user's commands."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_another_process_receives_changing_values(running: Cell) -> None:
     assert {"cycle", "rate_hz", "overruns", "pid", "uptime_s"} <= set(processes["cell"])
 
 
-def test_the_users_tool_reads_the_cell(running: Cell) -> None:
+def test_the_shmio_command_reads_the_cell(running: Cell) -> None:
     until(lambda: running.processes()["cell"]["quality"] == "good", "good quality")
     listed = json.loads(running.output("shmio", "list", "--json"))
     assert len(listed) == 22

@@ -1,4 +1,4 @@
-"""A shared-memory file system that is too small, as a container has by default."""
+"""A shared-memory file system that is too small, as containers have by default."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def stopped_cell(make_cell: object, tmp_path: Path) -> Cell:
     return cell
 
 
-def test_a_start_without_room_names_what_is_needed_and_the_remedy(stopped_cell: Cell) -> None:
+def test_a_start_without_room_names_the_needed_size_and_the_remedy(stopped_cell: Cell) -> None:
     done = in_small_shm(stopped_cell.folder, "1m", "shmio-supervisor up")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()

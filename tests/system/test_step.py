@@ -1,4 +1,4 @@
-"""Virtual time in a whole instance: models as a user writes them, stepped by commands and programs, and killed."""
+"""Virtual time in an instance with a user's models: stepped by commands and programs, and killed."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def start(make: Callable[..., Cell], clock: str) -> Cell:
 
 @pytest.fixture
 def make_line(make_cell: Callable[..., Cell]) -> Callable[[str], Cell]:
-    """What starts one for this test alone."""
+    """Return a function that starts an instance for one test."""
     return partial(start, make_cell)
 
 
@@ -109,7 +109,7 @@ def shared_line(make_shared_cell: Callable[..., Cell]) -> Cell:
 
 @pytest.fixture
 def line(shared_line: Cell) -> Cell:
-    """One whose time stands, and has stood from the start, at whatever step; the belt's speed is 1 from the next on."""
+    """An instance with time stopped at some step; from the next step on, the belt's speed is 1."""
     with shmio.attach(shared_line.instance, writable=True) as cell:
         cell.write({"belt/speed": 1.0})
         cell.step()
@@ -129,14 +129,16 @@ def get(cell: Cell, *paths: str) -> list[Any]:
     return [shown[path]["value"] for path in paths]
 
 
-def test_the_command_steps_and_tells_the_time(make_line: Callable[[str], Cell]) -> None:
+def test_the_step_command_steps_and_prints_the_time(make_line: Callable[[str], Cell]) -> None:
     line = make_line("stepped")
     assert get(line, "belt/position", "gate/closed") == [0.0, False]
     clock = step(line)
     assert (clock["mode"], clock["step"], clock["time_s"], clock["step_size_ms"]) == ("virtual", 1, 0.05, 50)
     assert get(line, "belt/position", "gate/closed") == [0.1, False]
     assert step(line, "--dt-ms", "100")["time_s"] == 0.15
-    assert get(line, "belt/position", "gate/closed") == [pytest.approx(0.3), False], "the gate sees the step before"
+    assert get(line, "belt/position", "gate/closed") == [pytest.approx(0.3), False], (
+        "the gate sees the belt of the previous step"
+    )
     step(line)
     assert get(line, "belt/position", "gate/closed") == [pytest.approx(0.4), True]
     assert line.run("shmio", "set", "belt/speed", "0.5", "panel/limit", "3").returncode == 0
@@ -148,7 +150,7 @@ def test_the_command_steps_and_tells_the_time(make_line: Callable[[str], Cell]) 
     assert line.status()["clock"]["time_s"] == 0.4
 
 
-def test_wall_time_goes_on_until_it_is_taken_over(make_line: Callable[[str], Cell]) -> None:
+def test_wall_time_runs_until_a_program_takes_control(make_line: Callable[[str], Cell]) -> None:
     line = make_line("wall")
     assert line.status()["clock"]["mode"] == "wall"
     first = line.processes()["belt"]["cycle"]
@@ -160,7 +162,7 @@ def test_wall_time_goes_on_until_it_is_taken_over(make_line: Callable[[str], Cel
     assert get(line, "belt/position") == [pytest.approx(before[0] + 0.1)]
 
 
-def test_real_time_comes_back_and_is_taken_over_again(make_line: Callable[[str], Cell]) -> None:
+def test_time_can_be_released_and_taken_again(make_line: Callable[[str], Cell]) -> None:
     line = make_line("wall")
 
     def runs() -> None:
@@ -172,7 +174,7 @@ def test_real_time_comes_back_and_is_taken_over_again(make_line: Callable[[str],
     with shmio.attach(line.instance) as cell:
         followed = [cell.block(source).cursor() for source in ("belt", "gate", "panel")]
         for way in ((), ("--host", str(line.grpc))):
-            # More steps than there were periods, then more time than has passed.
+            # Run ahead of real time by a number of steps, and then by time.
             moments += [step(line, *way, "--dt-ms", dt_ms, "--count", "30") for dt_ms in ("1", "60000")]
             moments.append(step(line, *way, "--release"))
             assert moments[-1]["mode"] == "wall"
@@ -183,12 +185,12 @@ def test_real_time_comes_back_and_is_taken_over_again(make_line: Callable[[str],
         runs()
         for cursor in followed:
             told = [(frame.cycle, frame.clock_ns) for frame in iter(cursor.poll, None)]
-            assert told == sorted(told), "neither cycles nor time go back"
+            assert told == sorted(told), "cycles and time never decrease"
     times = [moment["time_s"] for moment in moments]
     assert times == sorted(times)
 
 
-def test_it_plays_until_it_is_interrupted(line: Cell) -> None:
+def test_play_runs_until_ctrl_c(line: Cell) -> None:
     begun_s = line.status()["clock"]["time_s"]
     with subprocess.Popen([BIN / "shmio", "step", "--play", "10"], cwd=line.folder, stdout=subprocess.PIPE) as player:
         try:
@@ -205,7 +207,7 @@ def test_it_plays_until_it_is_interrupted(line: Cell) -> None:
     assert step(line)["step"] == clock["step"] + 1
 
 
-def test_time_that_was_never_real_is_not_released(line: Cell) -> None:
+def test_time_that_started_virtual_cannot_be_released(line: Cell) -> None:
     told = [line.run("shmio", "step", "--release", *way).stderr for way in ((), ("--host", str(line.grpc)))]
     assert all('virtual from its start (clock = "stepped" in its configuration)' in one for one in told)
     assert step(line)["mode"] == "virtual"
@@ -230,7 +232,7 @@ def test_a_program_steps_and_plays(line: Cell) -> None:
         reader.step()
 
 
-def test_a_model_that_raises_fails_the_step_with_its_line(line: Cell) -> None:
+def test_an_exception_in_a_model_fails_the_step_and_names_the_line(line: Cell) -> None:
     [position], number = get(line, "belt/position"), line.status()["clock"]["step"] + 1
     line.run("shmio", "set", "belt/speed", "-1")
     failed = line.run("shmio", "step")
@@ -247,7 +249,7 @@ def test_a_model_that_raises_fails_the_step_with_its_line(line: Cell) -> None:
     assert get(line, "belt/position") == [pytest.approx(position + 0.1)]
 
 
-def test_a_step_that_has_failed_is_told_alike_on_the_host_and_by_grpc(line: Cell) -> None:
+def test_a_failed_step_gives_the_same_messages_locally_and_by_grpc(line: Cell) -> None:
     ways: tuple[tuple[str, ...], ...] = (), ("--host", str(line.grpc))
     number = line.status()["clock"]["step"]
     line.run("shmio", "set", "belt/speed", "-1")
@@ -257,11 +259,11 @@ def test_a_step_that_has_failed_is_told_alike_on_the_host_and_by_grpc(line: Cell
     assert (first[0], second[0], first[2]) == (f"step {number + 1}", f"step {number + 2}", second[2])
     on_host, by_grpc = (step(line, "--pause", *way) for way in ways)
     assert on_host == by_grpc
-    assert on_host["step"] == number, "the last that all have finished"
+    assert on_host["step"] == number, "the last step that all sources have finished"
     assert on_host["note"].startswith(f"step {number + 2} failed: belt: ")
 
 
-def test_how_far_a_step_goes_is_told_as_it_was_asked_for(line: Cell) -> None:
+def test_the_step_command_prints_the_step_size_and_refuses_conflicting_options(line: Cell) -> None:
     told = line.output("shmio", "step", "--dt-ms", "20", "--count", "2")
     assert re.fullmatch(r"virtual time [0-9.]+ s, step [0-9]+ of 20 ms, step size 50 ms\n", told), told
     refused = line.run("shmio", "step", "--pause", "--dt-ms", "20")
@@ -271,7 +273,7 @@ def test_how_far_a_step_goes_is_told_as_it_was_asked_for(line: Cell) -> None:
 
 
 @pytest.mark.parametrize("remote", [False, True])
-def test_what_a_model_computes_is_not_set_and_the_remedy_works(line: Cell, remote: bool) -> None:
+def test_a_computed_register_cannot_be_set_and_the_remedy_works(line: Cell, remote: bool) -> None:
     way = ("--host", str(line.grpc)) if remote else ()
     unlisted = line.run("shmio", "set", *way, "belt/position", "7").stderr
     assert unlisted.startswith("belt/position is not writable; ")
@@ -288,7 +290,7 @@ def test_what_a_model_computes_is_not_set_and_the_remedy_works(line: Cell, remot
     assert get(line, "belt/position") != [-7.0]
 
 
-def test_a_model_that_is_killed_within_a_step_fails_it_and_goes_on_with_the_next(line: Cell) -> None:
+def test_a_model_killed_during_a_step_fails_it_and_the_next_step_works(line: Cell) -> None:
     with Attachment(Segment.open(line.instance, writable=True)) as cell:
         [position], number = get(line, "belt/position"), cell.clock.step + 1
         cell.write({"belt/speed": 5000.0})
@@ -306,7 +308,7 @@ def test_a_model_that_is_killed_within_a_step_fails_it_and_goes_on_with_the_next
         assert cell["belt/position"] == pytest.approx(position + 0.1)
 
 
-def test_a_model_that_is_stopped_is_named_after_the_hard_time_out(line: Cell) -> None:
+def test_a_frozen_model_is_named_after_the_hard_time_out(line: Cell) -> None:
     [position], number = get(line, "belt/position"), line.status()["clock"]["step"] + 1
     pid = line.processes()["gate"]["pid"]
     with Segment.open(line.instance, writable=True) as segment:
@@ -322,7 +324,7 @@ def test_a_model_that_is_stopped_is_named_after_the_hard_time_out(line: Cell) ->
     assert get(line, "belt/position") == [pytest.approx(position + 0.2)]
 
 
-def test_a_killed_program_that_played_leaves_time_standing(line: Cell) -> None:
+def test_time_stops_when_the_program_that_plays_is_killed(line: Cell) -> None:
     playing = "import shmio, sys, time; cell = shmio.attach(sys.argv[1], writable=True); cell.play(); time.sleep(3600)"
     with subprocess.Popen([sys.executable, "-c", playing, line.instance]) as player:
         until(lambda: line.status()["clock"]["playing"], "it plays")
@@ -330,13 +332,13 @@ def test_a_killed_program_that_played_leaves_time_standing(line: Cell) -> None:
         until(lambda: line.status()["clock"]["step"] > begun + 3, "time runs")
         player.kill()
     stands = line.status()["clock"]
-    assert not stands["playing"], "nobody plays it any more"
+    assert not stands["playing"], "no program plays time any more"
     clock = step(line)
-    assert clock["step"] in (stands["step"] + 1, stands["step"] + 2), "it may have been killed within a step"
+    assert clock["step"] in (stands["step"] + 1, stands["step"] + 2), "it may have been killed during a step"
     assert not clock["playing"]
 
 
-def test_a_supervisor_that_takes_over_keeps_the_time_unless_the_configuration_has_another_clock(
+def test_a_take_over_keeps_the_time_unless_the_configured_clock_changed(
     make_line: Callable[[str], Cell],
 ) -> None:
     line = make_line("wall")
@@ -349,7 +351,7 @@ def test_a_supervisor_that_takes_over_keeps_the_time_unless_the_configuration_ha
         return line.supervisor("up", "--detach").stdout
 
     taken_over = step(line)["step"]
-    assert "took over belt" in up_again(), "its clock is the wall's, though time was taken over"
+    assert "took over belt" in up_again(), "its configuration has the wall clock, though time is virtual"
     assert step(line)["step"] == taken_over + 1
     assert f"{line.instance} was started with instance.clock wall, not stepped: it starts anew" in up_again("stepped")
     assert line.status()["clock"]["step"] == 0

@@ -1,4 +1,4 @@
-"""A whole cell whose supervisor is killed: the next one goes on with what runs."""
+"""A cell whose supervisor is killed: the next supervisor takes over the running processes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def gone(pid: int) -> bool:
         return True
 
 
-def test_all_goes_on_under_the_next_supervisor(cell: Cell) -> None:
+def test_everything_continues_under_the_next_supervisor(cell: Cell) -> None:
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
     before = pids(cell)
     with grpc.insecure_channel(str(cell.grpc)) as channel, shmio.attach(cell.instance) as reader:
@@ -46,7 +46,9 @@ def test_all_goes_on_under_the_next_supervisor(cell: Cell) -> None:
         first = reader.frame("cell").frame
         kill_supervisor(cell)
         checked = cell.supervisor("check")
-        assert (checked.returncode, "would fail" in checked.stdout) == (0, False), "the ports are its own processes'"
+        assert (checked.returncode, "would fail" in checked.stdout) == (0, False), (
+            "the ports belong to the instance's own processes"
+        )
         up = cell.supervisor("up", "--detach")
         assert up.returncode == 0, up.stderr
         for name, pid in before.items():
@@ -58,7 +60,7 @@ def test_all_goes_on_under_the_next_supervisor(cell: Cell) -> None:
         assert next(stream).value
         stream.cancel()
     until(lambda: cell.status()["state"] == "running", "state running")
-    # What is taken over is watched as if it were its own.
+    # The new supervisor watches the processes that it has taken over.
     kill(before["cell"])
     until(lambda: cell.processes()["cell"]["restarts"] == 1, "a restart")
     until(lambda: cell.processes()["cell"]["state"] == "running", "the source is back")
@@ -68,10 +70,10 @@ def test_all_goes_on_under_the_next_supervisor(cell: Cell) -> None:
     assert cell.instance not in instances()
 
 
-def test_only_what_differs_is_replaced(cell: Cell) -> None:
+def test_only_changed_or_frozen_processes_are_replaced(cell: Cell) -> None:
     before = pids(cell)
     kill_supervisor(cell)
-    kill(before["grpc"], signal.SIGSTOP)  # shows no sign of life by the time it is looked at, or soon after
+    kill(before["grpc"], signal.SIGSTOP)  # shows no heartbeat when the supervisor looks, or soon after
     file = cell.folder / "supervisor.toml"
     file.write_text(file.read_text().replace("timeout = 1000", "timeout = 900"))
     up = cell.supervisor("up", "--detach")
@@ -84,15 +86,15 @@ def test_only_what_differs_is_replaced(cell: Cell) -> None:
     assert after["plc"] == before["plc"]
 
 
-def test_what_a_take_over_finds_is_told_as_it_is_by_now(cell: Cell) -> None:
-    """A reload has made the segment larger; the endpoint is in the configuration no more."""
+def test_take_over_reports_the_current_state(cell: Cell) -> None:
+    """A reload has made the segment larger; the endpoint is no longer in the configuration."""
     file = cell.folder / "supervisor.toml"
     first = cell.status()["segment_bytes"]
     file.write_text(file.read_text().replace("period_ms = 20", "period_ms = 25"))
     assert cell.supervisor("reload").returncode == 0
     grown = cell.status()["segment_bytes"]
     assert grown == Path(f"/dev/shm/shmio-{cell.instance}").stat().st_size
-    assert grown > first + 2**20, "it has another ring"
+    assert grown > first + 2**20, "the new block's ring is included"
     grpc_pid = pids(cell)["grpc"]
     kill_supervisor(cell)
     text = file.read_text()
@@ -104,7 +106,7 @@ def test_what_a_take_over_finds_is_told_as_it_is_by_now(cell: Cell) -> None:
     assert list(pids(cell)) == ["plc", "cell"]
 
 
-def test_another_versions_instance_starts_anew(cell: Cell) -> None:
+def test_an_instance_of_another_version_is_started_anew(cell: Cell) -> None:
     before = pids(cell)
     kill_supervisor(cell)
     with Segment.open(cell.instance, writable=True) as segment:
@@ -118,7 +120,7 @@ def test_another_versions_instance_starts_anew(cell: Cell) -> None:
         assert segment.shared.inode != inode
 
 
-def test_down_clears_another_versions_instance(cell: Cell) -> None:
+def test_down_clears_an_instance_of_another_version(cell: Cell) -> None:
     before = pids(cell)
     kill_supervisor(cell)
     with Segment.open(cell.instance, writable=True) as segment:
@@ -126,7 +128,7 @@ def test_down_clears_another_versions_instance(cell: Cell) -> None:
     refused = cell.supervisor("down")
     assert refused.returncode == 1
     name = f"--instance {cell.instance}"
-    assert f"down {name}` clears" in refused.stderr, "nobody can tell from which file it was started"
+    assert f"down {name}` clears" in refused.stderr, "its file is unknown"
     down = cell.supervisor("down", *name.split())
     assert down.returncode == 0, down.stderr
     assert all(gone(pid) for pid in before.values())
@@ -144,7 +146,7 @@ def test_a_segment_without_a_process_is_stale(cell: Cell) -> None:
     assert f"removed the left-over segment shmio-{cell.instance}" in up.stdout
 
 
-def test_of_two_that_take_over_one_wins(cell: Cell) -> None:
+def test_of_two_simultaneous_take_overs_one_succeeds(cell: Cell) -> None:
     before = pids(cell)
     kill_supervisor(cell)
     command = [str(BIN / "shmio-supervisor"), "up", "--detach"]
@@ -157,7 +159,7 @@ def test_of_two_that_take_over_one_wins(cell: Cell) -> None:
     assert pids(cell) == before
 
 
-def test_the_way_to_the_supervisor_is_found_when_its_socket_has_moved(
+def test_commands_find_a_supervisor_whose_socket_has_moved(
     cell: Cell, runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kill_supervisor(cell)

@@ -1,4 +1,4 @@
-"""Two cells at one broker, by the commands of the page on MQTT."""
+"""Two cells at one broker, with the commands of the page on MQTT."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def broker() -> Iterator[Address]:
 
 @pytest.fixture
 def folder(tmp_path: Path, instance: str, broker: Address) -> Iterator[Path]:
-    """The examples, with names and a port of the test's own."""
+    """The examples, with names and a port of this test."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     for cell in CELLS:
         file = tmp_path / "examples/two-cells" / cell / "supervisor.toml"
@@ -43,7 +43,7 @@ def folder(tmp_path: Path, instance: str, broker: Address) -> Iterator[Path]:
         shell(f"shmio-supervisor down -c examples/two-cells/{cell}/supervisor.toml", tmp_path)
 
 
-def test_the_page_on_two_cells(folder: Path, broker: Address, instance: str) -> None:
+def test_the_page_on_two_cells_runs_as_shown(folder: Path, broker: Address, instance: str) -> None:
     page = (ROOT / "docs/how-to/use-mqtt.md").read_text().replace("127.0.0.1:1883", str(broker))
     begin, end = BLOCK.findall(page)
     shown = [line.rpartition(" ")[0] for line in printed(begin, folder).splitlines()[-2:]]

@@ -1,4 +1,4 @@
-"""Writing through a whole cell: what one program writes, another sees come out of the controller."""
+"""Writes through the A50 cell: another program sees them in the controller's output."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 
 ROOT = Path(__file__).parents[2]
 WRITABLE = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs", "Robot_*/*"]\n')
-PLACE = "cell/Outputs/100"  # those from here on are of no meaning to the controller's program
+PLACE = "cell/Outputs/100"  # the controller's program ignores bytes from here on
 
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell with writable outputs, running and good; each test writes to places of its own."""
+    """The A50 cell with writable outputs, running and good; each test writes to other places."""
     cell = make_shared_cell(config=WRITABLE)
     cell.up()
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
@@ -43,7 +43,7 @@ def client(cell: Cell) -> Iterator[Any]:
 @contextmanager
 def subscribed(stub: Any, path: str) -> Iterator[Any]:
     stream = stub.Subscribe(TopicDescriptor(path=path), timeout=PATIENCE_S, wait_for_ready=True)
-    stream.initial_metadata()  # from now on nothing is missed
+    stream.initial_metadata()  # once it is here, no later value is missed
     try:
         yield stream
     finally:
@@ -64,7 +64,7 @@ def counted(cell: Cell) -> int:
     return found["published"] + found["refused"]
 
 
-def test_what_is_set_comes_out_of_the_controller_for_every_subscriber(cell: Cell) -> None:
+def test_every_subscriber_sees_a_value_written_by_set(cell: Cell) -> None:
     with client(cell) as stub, subscribed(stub, PLACE) as out, subscribed(stub, f"{PLACE}/in") as into:
         assert next(out).value == "0"
         done = cell.run("shmio", "set", PLACE, "16#2A")
@@ -74,7 +74,7 @@ def test_what_is_set_comes_out_of_the_controller_for_every_subscriber(cell: Cell
     assert json.loads(cell.output("shmio", "get", "--json", PLACE))[PLACE]["value"] == 42
 
 
-def test_what_is_published_comes_out_of_the_controller_for_every_subscriber(cell: Cell) -> None:
+def test_every_subscriber_sees_a_published_value(cell: Cell) -> None:
     before, place = counters(cell), "cell/Outputs/103"
     with client(cell) as stub, subscribed(stub, place) as out, shmio.attach(cell.instance) as local:
         assert next(out).value == "0"
@@ -100,9 +100,9 @@ def test_the_example_publishes(cell: Cell) -> None:
     assert "NOT_FOUND" in wrong.stderr
 
 
-def test_an_order_reaches_the_plant(cell: Cell) -> None:
+def test_a_command_register_controls_the_plant(cell: Cell) -> None:
     with shmio.attach(cell.instance, writable=True) as local:
-        assert [outcome.done for outcome in local.write({"cell/Outputs/13": 1})] == [True]  # hold
+        assert [outcome.done for outcome in local.write({"cell/Outputs/13": 1})] == [True]  # command: hold
         positions = (view["Robot_800/Axs1_Pos"] for view in local.stream("cell", timeout_s=PATIENCE_S))
         until(lambda: len(set(islice(positions, 5))) == 1, "the robots stand")
         assert local.write({"cell/Outputs/13": 0})[0].done
@@ -110,7 +110,7 @@ def test_an_order_reaches_the_plant(cell: Cell) -> None:
         positions.close()
 
 
-def test_what_cannot_be_written_is_one_clear_line(cell: Cell) -> None:
+def test_a_refused_write_gives_one_clear_line(cell: Cell) -> None:
     for path, value, message in [
         ("cell/Inputs/0", "1", "cell/Inputs/0 is not writable; name it in the source's"),
         ("cell/Outputs/100.%X8", "1", "Outputs/100.%X8: BYTE has bits 0 to 7"),
@@ -124,7 +124,7 @@ def test_what_cannot_be_written_is_one_clear_line(cell: Cell) -> None:
         assert done.stderr.count("\n") == 1
 
 
-def test_without_its_controller_nothing_is_written_and_the_reason_is_told(make_cell: Callable[..., Cell]) -> None:
+def test_without_a_controller_writes_are_rejected_with_the_reason(make_cell: Callable[..., Cell]) -> None:
     before, _, rest = WRITABLE.partition("[[emulator]]")
     cell = make_cell(config=f"{before}[grpc]{rest.partition('[grpc]')[2]}")
     cell.up()
@@ -139,7 +139,7 @@ def test_without_its_controller_nothing_is_written_and_the_reason_is_told(make_c
     until(lambda: counters(cell)["refused"] == 3, "all counted")
 
 
-def test_a_stream_outlives_its_source(cell: Cell) -> None:
+def test_a_publish_stream_survives_a_killed_source(cell: Cell) -> None:
     sent, before = 0, counters(cell)
 
     def numbered(value: str | None = None) -> PubRequest:

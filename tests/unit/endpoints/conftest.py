@@ -1,4 +1,4 @@
-"""A segment with one source, not published by anybody but the test."""
+"""A segment with one source, which only the test publishes."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def soon_stale(instance: str) -> Iterator[Segment]:
-    """Of tests about age."""
+    """A segment for tests about age: its frames soon turn stale."""
     with _segment(instance, SOON_STALE_NS) as segment:
         yield segment
 
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No command expires because the host is busy."""
+    """Let no command expire because the host is busy."""
     monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)

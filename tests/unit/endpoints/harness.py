@@ -86,7 +86,7 @@ class Endpoint:
 
     @cached_property
     def writer(self) -> BlockWriter:
-        """Of the source ``cell``."""
+        """Writer of the source ``cell``."""
         return self.segment.writer("cell")
 
     def publish(self, raw: bytes, quality: Quality = Quality.GOOD) -> None:
@@ -97,7 +97,7 @@ class Endpoint:
         return self.stub.Subscribe(wire.TopicDescriptor(path=path), timeout=TIMEOUT_S)
 
     async def subscriber(self, uuid: str, *paths: str) -> Any:
-        """A stream of version 2 that has subscribed to these."""
+        """Open a version 2 stream that has subscribed to these paths."""
         stream = self.v2.CreateSubscriber(v2.Subscriber(name="test", uuid=uuid), timeout=TIMEOUT_S)
         await stream.initial_metadata()
         for path in paths:
@@ -113,17 +113,21 @@ class Endpoint:
         return int(answer.status)
 
     async def until(self, condition: Callable[[], Awaitable[bool]]) -> None:
-        """Wait for what another thread brings about."""
+        """Wait until a condition holds that another thread brings about."""
         async with asyncio.timeout(TIMEOUT_S):
-            while not await condition():  # noqa: ASYNC110  it is another thread's doing
-                await asyncio.sleep(LOOK_S)  # which needs the interpreter for it
+            while not await condition():  # noqa: ASYNC110  another thread changes it
+                await asyncio.sleep(LOOK_S)  # gives the other thread the interpreter
 
 
 @asynccontextmanager
 async def endpoint(
     segment: Segment, limits: CallLimits | None = None, before: int = 0, port: int = 0
 ) -> AsyncIterator[Endpoint]:
-    """``before``: pid of the process that was the endpoint before; ``port``: where it was."""
+    """Serve a segment.
+
+    Args:
+        before: Process id of the previous endpoint.
+        port: Port of the previous endpoint, to reuse it."""
     tasks: set[asyncio.Task[None]] = set()
 
     def on_quality(source: str, good: bool) -> None:
@@ -167,14 +171,14 @@ async def value(stream: Any) -> str:
 
 
 async def message(stream: Any) -> tuple[str, Any]:
-    """Path and value of version 2's next message; lists and structures as Python's."""
+    """Return path and value of version 2's next message, as Python values."""
     got = await asyncio.wait_for(stream.read(), TIMEOUT_S)
     assert got is not grpc.aio.EOF
     return got.header.path, plain(got.value)
 
 
 def plain(value: Value) -> Any:
-    """A google.protobuf.Value as Python's."""
+    """Return a google.protobuf.Value as a Python value."""
     kind = value.WhichOneof("kind")
     if kind == "list_value":
         return [plain(item) for item in value.list_value.values]
@@ -185,7 +189,7 @@ def plain(value: Value) -> Any:
 
 
 async def refusal(call: Any) -> tuple[grpc.StatusCode, str]:
-    """Status and message with which a call ends."""
+    """Return the status and message with which a call ends."""
     with pytest.raises(grpc.aio.AioRpcError) as caught:
         await call
     return caught.value.code(), str(caught.value.details())

@@ -1,4 +1,4 @@
-"""A gRPC client down to the frame, that may stop in the middle of any of them (RFC 9113, gRPC over HTTP/2)."""
+"""A gRPC client on the level of HTTP/2 frames, which can stop within any of them (RFC 9113)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def frame(kind: int, flags: int, stream: int, payload: bytes) -> bytes:
 
 
 def headers(method: str, stream: int = 1) -> bytes:
-    """Of a call, without compression (RFC 7541, 6.2.2)."""
+    """Return the headers of a call, without compression (RFC 7541, 6.2.2)."""
     fields = {
         ":method": "POST",
         ":scheme": "http",
@@ -37,17 +37,17 @@ def headers(method: str, stream: int = 1) -> bytes:
 
 
 def call(method: str, request: bytes, stream: int = 1) -> bytes:
-    """A whole one, with its message."""
+    """Return a whole call with its message."""
     return headers(method, stream) + frame(DATA, END_STREAM, stream, message(request))
 
 
 def message(data: bytes) -> bytes:
-    """Behind its prefix."""
+    """Return a message with its gRPC prefix."""
     return b"\0" + len(data).to_bytes(4, "big") + data
 
 
 class Connection:
-    """One, of a client that reads no more than it has to."""
+    """A client's connection that reads no more than necessary."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
@@ -55,7 +55,9 @@ class Connection:
 
     @classmethod
     async def open(cls, port: int, *, deaf: bool = False) -> Self:
-        """Connected, and known by the server to speak HTTP/2. ``deaf``: its windows stay closed: it takes no data."""
+        """Connect, and wait until the server speaks HTTP/2.
+
+        ``deaf``: keep the flow-control windows closed, so that no data can arrive."""
         connection = cls(*await asyncio.open_connection("127.0.0.1", port))
         await connection.send(PREFACE + frame(SETTINGS, 0, 0, b"\0\4\0\0\0\0" if deaf else b""))
         async with asyncio.timeout(TIMEOUT_S):
@@ -70,7 +72,7 @@ class Connection:
         await self._writer.drain()
 
     async def until_end(self, stream: int) -> None:
-        """Read on until a call has its status."""
+        """Read until a call has its status."""
         async with asyncio.timeout(TIMEOUT_S):
             while True:
                 head = await self.reader.readexactly(9)
@@ -79,7 +81,7 @@ class Connection:
                     return
 
     async def drop(self, *, reset: bool) -> None:
-        """Break off; with a reset, or having heard that the server has noticed the end."""
+        """Close the connection: with a reset, or by an end that the server has noticed."""
         if reset:
             end: socket.socket = self._writer.get_extra_info("socket")
             end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
@@ -92,4 +94,4 @@ class Connection:
         try:
             await self._writer.wait_closed()
         except OSError:
-            return  # the server was first
+            return  # the server closed first

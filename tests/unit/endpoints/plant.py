@@ -1,4 +1,4 @@
-"""A source that takes commands, with its device, cycle by cycle as the test wants."""
+"""A source that accepts commands, with its device; the test decides when cycles happen."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GUEST = 0
 
 
 class Plant:
-    """A command processor in its thread, and a device that does what it is told unless ``refusal`` says why not."""
+    """A command processor in its thread, and a device that accepts writes unless ``refusal`` gives a reason."""
 
     def __init__(self, writer: BlockWriter, *, armed: bool = True) -> None:
         self.writer = writer
@@ -40,7 +40,7 @@ class Plant:
         self._threads[0].start()
 
     def cycle(self) -> None:
-        """Carry out what waits, then publish the memory as it is."""
+        """Carry out the waiting commands, then publish the device's memory."""
         try:
             if self.commands.waiting:
                 self.commands.carry_out(self._write)
@@ -51,7 +51,7 @@ class Plant:
         self.output.publish(Image(image, self._cycles, time.time_ns(), self.quality, Provenance.LIVE, ""))
 
     def run(self, period_s: float = 0.002) -> None:
-        """Go on cycle after cycle."""
+        """Run cycles until stopped."""
 
         def loop() -> None:
             while not self._stop.wait(period_s):

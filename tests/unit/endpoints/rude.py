@@ -1,4 +1,4 @@
-"""Every call that clients make, a polite client beside the rude ones, and how to see that nothing is left of these."""
+"""Every call that clients can make, a well-behaved client, and checks that misbehaving ones leave nothing."""
 
 from __future__ import annotations
 
@@ -28,9 +28,13 @@ HEALTH, REFLECTION = "/grpc.health.v1.Health/", "/grpc.reflection.v1alpha.Server
 
 
 class Call(NamedTuple):
-    """``many``: it takes a stream of messages. ``stays``: it is open until its client ends it, after its message.
+    """A call, and how it behaves.
 
-    ``first``: it needs one, which is not as the others. ``ends``: how, if all is well with it.
+    Attributes:
+        many: It takes a stream of messages.
+        stays: After its message it stays open until its client ends it.
+        first: Its first message is required, and differs from the others.
+        ends: Its status if it succeeds.
     """
 
     method: str
@@ -57,7 +61,7 @@ def _lay(path: str) -> bytes:
 
 NOISE = ours.Declaration(
     name="rude", targets=["cell/bits"], flip=ours.Flip(bits=[0]), when="cell/step mod 2 == 1"
-)  # over what no other call injects
+)  # no other call injects there
 SPEED = ours.Assignment(path="cell/axis/speed", value=ours.Value(number=5))
 
 CALLS = (
@@ -121,7 +125,7 @@ CALLS = (
 
 
 class Polite:
-    """A client of both versions that reads what comes, as long as the others are rude."""
+    """A client of both versions that reads its streams while other clients misbehave."""
 
     def __init__(self, served: Endpoint, device: Plant, first: Any, second: Any) -> None:
         self._served = served
@@ -130,20 +134,20 @@ class Polite:
         self._values = itertools.count(1)
 
     async def goes_on(self) -> None:
-        """A new value reaches both streams: the next thing on each."""
+        """Wait until a new value arrives on both streams, as the next message of each."""
         number = next(self._values) % 30_000
         self.device.memory[12:14] = number.to_bytes(2, "big")
         first, second = self._streams
         assert await value(first) == str(number)
         path, got = await message(second)
-        while path != "cell/step":  # one of the rude calls has it subscribe to another
+        while path != "cell/step":  # another call may have subscribed it to another topic
             path, got = await message(second)
         assert got == number
 
     async def alone(self, *, connected: bool = False) -> None:
-        """Nothing is left of any other: calls, streams, topics, values under way, bytes, injections.
+        """Wait until nothing is left of other clients: calls, streams, topics, commands, bytes, injections.
 
-        ``connected``: its connection is, and with it the injection that version 2 has laid.
+        ``connected``: the other client is still connected, so the injection of version 2 may remain.
         """
         served, feed = self._served, self._served.feeds["cell"]
 
@@ -164,7 +168,7 @@ class Polite:
 
 @asynccontextmanager
 async def polite(served: Endpoint, device: Plant) -> AsyncIterator[Polite]:
-    """A polite client that has its first values."""
+    """Run a well-behaved client that has its first values."""
     await served.until(_good(served))
     first, second = served.subscribe("cell/step"), await served.subscriber("polite", "cell/step")
     assert await value(first) == "0"
@@ -176,8 +180,8 @@ async def polite(served: Endpoint, device: Plant) -> AsyncIterator[Polite]:
         second.cancel()
 
 
-def beside_a_polite_one(segment: Segment, test: Callable[[Endpoint, Polite], Awaitable[None]]) -> None:
-    """Run a test with a device that runs; nothing may be left of what it does."""
+def beside_a_polite_client(segment: Segment, test: Callable[[Endpoint, Polite], Awaitable[None]]) -> None:
+    """Run a test with a running device and a well-behaved client; nothing may be left of the test's clients."""
 
     async def run() -> None:
         async with endpoint(segment) as served, plant(served) as device, polite(served, device) as beside:
@@ -188,17 +192,17 @@ def beside_a_polite_one(segment: Segment, test: Callable[[Endpoint, Polite], Awa
 
 
 def connect(served: Endpoint) -> grpc.aio.Channel:
-    """A connection of its own."""
+    """Open a new connection."""
     return grpc.aio.insecure_channel(f"127.0.0.1:{served.port}", [("grpc.use_local_subchannel_pool", 1)])
 
 
 def begin(channel: grpc.aio.Channel, call: Call, timeout_s: float = TIMEOUT_S) -> Any:
-    """Open a call and send nothing; its messages are bytes."""
+    """Open a call without sending anything; its messages are bytes."""
     return channel.stream_stream(call.method)(timeout=timeout_s)
 
 
 async def status(stream: Any) -> grpc.StatusCode:
-    """How it ends, after all that still comes."""
+    """Drain a stream and return its status."""
     async with asyncio.timeout(TIMEOUT_S):
         try:
             while await stream.read() is not grpc.aio.EOF:

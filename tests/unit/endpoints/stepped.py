@@ -1,4 +1,4 @@
-"""Sources that live on the instance's clock: threads that publish a frame for each step, as models' processes do."""
+"""Sources on the instance's clock: threads that publish a frame for each step, as model processes do."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _FAR_NS = 10_000_000_000
 
 
 class Model:
-    """Counts steps; shows ``goal`` as ``reached`` a step after it was written."""
+    """A source that counts steps; ``reached`` follows ``goal`` one step after it was written."""
 
     def __init__(self, segment: Segment, source: str) -> None:
         self.image = bytearray(LAYOUT.size)
@@ -57,7 +57,7 @@ class Model:
             thread.start()
 
     def publish(self, cycle: int) -> None:
-        """Publish the image as it is."""
+        """Publish the current image."""
         quality = Quality.BAD if self.failure else Quality.GOOD
         self.output.publish(
             Image(bytes(self.image), cycle, time.time_ns(), quality, Provenance.SIMULATED, self.failure)
@@ -103,7 +103,7 @@ class Model:
 
 @contextmanager
 def stepped_segment(instance: str, *sources: str, virtual: bool = True) -> Iterator[Segment]:
-    """A segment whose sources are models; ``virtual``: time stands at 0."""
+    """Create a segment whose sources are models; ``virtual``: time starts stopped at 0."""
     attributes = Attributes("simulation", ("goal",), stepped=True)
     blocks = [BlockSpec(source, LAYOUT, 20_000_000, STALE_NS, 1 << 20, attributes) for source in sources]
     processes = [*(ProcessSpec(source, "source") for source in sources), ProcessSpec("grpc", "grpc")]
@@ -118,7 +118,7 @@ def simulate(
     *sources: str,
     virtual: bool = True,
 ) -> None:
-    """Serve models, by default one named ``sim``."""
+    """Run a test with served models, by default one named ``sim``."""
     with stepped_segment(instance, *(sources or ("sim",)), virtual=virtual) as segment:
         models = {source: Model(segment, source) for source in segment.blocks}
 

@@ -47,7 +47,7 @@ from tests.unit.endpoints.harness import (
         ("cell/inputs/1", "int"),
     ],
 )
-def test_get_topic_tells_the_type(segment: Segment, path: str, kind: str) -> None:
+def test_get_topic_returns_the_type(segment: Segment, path: str, kind: str) -> None:
     async def test(served: Endpoint) -> None:
         answer = await served.stub.GetTopic(wire.TopicDescriptor(path=path), timeout=TIMEOUT_S)
         assert (answer.path, answer.msgType) == (path, kind)
@@ -76,7 +76,7 @@ def test_a_structure_is_refused(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_subscriber_gets_the_current_value_then_every_change_and_nothing_else(segment: Segment) -> None:
+def test_a_subscriber_gets_the_current_value_then_every_change(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(position=0.1))
         stream = served.subscribe("cell/axis/position")
@@ -92,7 +92,7 @@ def test_a_subscriber_gets_the_current_value_then_every_change_and_nothing_else(
     serve(segment, test)
 
 
-def test_time_is_all_nanoseconds_since_the_start(segment: Segment) -> None:
+def test_the_nsec_field_has_all_nanoseconds_since_the_start(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image())
         frame = served.feeds["cell"].block.latest()
@@ -106,7 +106,7 @@ def test_time_is_all_nanoseconds_since_the_start(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_bits_and_arrays_and_their_elements(segment: Segment) -> None:
+def test_bits_arrays_and_elements(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(inputs=b"\x01\x02"))
         streams = [served.subscribe(path) for path in ("cell/running", "cell/inputs", "cell/inputs/1")]
@@ -119,7 +119,7 @@ def test_bits_and_arrays_and_their_elements(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_nothing_is_sent_while_bad_and_the_value_again_on_recovery(segment: Segment) -> None:
+def test_no_value_is_sent_while_bad_and_it_is_sent_again_on_recovery(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
         stream = served.subscribe("cell/step")
@@ -165,7 +165,7 @@ def test_health_follows_quality_and_age(soon_stale: Segment) -> None:
     serve(soon_stale, test)
 
 
-def test_a_value_that_went_stale_is_sent_again_when_frames_come_again(soon_stale: Segment) -> None:
+def test_a_stale_value_is_sent_again_when_frames_resume(soon_stale: Segment) -> None:
     async def test(served: Endpoint) -> None:
         serving, not_serving = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
         stream = served.subscribe("cell/step")
@@ -214,7 +214,7 @@ def test_reflection_names_the_services(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_stream_that_ends_leaves_nothing_at_the_feed(segment: Segment) -> None:
+def test_a_stream_that_ends_leaves_no_listener_at_the_feed(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
         streams = [served.subscribe("cell/step") for _ in range(3)]
@@ -230,7 +230,7 @@ def test_a_stream_that_ends_leaves_nothing_at_the_feed(segment: Segment) -> None
     serve(segment, test)
 
 
-def test_a_taken_address_is_refused_by_name(segment: Segment) -> None:
+def test_an_occupied_address_is_named_in_the_error(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         second = Server(served.service.calls)
         with pytest.raises(EndpointError, match=f"127.0.0.1:{served.port}"):
@@ -240,7 +240,7 @@ def test_a_taken_address_is_refused_by_name(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_tls_serves_those_who_trust_it(segment: Segment, tmp_path: Path) -> None:
+def test_tls_serves_clients_that_trust_the_certificate(segment: Segment, tmp_path: Path) -> None:
     authority = trustme.CA()
     server_cert, client_cert = authority.issue_cert("localhost"), authority.issue_cert("twin@example.org")
     server_cert.private_key_pem.write_to_path(tmp_path / "key.pem")
@@ -275,7 +275,7 @@ STEP = Subject("raw", "step", (LAYOUT.registers[4],), lambda picture: picture.im
 
 
 class Recorder:
-    """A listener that keeps what it gets."""
+    """A listener that records messages and losses."""
 
     def __init__(self) -> None:
         self.since = 0
@@ -293,13 +293,13 @@ class Recorder:
         self.lost += 1
 
 
-def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_never_changes(soon_stale: Segment) -> None:
+def test_a_subscriber_of_a_stale_source_gets_the_unchanged_value_when_frames_resume(soon_stale: Segment) -> None:
     async def test(served: Endpoint) -> None:
         feed = served.feeds["cell"]
         served.publish(image(step=7))
         frame = feed.block.latest()
         assert frame is not None
-        while not frame.age_ns(feed.block.now_ns()) > SOON_STALE_NS:  # noqa: ASYNC110  age is what is waited for
+        while not frame.age_ns(feed.block.now_ns()) > SOON_STALE_NS:  # noqa: ASYNC110  waits until the frame is stale
             await asyncio.sleep(0.01)
         late = Recorder()
         feed.listen(STEP, late)
@@ -316,7 +316,7 @@ def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_nev
     serve(soon_stale, test)
 
 
-def test_what_waits_is_dropped_when_the_source_turns_bad(segment: Segment) -> None:
+def test_queued_values_are_dropped_when_the_source_turns_bad(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         feed = served.feeds["cell"]
         served.publish(image(step=1))
@@ -340,7 +340,7 @@ def test_what_waits_is_dropped_when_the_source_turns_bad(segment: Segment) -> No
     serve(segment, test)
 
 
-def test_who_joins_around_a_change_of_quality_is_shown_no_past(segment: Segment) -> None:
+def test_a_subscriber_that_joins_around_a_change_of_quality_gets_no_old_values(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         feed = served.feeds["cell"]
         first = Recorder()

@@ -1,4 +1,4 @@
-"""Version 2's Inject, over real sockets: paths for originals and for values, and how long an injection stands."""
+"""Inject of version 2, over real sockets: the paths of originals and values, and when an injection ends."""
 
 from __future__ import annotations
 
@@ -28,14 +28,16 @@ Status = grpc.StatusCode
 
 
 async def shadow(served: Endpoint, target: str, prefix: str = "shadow/test 1", stub: Any = None) -> tuple[str, str]:
-    """The paths to give values to, and where originals come from."""
+    """Inject; return the path for values and the path of the originals."""
     asked = v2.InjectRequest(targetPath=target, shadowPathPrefix=prefix)
     answer = await (stub or served.v2).Inject(asked, timeout=TIMEOUT_S)
     return answer.shadowPathIn, answer.shadowPathOut
 
 
 async def reaches(served: Endpoint, device: Plant, step: bytes) -> None:
-    """Write is answered when the source has accepted; the device has the value a cycle later."""
+    """Wait until the device has the value.
+
+    Write returns when the source has accepted it; the device gets it a cycle later."""
 
     async def condition() -> bool:
         return device.memory[12:14] == step
@@ -55,8 +57,8 @@ async def info(served: Endpoint, path: str) -> tuple[int, int, bool]:
     return found.type, found.direction, found.exists
 
 
-def test_a_client_that_injects_as_clients_do(segment: Segment) -> None:
-    """The calls of the wire contract, in their order."""
+def test_a_typical_injecting_client(segment: Segment) -> None:
+    """The calls of the wire contract, in order."""
 
     async def test(served: Endpoint, device: Plant) -> None:
         published: Any = served.v2.Publish(timeout=TIMEOUT_S)
@@ -92,7 +94,7 @@ def test_consumers_get_the_values_and_the_injector_the_originals(segment: Segmen
         stream = await served.subscriber("injector")
         path_in, path_out = await shadow(served, "cell/axis/position/out")
         await served.add("injector", path_out)
-        assert await message(stream) == (path_out, 0), "the present value first"
+        assert await message(stream) == (path_out, 0), "the current value first"
         await write(served, path_in, 1.5)
         assert await message(consumer) == ("cell/axis/position", 1.5)
         await write(served, "cell/axis/position", 2.5)
@@ -109,7 +111,7 @@ def test_consumers_get_the_values_and_the_injector_the_originals(segment: Segmen
     with_plant(segment, test)
 
 
-def test_one_prefix_serves_many_targets_and_their_paths_are_unique(segment: Segment) -> None:
+def test_one_prefix_gives_unique_paths_for_many_targets(segment: Segment) -> None:
     targets = [
         "cell/step/in",
         "cell/step/out",
@@ -124,7 +126,9 @@ def test_one_prefix_serves_many_targets_and_their_paths_are_unique(segment: Segm
         found = [await shadow(served, target, "a/b") for target in targets]
         found.append(await shadow(served, "cell/step/in", "a"))
         assert len({path for pair in found for path in pair}) == 2 * len(found)
-        assert await shadow(served, "STEP/in".lower(), "SIMLOG://a//b/") == found[0], "the same again joins"
+        assert await shadow(served, "STEP/in".lower(), "SIMLOG://a//b/") == found[0], (
+            "an equal request joins the injection"
+        )
         assert len(standing(served)) == len(found)
 
     with_plant(segment, test)
@@ -171,7 +175,7 @@ def test_structures_and_arrays(segment: Segment) -> None:
         ("cell/axis/in", "p" * 1025, Status.INVALID_ARGUMENT, "printable"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(
+def test_invalid_injections_are_refused_with_the_reason(
     segment: Segment, target: str, prefix: str, status: Status, reason: str
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
@@ -182,7 +186,7 @@ def test_what_cannot_be_is_refused_by_name(
     with_plant(segment, test)
 
 
-def test_a_client_without_a_stream_holds_it_by_its_connection(segment: Segment) -> None:
+def test_without_a_stream_the_injection_lasts_as_long_as_the_connection(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         async with grpc.aio.insecure_channel(
             f"127.0.0.1:{served.port}", options=[("grpc.use_local_subchannel_pool", 1)]
@@ -190,7 +194,7 @@ def test_a_client_without_a_stream_holds_it_by_its_connection(segment: Segment) 
             stub = SimlogV2Stub(channel)  # type: ignore[no-untyped-call]
             path_in, _ = await shadow(served, "cell/step/in", stub=stub)
             looked = asyncio.get_running_loop().time() + 1.0
-            while asyncio.get_running_loop().time() < looked:  # several looks later it still stands
+            while asyncio.get_running_loop().time() < looked:  # several checks later it still exists
                 await stub.Write(request(path_in, 5), timeout=TIMEOUT_S)
             assert len(standing(served)) == 1
         await lifted(served)
@@ -198,7 +202,7 @@ def test_a_client_without_a_stream_holds_it_by_its_connection(segment: Segment) 
     with_plant(segment, test)
 
 
-def test_whose_connection_cannot_be_seen_has_a_while_to_subscribe(
+def test_a_client_whose_connection_is_invisible_must_subscribe_in_time(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.services.injection.connected", frozenset)
@@ -222,7 +226,7 @@ def test_whose_connection_cannot_be_seen_has_a_while_to_subscribe(
     with_plant(segment, test)
 
 
-def test_the_last_subscriber_lifts_it(segment: Segment) -> None:
+def test_the_injection_is_lifted_when_its_last_subscriber_leaves(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         first, second = await served.subscriber("first"), await served.subscriber("second")
         _, path_out = await shadow(served, "cell/step/in")
@@ -231,7 +235,7 @@ def test_the_last_subscriber_lifts_it(segment: Segment) -> None:
         first.cancel()
         await write(served, "cell/step", 3)
         assert await message(second) == (path_out, 3)
-        again = await served.subscriber("second")  # takes over: topics end with the stream before
+        again = await served.subscriber("second")  # replaces the earlier stream, whose topics end
         await lifted(served)
         again_in, again_out = await shadow(served, "cell/step/in")
         assert again_out == path_out
@@ -247,7 +251,7 @@ def test_the_last_subscriber_lifts_it(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_a_subscription_can_be_made_again_after_a_lift_by_somebody_else(segment: Segment) -> None:
+def test_a_client_can_inject_and_subscribe_again_after_another_lifted_it(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         stream = await served.subscriber("injector", "cell/running")
         assert await message(stream) == ("cell/running", False)
@@ -260,15 +264,13 @@ def test_a_subscription_can_be_made_again_after_a_lift_by_somebody_else(segment:
             injection.end("a test")
             await lifted(served)
         await write(served, "cell/running", True)
-        assert await message(stream) == ("cell/running", True), "the stream goes on"
+        assert await message(stream) == ("cell/running", True), "the stream continues"
         stream.cancel()
 
     with_plant(segment, test)
 
 
-def test_a_subscriber_that_does_not_read_loses_its_injections(
-    segment: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_subscriber_that_does_not_read_loses_its_injection(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.streams.outbox.EVENT_BOUND", 20)
 
     async def test(served: Endpoint, device: Plant) -> None:
@@ -327,7 +329,7 @@ sys.stdin.read()
 
 
 @pytest.mark.parametrize("subscribed", ["", "subscribed"])
-def test_a_killed_client_leaves_no_shadow(segment: Segment, subscribed: str) -> None:
+def test_a_killed_clients_injection_is_lifted(segment: Segment, subscribed: str) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         pipe = asyncio.subprocess.PIPE
         client = await asyncio.create_subprocess_exec(
@@ -354,7 +356,7 @@ def test_a_killed_client_leaves_no_shadow(segment: Segment, subscribed: str) -> 
     with_plant(segment, test)
 
 
-def test_the_other_end_of_a_connection_is_seen_while_it_stands() -> None:
+def test_the_peer_of_an_open_connection_is_found() -> None:
     async def test() -> None:
         accepted: list[asyncio.StreamWriter] = []
         server = await asyncio.start_server(lambda _, writer: accepted.append(writer), "127.0.0.1", 0)
@@ -378,11 +380,11 @@ def test_the_other_end_of_a_connection_is_seen_while_it_stands() -> None:
 
 
 @pytest.mark.parametrize("text", ["unix:", "unix:/tmp/x", "", "ipv4:300.0.0.1:5", "ipv6:::1", "ipv4:1.2.3.4:99999999"])
-def test_a_peer_that_is_none_of_tcp_cannot_be_seen(text: str) -> None:
+def test_a_peer_without_a_tcp_address_is_not_found(text: str) -> None:
     assert peer_of(text) is None
 
 
-def test_counters_count_what_an_injector_writes(segment: Segment) -> None:
+def test_values_of_an_injector_are_counted(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         path_in, _ = await shadow(served, "cell/step/out")
         await write(served, path_in, 1)
@@ -392,7 +394,7 @@ def test_counters_count_what_an_injector_writes(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_a_reload_ends_what_lies_over_the_sources_it_changes(segment: Segment) -> None:
+def test_a_reload_ends_the_injections_of_changed_sources(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         stream = await served.subscriber("injector")
         originals = await laid(served, "cell/running/in", "s")
@@ -409,7 +411,7 @@ def test_a_reload_ends_what_lies_over_the_sources_it_changes(segment: Segment) -
     with_plant(segment, test)
 
 
-def test_in_virtual_time_originals_come_with_their_step_and_before_its_marker(instance: str) -> None:
+def test_in_virtual_time_originals_come_before_the_marker_of_their_step(instance: str) -> None:
     async def test(served: Endpoint, models: dict[str, Model]) -> None:
         stream = await served.subscriber("injector", "SIMLOG://step", "sim/count")
         assert await message(stream) == ("sim/count", 0)
@@ -420,7 +422,7 @@ def test_in_virtual_time_originals_come_with_their_step_and_before_its_marker(in
         assert await message(stream) == (count_out, 0)
         await write(served, count_in, 100)
         await write(served, "sim/goal", 5)
-        assert await message(stream) == (goal_out, 5), "what is written comes at once"
+        assert await message(stream) == (goal_out, 5), "writes are sent at once"
         await write(served, goal_in, 6)
         for number in (1, 2):
             await served.time.step(sim.StepRequest(), timeout=TIMEOUT_S)

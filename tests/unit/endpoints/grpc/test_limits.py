@@ -1,4 +1,4 @@
-"""The limits are those of the page on them."""
+"""The limits equal those documented on the page about them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_limit_is_as_documented(what: str, limit: float) -> None:
     assert {name: int(number) for name, number, _ in ROW.findall(PAGE.read_text())}[what] == limit
 
 
-def test_a_client_of_ours_does_not_ask_too_often_whether_the_endpoint_lives() -> None:
-    """Else gRPC ends the connection of one whose streams rest, after a minute or two."""
+def test_the_clients_keepalive_interval_is_allowed_by_the_server() -> None:
+    """gRPC would end the connection of a client with idle streams after a minute or two."""
     allowed_ms = dict(server.OPTIONS)["grpc.http2.min_ping_interval_without_data_ms"]
     assert allowed_ms < dict(calls.OPTIONS)["grpc.keepalive_time_ms"]

@@ -28,7 +28,7 @@ from tests.unit.endpoints.harness import TIMEOUT_S
 STREAMS = 20
 
 
-def test_no_call_begins_between_new_feeds_and_the_move_of_the_calls() -> None:
+def test_no_call_starts_between_new_feeds_and_the_move_of_open_calls() -> None:
     done: list[str] = []
 
     class ReloadedFeeds:
@@ -49,8 +49,10 @@ def test_no_call_begins_between_new_feeds_and_the_move_of_the_calls() -> None:
     assert done == ["feeds", "move ['cell']", "call"]
 
 
-def test_it_beats_while_layouts_are_read(segment: Segment, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else a reload with several big ones would look like a hang, and the endpoint would be killed."""
+def test_the_heartbeat_continues_while_layouts_are_read(
+    segment: Segment, instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a heartbeat, a reload of large layouts would look like a hang, and the endpoint would be killed."""
     begun, going_on = threading.Event(), threading.Event()
     stops: list[Callable[[], object]] = []
     beats: list[object] = []
@@ -88,7 +90,7 @@ def test_it_beats_while_layouts_are_read(segment: Segment, instance: str, monkey
 def test_a_stop_with_open_streams_leaves_no_traceback(
     segment: Segment, instance: str, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Streams of both versions, and a client that has not finished publishing."""
+    """The streams are of both versions, and one client is still publishing."""
     stops: list[Callable[[], object]] = []
     ends: queue.SimpleQueue[grpc.StatusCode] = queue.SimpleQueue()
     over = threading.Event()
@@ -142,7 +144,7 @@ def test_a_stop_with_open_streams_leaves_no_traceback(
 
 
 class Turn(asyncio.Lock):
-    """A lock that tells when somebody has to wait for it."""
+    """A lock that signals when a task has to wait for it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -154,8 +156,8 @@ class Turn(asyncio.Lock):
         return await super().acquire()
 
 
-def test_of_two_reloads_the_later_one_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though the first is still being read when the second comes: a token that is gone must not come back."""
+def test_of_two_concurrent_reloads_the_later_one_applies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first reload is still reading its file when the second starts; a removed token must not return."""
     begun, going_on = threading.Event(), threading.Event()
     numbers = itertools.count()
     taken: list[int] = []
@@ -176,7 +178,7 @@ def test_of_two_reloads_the_later_one_counts(monkeypatch: pytest.MonkeyPatch) ->
         assert await asyncio.to_thread(begun.wait, TIMEOUT_S)
         second = asyncio.create_task(_take_anew(worker, Path("x"), listeners, server, turn))
         waits = asyncio.create_task(turn.waited_for.wait())
-        await asyncio.wait((second, waits), return_when=asyncio.FIRST_COMPLETED)  # it is over, if it need not wait
+        await asyncio.wait((second, waits), return_when=asyncio.FIRST_COMPLETED)  # without the lock it would be done
         going_on.set()
         await asyncio.gather(first, second)
         waits.cancel()

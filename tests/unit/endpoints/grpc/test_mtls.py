@@ -1,4 +1,4 @@
-"""With ``client_ca``, nobody without a valid certificate of that authority gets as far as a call."""
+"""With ``client_ca``, a client without a valid certificate of that authority cannot make a call."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Certificate = trustme.LeafCert | None
 
 
 class Party:
-    """The endpoint's authorities, and clients that want to get past them."""
+    """The endpoint's certificate authorities, and clients with certificates of several kinds."""
 
     def __init__(self, folder: Path) -> None:
         self.server, self.clients = trustme.CA(), trustme.CA()
@@ -41,7 +41,7 @@ class Party:
 
     @asynccontextmanager
     async def channel(self, port: int, own: Certificate) -> AsyncIterator[grpc.aio.Channel]:
-        """One that shows this certificate."""
+        """Open a channel that presents this certificate."""
         parts = () if own is None else (own.private_key_pem.bytes(), b"".join(p.bytes() for p in own.cert_chain_pems))
         credentials = grpc.ssl_channel_credentials(self.server.cert_pem.bytes(), *parts)
         options = [("grpc.use_local_subchannel_pool", 1)]
@@ -49,7 +49,7 @@ class Party:
             yield channel
 
     async def known(self, port: int) -> bool:
-        """Whether a client with a good certificate is served."""
+        """Return whether a client with a valid certificate is served."""
         async with self.channel(port, self.clients.issue_cert("twin@example.org")) as channel:
             stub: Any = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
             answer = await stub.GetTopic(TopicDescriptor(path="cell/step"), timeout=TIMEOUT_S)
@@ -68,7 +68,7 @@ INTRUDERS: dict[str, Callable[[Party], Certificate]] = {
 
 
 @pytest.mark.parametrize("intruder", INTRUDERS)
-def test_who_has_no_good_certificate_gets_nowhere(
+def test_a_client_without_a_valid_certificate_cannot_make_calls(
     segment: Segment, tmp_path: Path, intruder: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     party = Party(tmp_path)
@@ -90,14 +90,14 @@ def test_who_has_no_good_certificate_gets_nowhere(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_handshakes_without_a_certificate_and_broken_off_ones_harm_nobody(segment: Segment, tmp_path: Path) -> None:
+def test_failed_handshakes_do_not_disturb_other_clients(segment: Segment, tmp_path: Path) -> None:
     party = Party(tmp_path)
     context = ssl.create_default_context()
     context.set_alpn_protocols(["h2"])
     party.server.configure_trust(context)
 
     def break_off(port: int) -> None:
-        """A part of a handshake, then nothing, or a reset."""
+        """Send part of a handshake, then end or reset the connection."""
         for number in range(20):
             with socket.create_connection(("localhost", port)) as connection:
                 connection.sendall(b"\x16\x03\x01\x02\0\x01\0\x01\xfc\x03\x03"[: 1 + number % 11])
@@ -108,7 +108,7 @@ def test_handshakes_without_a_certificate_and_broken_off_ones_harm_nobody(segmen
         flood = Flood()
         with flood.upon(("localhost", port), context):
             async with asyncio.timeout(TIMEOUT_S):
-                while flood.lost < 20:  # noqa: ASYNC110  it is another thread's doing
+                while flood.lost < 20:  # noqa: ASYNC110  another thread changes it
                     await asyncio.sleep(0.01)
             await asyncio.to_thread(break_off, port)
             assert await party.known(port)

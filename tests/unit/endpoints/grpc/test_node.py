@@ -1,4 +1,4 @@
-"""Both versions as clients on another gRPC stack see them: that of Node, which shares no line with Python's."""
+"""Both versions with clients on Node's gRPC stack, which shares no code with Python's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shmio.segment import Segment
 from tests.unit.endpoints.grpc.services.test_publish import counted, with_plant
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint
 from tests.unit.endpoints.plant import Plant
-from tests.unit.endpoints.rude import CALLS, Polite, beside_a_polite_one
+from tests.unit.endpoints.rude import CALLS, Polite, beside_a_polite_client
 
 HERE = Path(__file__).parents[1] / "node"
 PROTO = Path(__file__).parents[4] / "proto"
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node
 
 @pytest.fixture(autouse=True)
 def packages() -> None:
-    assert (HERE / "node_modules").exists(), f"its packages are not installed: npm ci --prefix {HERE}"
+    assert (HERE / "node_modules").exists(), f"packages for Node are not installed: run npm ci --prefix {HERE}"
 
 
 async def started(script: str, port: int, *arguments: str | Path) -> asyncio.subprocess.Process:
@@ -48,7 +48,7 @@ async def run(script: str, port: int, *arguments: str | Path, given: bytes = b""
     return json.loads(out)
 
 
-def test_a_client_of_version_2_calls_as_clients_do(segment: Segment) -> None:
+def test_a_typical_session_of_version_2(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         before_s = served.segment.clock_ns(0) / 1e9
         found = await run("client.js", served.port, PROTO / "simlog_v2.proto")
@@ -74,12 +74,12 @@ def test_a_client_of_version_2_calls_as_clients_do(segment: Segment) -> None:
         assert found["shadow"] == [["NUMBER", "IN"], ["NUMBER", "OUT"]]
         assert found["replaced"] == "ABORTED"
         assert found["again"]["value"] == 20
-        assert counted(served)[1] == 3  # of which one was published
+        assert counted(served)[1] == 3  # one of them was published
 
     with_plant(segment, test)
 
 
-def test_a_client_of_version_1_calls_as_clients_do(segment: Segment) -> None:
+def test_a_typical_session_of_version_1(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         found = await run("client_v1.js", served.port, PROTO / "simlog_v1.proto")
         assert found["topic"] == {"path": "axis/position/in", "msgType": "double"}
@@ -93,7 +93,7 @@ def test_a_client_of_version_1_calls_as_clients_do(segment: Segment) -> None:
         assert (found["original"]["value"], found["injected"]["value"]) == ("2.5", "3.5")
         assert (found["taken"], found["lifted"]) == ("ALREADY_EXISTS", "CANCELLED")
         published, refused = counted(served)
-        assert published >= 5, "the last value until the injection was lifted"
+        assert published >= 5, "the last value before the injection was lifted"
         assert refused == 2
 
     with_plant(segment, test)
@@ -116,7 +116,9 @@ def given(calls: Any) -> bytes:
         ("oversize", "RESOURCE_EXHAUSTED", "RESOURCE_EXHAUSTED", "RESOURCE_EXHAUSTED"),
     ],
 )
-def test_rude_clients_leave_nothing(segment: Segment, act: str, unary: Any, stream: Any, publish: Any) -> None:
+def test_misbehaving_clients_leave_nothing_behind(
+    segment: Segment, act: str, unary: Any, stream: Any, publish: Any
+) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         for call, told in zip(CALLS, await run("rude.js", served.port, act, given=given(CALLS)), strict=True):
             expected = publish if call.many and not call.first else stream if call.stays else unary
@@ -124,15 +126,15 @@ def test_rude_clients_leave_nothing(segment: Segment, act: str, unary: Any, stre
             assert told in [call.ends.name if name == "OK" else name for name in allowed], call.method
             await polite.goes_on()
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
-def test_a_client_that_is_killed_in_the_middle_of_all_calls_leaves_nothing(segment: Segment) -> None:
+def test_a_client_killed_with_all_calls_open_leaves_nothing_behind(segment: Segment) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         process = await started("rude.js", served.port, "hold")
         assert process.stdin is not None
         assert process.stdout is not None
-        calls = [call for call in CALLS if not call.method.endswith("LiftAll")]  # ends others
+        calls = [call for call in CALLS if not call.method.endswith("LiftAll")]  # LiftAll would end the others
         process.stdin.write(given(calls))
         process.stdin.write_eof()
         try:
@@ -149,4 +151,4 @@ def test_a_client_that_is_killed_in_the_middle_of_all_calls_leaves_nothing(segme
             process.kill()
             await process.wait()
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)

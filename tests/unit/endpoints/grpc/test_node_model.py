@@ -1,4 +1,4 @@
-"""A model in another language: it computes a source for Node, whose gRPC shares no line with Python's."""
+"""A model in JavaScript computes a source, on Node's gRPC stack, which shares no code with Python's."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ PROTO = Path(__file__).parents[4] / "proto/shmio_v1.proto"
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
-def test_a_model_of_node_takes_part_in_steps(instance: str) -> None:
-    assert (HERE / "node_modules").exists(), f"its packages are not installed: npm ci --prefix {HERE}"
+def test_a_model_in_node_computes_a_source(instance: str) -> None:
+    assert (HERE / "node_modules").exists(), f"packages for Node are not installed: run npm ci --prefix {HERE}"
 
     async def test(served: Endpoint, drive: Running) -> None:
         pipe = asyncio.subprocess.PIPE

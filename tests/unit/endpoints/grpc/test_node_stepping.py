@@ -1,4 +1,4 @@
-"""Time as it is driven by a client on another gRPC stack, that of Node: the call sequences of both generations."""
+"""Time control of both generations with a client on Node's gRPC stack."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ async def run(port: int) -> dict[str, Any]:
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
-def test_a_client_of_node_drives_time_as_clients_do(instance: str) -> None:
-    assert (HERE / "node_modules").exists(), f"its packages are not installed: npm ci --prefix {HERE}"
+def test_a_client_in_node_controls_time(instance: str) -> None:
+    assert (HERE / "node_modules").exists(), f"packages for Node are not installed: run npm ci --prefix {HERE}"
 
     async def test(served: Endpoint, models: dict[str, Model]) -> None:
         found = await run(served.port)
         assert found["setStepSize"] == {}
         assert found["codes"] == [0] * STEPS
-        assert found["goal"] == found["expected"], "what was published before a step is in it"
+        assert found["goal"] == found["expected"], "a step applies the values published before it"
         assert found["clock"] == [["timeStamp", 20_000_000 * number] for number in range(STEPS + 1)]
         begun_ms = 20 * STEPS
         assert found["stream"] == [

@@ -1,4 +1,4 @@
-"""Clients that break off, stop half-way, send rubbish or never read: nothing of them stays, and others go on."""
+"""Clients that disconnect, stop half-way, send garbage or never read: they leave nothing, and others continue."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.unit.endpoints.rude import (
     Call,
     Polite,
     begin,
-    beside_a_polite_one,
+    beside_a_polite_client,
     connect,
     status,
 )
@@ -48,7 +48,7 @@ async def until_calls(served: Endpoint, count: int) -> None:
 
 @pytest.mark.parametrize("reset", [False, True], ids=["end", "reset"])
 @pytest.mark.parametrize("stage", ["headers", "part of the prefix", "part of the message", "message", "half-close"])
-def test_connections_break_in_the_middle_of_each_call(segment: Segment, stage: str, reset: bool) -> None:
+def test_connections_break_at_each_stage_of_each_call(segment: Segment, stage: str, reset: bool) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         for call in CALLS:
             whole = http2.message(call.request)
@@ -57,24 +57,24 @@ def test_connections_break_in_the_middle_of_each_call(segment: Segment, stage: s
             await connection.send(http2.headers(call.method))
             end = http2.END_STREAM if stage == "half-close" else 0
             if sent:
-                # A frame that promises more than comes is a frame broken off; a whole one may be part of a message.
+                # An incomplete frame is discarded as a whole; a complete frame may hold part of a message.
                 await connection.send(http2.frame(http2.DATA, end, 1, whole[:sent]))
             if sent < len(whole) or (call.stays and not end):
                 await until_calls(served, 3)
             else:
                 async with asyncio.timeout(TIMEOUT_S):
-                    await connection.reader.read(1)  # it has begun to answer, or acknowledged our settings
+                    await connection.reader.read(1)  # the server has started to answer, or acknowledged our settings
             await connection.drop(reset=reset)
             await polite.alone()
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
 @pytest.mark.parametrize(
     "data",
     [b"", b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01\0\xff" * 50, http2.PREFACE[:10], http2.PREFACE + b"\xff" * 500],
 )
-def test_what_is_no_http2_harms_nobody(segment: Segment, data: bytes) -> None:
+def test_bytes_that_are_not_http2_do_not_disturb_others(segment: Segment, data: bytes) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
         writer.write(data)
@@ -85,10 +85,10 @@ def test_what_is_no_http2_harms_nobody(segment: Segment, data: bytes) -> None:
         writer.close()
         await polite.goes_on()
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
-def test_calls_are_cancelled_before_during_and_after_their_message(segment: Segment) -> None:
+def test_calls_cancelled_before_during_and_after_their_message(segment: Segment) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         async with connect(served) as channel:
             for call in CALLS:
@@ -105,10 +105,10 @@ def test_calls_are_cancelled_before_during_and_after_their_message(segment: Segm
                 answered.cancel()
                 await polite.alone()
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
-def test_half_closed_calls_end_by_themselves_or_go_on(segment: Segment) -> None:
+def test_half_closed_calls_end_or_continue_as_specified(segment: Segment) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         async with connect(served) as channel:
             for call in CALLS:
@@ -126,10 +126,10 @@ def test_half_closed_calls_end_by_themselves_or_go_on(segment: Segment) -> None:
                     assert await status(whole) is call.ends, call.method
                 await polite.alone(connected=True)
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
-def test_deadlines_pass(segment: Segment) -> None:
+def test_calls_end_at_their_deadline(segment: Segment) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         async with connect(served) as channel:
             for call in CALLS:
@@ -141,11 +141,11 @@ def test_deadlines_pass(segment: Segment) -> None:
                     assert await status(late) is Status.DEADLINE_EXCEEDED
                 await polite.alone()
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
 @pytest.mark.parametrize("size", [9, MAX_REQUEST_BYTES + 1], ids=["garbage", "oversize"])
-def test_bytes_that_are_no_message_end_their_call_alone(segment: Segment, size: int) -> None:
+def test_undecodable_bytes_end_only_their_call(segment: Segment, size: int) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         refused = 0
         async with connect(served) as channel:
@@ -156,7 +156,7 @@ def test_bytes_that_are_no_message_end_their_call_alone(segment: Segment, size: 
                 told = await status(stream)
                 if size > MAX_REQUEST_BYTES:
                     assert told is Status.RESOURCE_EXHAUSTED, call.method
-                elif call.method.endswith("Publish"):  # what is wrong with a message does not end the stream
+                elif call.method.endswith("Publish"):  # an invalid message does not end the stream
                     assert told is Status.OK
                     refused += 1
                 else:
@@ -164,7 +164,7 @@ def test_bytes_that_are_no_message_end_their_call_alone(segment: Segment, size: 
                 await polite.alone()
         assert served.service.counters[3] == refused
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -179,7 +179,7 @@ def test_a_subscriber_that_never_reads_costs_a_bounded_queue(segment: Segment, v
         if version == 2:
             await served.add("deaf", "cell/long")
         before = served.service.counters[1]
-        for number in range(600):  # what fits into its connection, and then what waits, and more
+        for number in range(600):  # fills its connection, then its queue, and more
             polite.device.memory[30:32] = number.to_bytes(2, "big")
             await polite.goes_on()
             if served.service.counters[1] > before:
@@ -188,10 +188,10 @@ def test_a_subscriber_that_never_reads_costs_a_bounded_queue(segment: Segment, v
         assert 0 < served.service.waiting_bytes < BOUND_BYTES
         await connection.drop(reset=True)
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
-def test_a_watcher_of_health_that_never_reads_holds_nobody_up(segment: Segment) -> None:
+def test_a_health_watcher_that_never_reads_delays_no_other(segment: Segment) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         connection = await http2.Connection.open(served.port)
         watch = next(call for call in CALLS if call.method == HEALTH + "Watch")
@@ -203,7 +203,7 @@ def test_a_watcher_of_health_that_never_reads_holds_nobody_up(segment: Segment) 
         assert await served.health("source.cell") == 2
         await connection.drop(reset=True)
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
 def test_a_thousand_subscriptions_on_one_stream(segment: Segment) -> None:
@@ -218,7 +218,7 @@ def test_a_thousand_subscriptions_on_one_stream(segment: Segment) -> None:
         await polite.goes_on()
         stream.cancel()
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
 def test_a_thousand_streams_on_one_connection(segment: Segment) -> None:
@@ -234,10 +234,10 @@ def test_a_thousand_streams_on_one_connection(segment: Segment) -> None:
             assert {await value(stream) for stream in streams} == {"1"}
             await polite.goes_on()
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
-def test_fifty_that_come_and_go_are_not_noticed(segment: Segment) -> None:
+def test_fifty_short_lived_clients_do_not_disturb_others(segment: Segment) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         over = asyncio.Event()
 
@@ -256,7 +256,7 @@ def test_fifty_that_come_and_go_are_not_noticed(segment: Segment) -> None:
                     if (number + turn) % 3 == 0:
                         stream.cancel()
                     elif (number + turn) % 3 == 1:
-                        await create.done_writing()  # and else the connection goes away with both
+                        await create.done_writing()  # in the remaining case the connection closes with both calls
 
         async def read() -> int:
             count = 0
@@ -270,11 +270,11 @@ def test_fifty_that_come_and_go_are_not_noticed(segment: Segment) -> None:
         over.set()
         assert await reading > 0
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
 @pytest.mark.parametrize("direction", ["", "/in"])
-def test_streams_of_ours_beyond_the_most_are_refused_and_leave_room_again(segment: Segment, direction: str) -> None:
+def test_shmio_v1_streams_beyond_the_limit_are_refused_until_others_end(segment: Segment, direction: str) -> None:
     request = ours.SubscribeRequest(patterns=[f"cell/long{direction}"]).SerializeToString()
 
     async def test(served: Endpoint, polite: Polite) -> None:
@@ -291,11 +291,11 @@ def test_streams_of_ours_beyond_the_most_are_refused_and_leave_room_again(segmen
             subscribe = channel.unary_stream(OURS + "Subscribe")
             assert await first(subscribe(request, timeout=TIMEOUT_S)) is not grpc.aio.EOF
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)
 
 
 async def first(stream: Any) -> Any:
-    """The first message; EOF of one that is refused."""
+    """Return the first message; EOF if the stream is refused."""
     try:
         return await stream.read()
     except grpc.aio.AioRpcError:
@@ -310,8 +310,8 @@ async def until_streams(served: Endpoint, count: int) -> None:
     await served.until(reached)
 
 
-def test_a_subscriber_of_ours_that_never_reads_holds_nobody_up(segment: Segment) -> None:
-    """Nor is anything kept for it but its place, and what was written, up to a bound."""
+def test_a_shmio_v1_subscriber_that_never_reads_delays_no_other(segment: Segment) -> None:
+    """For this client the endpoint keeps only its position, and writes up to a bound."""
     both = ours.SubscribeRequest(patterns=["cell/long", "cell/long/in"], mode=ours.MODE_EVERY_FRAME)
 
     async def test(served: Endpoint, polite: Polite) -> None:
@@ -327,18 +327,18 @@ def test_a_subscriber_of_ours_that_never_reads_holds_nobody_up(segment: Segment)
                 await write(put, timeout=TIMEOUT_S)
                 if not served.feeds["cell"].commands.followers.busy:
                     break
-        assert not served.feeds["cell"].commands.followers.busy, "it was given up"
+        assert not served.feeds["cell"].commands.followers.busy, "its stream was ended"
         await polite.goes_on()
         await connection.drop(reset=True)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(outbox, "MAX_WAITING", 64)
-        beside_a_polite_one(segment, test)
+        beside_a_polite_client(segment, test)
 
 
 @pytest.mark.parametrize("call", ["Inject", "Declare"])
-def test_who_does_not_read_what_is_told_of_an_injection_loses_it(segment: Segment, call: str) -> None:
-    """Though its stream itself waits for it, and so long as its connection stands."""
+def test_a_client_that_does_not_read_its_injections_events_loses_it(segment: Segment, call: str) -> None:
+    """The stream itself would wait for the client, as long as the connection exists."""
     lay = ours.InjectRequest(lay=ours.Lay(patterns=["cell/inputs/in"]))
     request: Any = lay if call == "Inject" else ours.DeclareRequest(declarations=[NOISE])
     put = ours.WriteRequest(values=[ours.Assignment(path="cell/inputs/0", value=ours.Value(integer=1))])
@@ -361,7 +361,7 @@ def test_who_does_not_read_what_is_told_of_an_injection_loses_it(segment: Segmen
                 if call == "Inject":
                     await write(put.SerializeToString(), timeout=TIMEOUT_S)
                 else:
-                    await polite.goes_on()  # a step that is odd, then one that is even
+                    await polite.goes_on()  # one odd and one even step
                 if not standing.read():
                     break
         assert not standing.read()
@@ -369,10 +369,10 @@ def test_who_does_not_read_what_is_told_of_an_injection_loses_it(segment: Segmen
 
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(outbox, "MAX_WAITING", 16)
-        beside_a_polite_one(segment, test)
+        beside_a_polite_client(segment, test)
 
 
-def test_unknown_topics_and_values_that_do_not_parse(segment: Segment) -> None:
+def test_unknown_topics_and_invalid_values_are_refused(segment: Segment) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         wrong = "cell/nothing/in"
         nothing = v1.TopicDescriptor(path=wrong)
@@ -421,4 +421,4 @@ def test_unknown_topics_and_values_that_do_not_parse(segment: Segment) -> None:
             assert await ends(OURS + "LiftAll", ours.LiftAllRequest(sources=["nobody"])) is Status.NOT_FOUND
         assert served.service.counters[2:] == (0, len(puts) + 6)
 
-    beside_a_polite_one(segment, test)
+    beside_a_polite_client(segment, test)

@@ -1,4 +1,4 @@
-"""Time driven by clients: what comes of a step on every stream, in which order, and when the call returns."""
+"""Time controlled by clients: what streams receive of a step, in which order, and when the call returns."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ GOAL = v1.TopicDescriptor(path="sim/goal/in")
 
 
 async def step(served: Endpoint) -> int:
-    """Version 1's step; its code."""
+    """Step by version 1; return the answer's code."""
     answer = await served.stub.step(v1.StepRequest(), timeout=TIMEOUT_S)
     return int(answer.code)
 
@@ -51,12 +51,12 @@ def prefixed(request: v1.PubRequest) -> bytes:
 
 
 async def drained(stream: Any) -> None:
-    """Read all that comes."""
+    """Read the stream to its end."""
     while await asyncio.wait_for(stream.read(), TIMEOUT_S) is not grpc.aio.EOF:
         pass
 
 
-def test_version_1_steps_by_what_was_set(instance: str) -> None:
+def test_version_1_steps_by_the_size_that_was_set(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         clock, count = await open_v1(served, "/model/clock"), await open_v1(served, "sim/count/out")
         await served.stub.setStepSize(v1.StepSizeRequest(step=20), timeout=TIMEOUT_S)
@@ -73,7 +73,7 @@ def test_version_1_steps_by_what_was_set(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_a_step_is_50_ms_unless_it_was_set_and_all_of_its_nanoseconds_are_told(instance: str) -> None:
+def test_a_step_is_50_ms_by_default_and_is_reported_in_nanoseconds(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         assert await step(served) == 0
         assert served.segment.clock.read().time_ns == 50 * MS
@@ -103,7 +103,7 @@ def test_every_value_of_a_step_comes_before_its_one_marker(instance: str) -> Non
         for number in range(1, 4):
             status = await served.time.step(sim.StepRequest(), timeout=TIMEOUT_S)
             assert (status.clock, status.deltaTime, status.alive, status.playing) == (50 * number, 50, True, False)
-            assert await messages(stream, 5) == [  # in the order of the blocks, whatever was subscribed first
+            assert await messages(stream, 5) == [  # in the order of the blocks, not of the subscriptions
                 ("SIM://count", number),
                 ("SIM://doubled/out", 2 * number),
                 ("sim/row/2", number + 1),
@@ -114,8 +114,8 @@ def test_every_value_of_a_step_comes_before_its_one_marker(instance: str) -> Non
     simulate(instance, test, "sim", "b")
 
 
-def test_all_have_taken_the_step_when_its_call_returns(instance: str) -> None:
-    """Whatever is written by the server by then comes in order of the connection: the answer comes last."""
+def test_all_streams_have_received_a_step_when_its_call_returns(instance: str) -> None:
+    """Messages that the server has written by then arrive before the answer, as they share a connection."""
 
     async def test(served: Endpoint, models: Models) -> None:
         streams = [await served.subscriber(str(n), "sim/count", "SIMLOG://step") for n in range(5)]
@@ -129,7 +129,7 @@ def test_all_have_taken_the_step_when_its_call_returns(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_a_marker_comes_with_each_step_and_never_else(instance: str) -> None:
+def test_a_marker_comes_only_with_each_step(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream, old = await served.subscriber("one", "SIMLOG://step"), await open_v1(served, "SIMLOG://step")
         for _ in range(3):
@@ -146,7 +146,7 @@ def test_a_marker_comes_with_each_step_and_never_else(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_what_the_topics_of_time_are(instance: str) -> None:
+def test_the_topics_for_time_have_a_type_but_cannot_be_read(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         for path, kind in (("SIMLOG://step", "int"), ("/model/clock", "time")):
             topic = await served.stub.GetTopic(v1.TopicDescriptor(path=path), timeout=TIMEOUT_S)
@@ -162,7 +162,7 @@ def test_what_the_topics_of_time_are(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_what_was_written_before_a_step_is_in_it_and_its_echo_before(instance: str) -> None:
+def test_a_step_applies_the_writes_before_it_and_their_echo_comes_first(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "sim/goal", "sim/reached", "SIM://goal/in", "SIMLOG://step")
         for number in range(1, 20):
@@ -178,7 +178,7 @@ def test_what_was_written_before_a_step_is_in_it_and_its_echo_before(instance: s
     simulate(instance, test)
 
 
-def test_what_a_client_of_version_1_has_published_is_applied_before_its_step(instance: str) -> None:
+def test_a_step_applies_the_values_published_before_it_by_version_1(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         goal, write_subscriptions = await open_v1(served, "sim/goal"), await open_v1(served, "sim/goal/in")
         publish: Any = served.stub.Publish(timeout=TIMEOUT_S)
@@ -199,8 +199,8 @@ def test_what_a_client_of_version_1_has_published_is_applied_before_its_step(ins
     simulate(instance, test)
 
 
-def test_what_came_in_one_piece_with_a_step_is_applied_before_it(instance: str) -> None:
-    """Values and step in the order of the wire, nothing between them: the endpoint reads them in different calls."""
+def test_a_step_applies_values_that_arrive_in_one_packet_with_it(instance: str) -> None:
+    """Values and step follow each other on the wire, and the endpoint reads them in different calls."""
 
     async def test(served: Endpoint, models: Models) -> None:
         goal = await open_v1(served, "sim/goal")
@@ -224,7 +224,7 @@ def test_what_came_in_one_piece_with_a_step_is_applied_before_it(instance: str) 
     simulate(instance, test)
 
 
-def test_a_step_that_fails_is_a_negative_code_or_a_status_and_the_next_one_goes_on(
+def test_a_failed_step_gives_a_negative_code_or_a_status_and_the_next_works(
     instance: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def test(served: Endpoint, models: Models) -> None:
@@ -241,7 +241,7 @@ def test_a_step_that_fails_is_a_negative_code_or_a_status_and_the_next_one_goes_
     simulate(instance, test)
 
 
-def test_time_that_another_program_moves_is_not_ours_to_move(instance: str) -> None:
+def test_steps_are_refused_while_another_program_controls_time(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         with Segment.open(instance, writable=True) as other:
             local = Coordinator(other)
@@ -261,7 +261,7 @@ def test_time_that_another_program_moves_is_not_ours_to_move(instance: str) -> N
     simulate(instance, test)
 
 
-def test_steps_of_another_program_are_delivered_likewise_and_acknowledged(instance: str) -> None:
+def test_steps_of_another_program_are_delivered_and_acknowledged(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "sim/count", "SIMLOG://step")
         statuses = served.time.subscribe(Empty(), timeout=TIMEOUT_S)
@@ -286,7 +286,7 @@ def test_steps_of_another_program_are_delivered_likewise_and_acknowledged(instan
     simulate(instance, test)
 
 
-def test_a_step_waits_for_the_endpoint_only_while_it_has_streams(instance: str) -> None:
+def test_a_local_step_waits_for_the_endpoint_only_while_it_has_streams(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         slot = served.segment.processes.find("grpc")
         slot.take()
@@ -297,9 +297,9 @@ def test_a_step_waits_for_the_endpoint_only_while_it_has_streams(instance: str) 
         with Segment.open(instance, writable=True) as other:
             local = Coordinator(other)
             for _ in range(3):
-                local.step()  # in the event loop's own thread, which takes no notice meanwhile
+                local.step()  # blocks the event loop, which notices nothing meanwhile
             stream = await served.subscriber("one", "sim/count", "SIMLOG://step")
-            assert await messages(stream, 1) == [("sim/count", 3.0)], "it is shown what is over"
+            assert await messages(stream, 1) == [("sim/count", 3.0)], "the client sees the finished step"
             await asyncio.to_thread(local.step)
             assert served.segment.clock.delivered(slot.index) == 4
             assert await messages(stream, 2) == [("sim/count", 4.0), ("SIMLOG://step", 4.0)]
@@ -312,7 +312,7 @@ def test_a_step_waits_for_the_endpoint_only_while_it_has_streams(instance: str) 
     simulate(instance, test)
 
 
-def test_a_first_step_that_is_over_before_the_endpoint_looks_is_delivered_too(instance: str) -> None:
+def test_a_first_step_that_ends_before_the_endpoint_looks_is_delivered(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "sim/count", "SIMLOG://step")
         slot = served.segment.processes.find("grpc")
@@ -320,9 +320,9 @@ def test_a_first_step_that_is_over_before_the_endpoint_looks_is_delivered_too(in
         with Segment.open(instance, writable=True) as other:
             local = Coordinator(other)
             stepping = asyncio.create_task(asyncio.to_thread(local.step))
-            await asyncio.sleep(0)  # the thread has begun
+            await asyncio.sleep(0)  # lets the thread start
             clock = served.segment.clock
-            while not (state := clock.read()).dt_ns or state.stepping:  # the event loop is busy until the step is over
+            while not (state := clock.read()).dt_ns or state.stepping:  # blocks the event loop until the step is done
                 clock.bell.wait(clock.bell.value(), 10_000_000)
             done = await stepping
             assert served.segment.clock.delivered(slot.index) == done.number
@@ -333,11 +333,14 @@ def test_a_first_step_that_is_over_before_the_endpoint_looks_is_delivered_too(in
     simulate(instance, test, virtual=False)
 
 
-def test_one_that_does_not_read_ends_and_the_others_go_on(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_that_is_not_read_ends_and_others_continue(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timeline, "PATIENCE_S", 2.0)
 
     async def test(served: Endpoint, models: Models) -> None:
-        options = [("grpc.http2.bdp_probe", 0), ("grpc.use_local_subchannel_pool", 1)]  # 64 KiB wait for a client
+        options = [
+            ("grpc.http2.bdp_probe", 0),
+            ("grpc.use_local_subchannel_pool", 1),
+        ]  # limits a client's window to 64 KiB
         async with grpc.aio.insecure_channel(f"127.0.0.1:{served.port}", options=options) as channel:
             create: Any = channel.unary_stream("/simlog.server.SimlogAPI/CreateSubscriber")
             idle = create(v2.Subscriber(uuid="idle").SerializeToString(), timeout=TIMEOUT_S)
@@ -368,7 +371,7 @@ DEAF = {
 
 
 @pytest.mark.parametrize("wire", DEAF)
-def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
+def test_a_client_that_takes_nothing_delays_one_step_only(
     instance: str, monkeypatch: pytest.MonkeyPatch, wire: str
 ) -> None:
     def patience(for_s: float) -> None:
@@ -401,7 +404,7 @@ def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
     simulate(instance, test)
 
 
-def test_a_step_goes_to_its_end_without_its_client(instance: str) -> None:
+def test_a_running_step_completes_without_its_client(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "SIMLOG://step")
         models["sim"].mute = True
@@ -420,7 +423,7 @@ def test_a_step_goes_to_its_end_without_its_client(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_a_step_that_waits_for_others_is_not_made_without_its_client(instance: str) -> None:
+def test_a_queued_step_is_dropped_without_its_client(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         models["sim"].mute = True
         first = served.time.step(sim.StepRequest(), timeout=TIMEOUT_S)
@@ -447,7 +450,7 @@ def test_a_step_that_waits_for_others_is_not_made_without_its_client(instance: s
     simulate(instance, test)
 
 
-def test_start_behind_a_pause_that_waits_for_a_step_plays(instance: str) -> None:
+def test_start_after_a_pause_that_waits_for_a_step_plays(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "SIMLOG://step")
         await served.time.start(sim.StartRequest(deltaTime=5), timeout=TIMEOUT_S)
@@ -478,9 +481,9 @@ def test_start_behind_a_pause_that_waits_for_a_step_plays(instance: str) -> None
 
 
 @pytest.mark.parametrize("ours", [True, False])
-def test_an_endpoint_goes_on_playing_what_its_predecessor_did_and_nobody_elses(instance: str, ours: bool) -> None:
+def test_an_endpoint_continues_the_playing_of_its_predecessor_only(instance: str, ours: bool) -> None:
     with stepped_segment(instance, "sim") as segment:
-        with Segment.open(instance, writable=True) as dying:  # without giving time up
+        with Segment.open(instance, writable=True) as dying:  # without releasing control of time
             Coordinator(dying).set_playing(True)
         model = Model(segment, "sim")
 
@@ -490,7 +493,7 @@ def test_an_endpoint_goes_on_playing_what_its_predecessor_did_and_nobody_elses(i
                     stream = await served.subscriber("one", "SIMLOG://step")
                     await messages(stream, 2)
                     await served.time.pause(Empty(), timeout=TIMEOUT_S)
-                assert await step(served) == 0, "nobody plays"
+                assert await step(served) == 0, "no program plays time"
 
         try:
             asyncio.run(run())
@@ -498,21 +501,21 @@ def test_an_endpoint_goes_on_playing_what_its_predecessor_did_and_nobody_elses(i
             model.stop()
 
 
-def test_the_death_of_a_program_that_plays_is_told(instance: str) -> None:
+def test_the_death_of_a_program_that_plays_is_reported(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         statuses = served.time.subscribe(Empty(), timeout=TIMEOUT_S)
         await statuses.initial_metadata()
-        with Segment.open(instance, writable=True) as dying:  # without giving time up
+        with Segment.open(instance, writable=True) as dying:  # without releasing control of time
             Coordinator(dying).set_playing(True)
             assert (await asyncio.wait_for(statuses.read(), TIMEOUT_S)).playing
         served.service.stepper.timeline.look()
         assert not (await asyncio.wait_for(statuses.read(), TIMEOUT_S)).playing
-        assert await step(served) == 0, "it is anybody's again"
+        assert await step(served) == 0, "any client may step again"
 
     simulate(instance, test)
 
 
-def test_steps_of_several_clients_are_made_one_after_another(instance: str) -> None:
+def test_steps_of_several_clients_are_done_one_after_another(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "sim/count", "SIMLOG://step")
         codes = await asyncio.gather(*(step(served) for _ in range(20)))
@@ -524,7 +527,7 @@ def test_steps_of_several_clients_are_made_one_after_another(instance: str) -> N
     simulate(instance, test)
 
 
-def test_playing_steps_until_it_is_paused_and_the_status_tells(instance: str) -> None:
+def test_play_steps_until_paused_and_the_status_shows_it(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         statuses = served.time.subscribe(Empty(), timeout=TIMEOUT_S)
         await statuses.initial_metadata()
@@ -558,7 +561,7 @@ def test_playing_steps_until_it_is_paused_and_the_status_tells(instance: str) ->
     simulate(instance, test)
 
 
-def test_wrong_steps_are_refused(instance: str) -> None:
+def test_invalid_steps_are_refused(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         for call in (
             served.time.step(sim.StepRequest(deltaTime=-1), timeout=TIMEOUT_S),
@@ -571,11 +574,11 @@ def test_wrong_steps_are_refused(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_who_comes_between_two_steps_sees_the_last_one_and_what_is_newer_with_the_next(instance: str) -> None:
+def test_a_subscriber_between_two_steps_sees_the_last_and_newer_values_with_the_next(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         await step(served)
         models["sim"].image[11] = 7
-        models["sim"].publish(1)  # as an injection makes it do
+        models["sim"].publish(1)  # as an injection would cause
         stream = await served.subscriber("one", "sim/goal", "sim/count", "SIMLOG://step")
         assert await messages(stream, 2) == [("sim/goal", 0.0), ("sim/count", 1.0)]
         await step(served)
@@ -584,7 +587,7 @@ def test_who_comes_between_two_steps_sees_the_last_one_and_what_is_newer_with_th
     simulate(instance, test)
 
 
-def test_what_is_refused_takes_nothing_over(instance: str) -> None:
+def test_refused_calls_do_not_take_control_of_time(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         for call in (
             served.stub.setStepSize(v1.StepSizeRequest(step=-20), timeout=TIMEOUT_S),
@@ -597,7 +600,7 @@ def test_what_is_refused_takes_nothing_over(instance: str) -> None:
     simulate(instance, test, virtual=False)
 
 
-def test_wall_time_goes_by_itself_until_somebody_takes_it_over(instance: str) -> None:
+def test_wall_time_runs_until_a_client_takes_control(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         clock = await open_v1(served, "model/clock")
         count = await open_v1(served, "sim/count")
@@ -621,7 +624,7 @@ def test_wall_time_goes_by_itself_until_somebody_takes_it_over(instance: str) ->
     simulate(instance, test, virtual=False)
 
 
-def test_device_sources_are_not_held(segment: Segment) -> None:
+def test_frames_of_devices_are_not_held_back_for_a_step(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
         stream = await served.subscriber("one", "cell/step", "SIMLOG://step")
@@ -635,7 +638,7 @@ def test_device_sources_are_not_held(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_stream_that_ends_during_a_step_does_not_hold_it_up(instance: str) -> None:
+def test_a_stream_that_ends_during_a_step_does_not_delay_it(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         streams = [await served.subscriber(str(n), "sim/row", "sim/count") for n in range(20)]
         stepping = asyncio.ensure_future(step(served))
@@ -648,7 +651,7 @@ def test_a_stream_that_ends_during_a_step_does_not_hold_it_up(instance: str) -> 
     simulate(instance, test)
 
 
-def test_what_is_bad_after_a_step_is_not_shown_and_all_of_it_when_it_is_good_again(instance: str) -> None:
+def test_values_that_are_bad_after_a_step_are_sent_when_good_again(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "b/goal", "sim/goal", "SIMLOG://step")
         await messages(stream, 2)

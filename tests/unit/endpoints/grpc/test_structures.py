@@ -1,4 +1,4 @@
-"""Structures of known shape: messages of their own in version 1, and values of version 2 both ways."""
+"""Structures of known shape: a message type each in version 1, and values in version 2, both ways."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 def image(**values: object) -> bytes:
-    """A block with these values; in the names, __ is a slash."""
+    """Return a block's image with these values; in the names, __ stands for a slash."""
     frame = bytearray(LAYOUT.size)
     for name, value in values.items():
         codec(find(LAYOUT, name.replace("__", "/")), "little").encode_into(value, frame)
@@ -65,7 +65,7 @@ async def received(stream: Any) -> wire.ROSMessage:
 
 
 @pytest.mark.parametrize("shape", CONTENTS)
-def test_each_shape_is_told_and_served_as_its_own_message(segment: Segment, shape: str) -> None:
+def test_each_shape_is_served_as_its_own_message_type(segment: Segment, shape: str) -> None:
     async def test(served: Endpoint) -> None:
         topic = await served.stub.GetTopic(wire.TopicDescriptor(path=f"cell/known/{shape}"), timeout=TIMEOUT_S)
         assert topic.msgType == shape
@@ -76,7 +76,7 @@ def test_each_shape_is_told_and_served_as_its_own_message(segment: Segment, shap
     serve(segment, test)
 
 
-def test_a_safety_zone_has_no_value_and_comes_again_when_any_member_changes(segment: Segment) -> None:
+def test_a_safety_zone_is_sent_when_any_member_changes(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(safetyzones__Z1__zone="Z1", safetyzones__Z1__level=0.1))
         stream = served.subscribe("safetyzones/Z1")
@@ -108,7 +108,7 @@ def test_a_trajectory_is_served_with_all_its_elements(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_published_structure_is_written_as_one(segment: Segment) -> None:
+def test_a_published_structure_is_written_in_one_command(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         listener = served.subscribe("safetyzones/Z1/in")
         await listener.initial_metadata()
@@ -125,7 +125,7 @@ def test_a_published_structure_is_written_as_one(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_what_is_not_in_the_message_stays_and_short_lists_are_filled(segment: Segment) -> None:
+def test_fields_missing_in_the_message_keep_their_value_and_short_lists_are_filled(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         point = wire.JointTrajectoryPoint(positions=[1, 2, 3], effort=[4], time_from_start=wire.duration(msec=9))
         await publish(
@@ -178,7 +178,7 @@ def test_what_is_not_in_the_message_stays_and_short_lists_are_filled(segment: Se
         (request("known/Point/x", point=wire.Point(x=1)), "known/Point/x: expected a text, found a point"),
     ],
 )
-def test_what_does_not_fit_is_told_and_nothing_of_it_written(
+def test_a_structure_that_does_not_fit_is_refused_as_a_whole(
     segment: Segment, caplog: pytest.LogCaptureFixture, wrong: wire.PubRequest, reason: str
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:

@@ -22,7 +22,7 @@ from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, serve
 
 
 @pytest.mark.parametrize("name", ["socket", "a name 100 % as # it may ? be"])
-def test_it_serves_there_and_leaves_nothing(segment: Segment, tmp_path: Path, name: str) -> None:
+def test_it_serves_on_the_socket_and_removes_it_at_the_end(segment: Segment, tmp_path: Path, name: str) -> None:
     file = tmp_path / name
     listener = Listener(UnixAddress(str(file)), ListenerAccess(Keys()))
 
@@ -46,7 +46,7 @@ def test_it_serves_there_and_leaves_nothing(segment: Segment, tmp_path: Path, na
     serve(segment, test)
 
 
-def test_a_group_may_open_it(segment: Segment, tmp_path: Path) -> None:
+def test_a_group_may_open_the_socket(segment: Segment, tmp_path: Path) -> None:
     file = tmp_path / "s"
 
     async def test(served: Endpoint) -> None:

@@ -1,4 +1,4 @@
-"""Bells that ring in the event loop: for whom, when, and until when."""
+"""Doorbells of blocks that wake listeners in the event loop."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shmio.segment import Segment
 from tests.unit.endpoints.harness import TIMEOUT_S, image
 
 
-def test_all_who_listen_to_a_block_hear_of_it_in_the_order_in_which_they_came(segment: Segment) -> None:
+def test_listeners_of_a_block_are_called_in_the_order_of_joining(segment: Segment) -> None:
     async def test() -> None:
         block, writer, wake_ups = segment.blocks["cell"], segment.writer("cell"), WakeUps()
         heard = list[tuple[str, int]]()
@@ -32,13 +32,13 @@ def test_all_who_listen_to_a_block_hear_of_it_in_the_order_in_which_they_came(se
         async with asyncio.timeout(TIMEOUT_S):
             await reached.wait()
         assert heard[-2:] == [("first", 100), ("second", 100)]
-        assert len(heard) < 200, "a loop that has no time is not rung for each frame"
+        assert len(heard) < 200, "a busy event loop is not woken for each frame"
         wake_ups.leave(block, first)
         heard.clear()
         reached.clear()
         writer.publish(image(), cycle=100)
         async with asyncio.timeout(TIMEOUT_S):
-            while ("second", 101) not in heard:  # noqa: ASYNC110  another thread's doing
+            while ("second", 101) not in heard:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
         assert ("first", 101) not in heard
         wake_ups.close()
@@ -46,7 +46,7 @@ def test_all_who_listen_to_a_block_hear_of_it_in_the_order_in_which_they_came(se
     asyncio.run(test())
 
 
-def test_who_leaves_while_it_rings_takes_nobody_with_him(segment: Segment) -> None:
+def test_a_listener_that_leaves_during_a_ring_leaves_others_listening(segment: Segment) -> None:
     async def test() -> None:
         block, wake_ups, over = segment.blocks["cell"], WakeUps(), asyncio.Event()
 
@@ -63,7 +63,7 @@ def test_who_leaves_while_it_rings_takes_nobody_with_him(segment: Segment) -> No
     asyncio.run(test())
 
 
-def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.wakeups.REST_S", 1000.0)
 
     async def test() -> None:
@@ -89,7 +89,7 @@ def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypat
             writer.publish(image(step=number), cycle=number)
             await asyncio.sleep(0)
         assert not heard
-        wake_ups.join(block, prompt)  # who has no time ends it for all
+        wake_ups.join(block, prompt)  # an impatient listener ends the rest for all
         async with asyncio.timeout(TIMEOUT_S):
             await rung.wait()
             assert heard == ["busy", "patient", "prompt"]
@@ -101,21 +101,19 @@ def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypat
             wake_ups.rest(block, busy)
             heard.clear()
             wake_ups.resume(block, busy)
-            while not heard:  # noqa: ASYNC110  another thread's doing
+            while not heard:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
-            wake_ups.rest(block, patient)  # busy has no time any more
+            wake_ups.rest(block, patient)  # busy is still to be woken
             heard.clear()
             writer.publish(image(), cycle=101)
-            while not heard:  # noqa: ASYNC110  another thread's doing
+            while not heard:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
         wake_ups.close()
 
     asyncio.run(test())
 
 
-def test_a_bell_that_has_rested_rings_for_what_was_left_and_goes_on(
-    segment: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bell_that_has_rested_rings_once_and_continues(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.wakeups.REST_S", 0.001)
 
     async def test() -> None:
@@ -131,11 +129,11 @@ def test_a_bell_that_has_rested_rings_for_what_was_left_and_goes_on(
 
         await rings()
         bell.rest()
-        await rings()  # though nothing has come since
+        await rings()  # though no frame was published since
         writer.publish(image(), cycle=1)
         await rings()
         bell.stop()
-        writer.publish(image(), cycle=2)  # so that its thread looks
+        writer.publish(image(), cycle=2)  # wakes its thread
         bell.join()
 
     asyncio.run(test())

@@ -1,4 +1,4 @@
-"""A segment, a broker, and who listens there."""
+"""A segment, a broker and its listeners."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def make_segment(instance: str) -> Iterator[Callable[[], Segment]]:
-    """More of them, each of another instance."""
+    """Make more segments, each of another instance."""
     with ExitStack() as stack:
 
         def make() -> Segment:
@@ -40,7 +40,7 @@ def make_segment(instance: str) -> Iterator[Callable[[], Segment]]:
 
 @pytest.fixture
 def make_broker(tmp_path: Path) -> Iterator[Callable[..., Mosquitto]]:
-    """Start a mosquitto of this test's own."""
+    """Start a mosquitto for this test."""
     if reason := missing():
         pytest.skip(reason)
     with ExitStack() as stack:

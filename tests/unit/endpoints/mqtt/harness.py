@@ -23,7 +23,7 @@ PREFIX = "shmio/test"
 
 
 class Listener:
-    """Hears everything; keeps what has come, in order."""
+    """A client that receives everything and keeps it in order."""
 
     def __init__(
         self, address: Address, *filters: str, protocol: MQTTProtocolVersion = MQTTv5, qos: int = 1, **account: Any
@@ -48,43 +48,43 @@ class Listener:
     def close(self) -> None:
         self.client.disconnect()
         self.client.loop_stop()
-        # Only the end of the client closes the pair of sockets of its thread: in a cycle, that has no order.
+        # Only the client's deletion closes the socket pair of its thread; break the cycle so that it happens now.
         self.client.on_connect = self.client.on_message = None
 
     def message(self) -> MQTTMessage:
-        """The next one."""
+        """Return the next message."""
         message = self._come.get(timeout=TIMEOUT_S)
         self.heard.append((message.topic, bytes(message.payload)))
         return message
 
     def taken(self) -> None:
-        """Take what has come, without waiting."""
+        """Take the messages that have arrived, without waiting."""
         while not self._come.empty():
             self.message()
 
     def until(self, topic: str, payload: bytes | None = None) -> bytes:
-        """Take messages until there is one on this topic, with this payload if one is given."""
+        """Return the next payload on this topic, equal to ``payload`` if it is given."""
         while True:
             message = self.message()
             if message.topic == f"{PREFIX}/{topic}" and payload in (None, message.payload):
                 return bytes(message.payload)
 
     def json(self, topic: str) -> dict[str, Any]:
-        """The next one on this topic, as JSON."""
+        """Return the next payload on this topic, decoded from JSON."""
         found: dict[str, Any] = json.loads(self.until(topic))
         return found
 
     def values(self, topic: str) -> list[str]:
-        """All heard on this topic so far."""
+        """Return all payloads received on this topic so far."""
         return [payload.decode() for heard, payload in self.heard if heard == f"{PREFIX}/{topic}"]
 
     def shown(self, topic: str, value: str) -> None:
-        """Wait until this is, or was, the last heard on a topic."""
+        """Wait until the last payload on this topic equals ``value``."""
         while self.values(topic)[-1:] != [value]:
             self.message()
 
     def publish(self, topic: str, payload: bytes | str, *, retain: bool = False, **named: Any) -> None:
-        """Publish, and wait until the broker has it."""
+        """Publish, and wait until the broker has the message."""
         properties = None
         if named:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
@@ -103,7 +103,7 @@ def listening(address: Address, *filters: str, **how: Any) -> Iterator[Listener]
 
 
 class Running:
-    """A bridge in a thread of its own."""
+    """A bridge in its own thread."""
 
     def __init__(self, segment: Segment, settings: Mqtt) -> None:
         slot = segment.processes.find("mqtt")
@@ -122,7 +122,7 @@ class Running:
         self.bridge.close()
 
     def until(self, condition: Any) -> None:
-        """Wait for what the bridge, or who is at its other end, brings about."""
+        """Wait until a condition holds that the bridge or its peer brings about."""
         with self._turned:
             assert self._turned.wait_for(condition, TIMEOUT_S), self.bridge.problem
 

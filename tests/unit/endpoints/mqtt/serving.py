@@ -1,4 +1,4 @@
-"""Our own broker, in a thread, as its process runs it; and a client that is no good."""
+"""The broker that shmio starts, run in a thread as in its process; and a client that sends raw packets."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def address() -> Iterator[Address]:
 
 
 class Process:
-    """The broker's process, as far as it needs one."""
+    """The broker's process, as far as the broker uses it."""
 
     def __init__(self, segment: Segment, **config: Any) -> None:
         self.stopping, self.ready = threading.Event(), threading.Event()
@@ -60,7 +60,7 @@ class Process:
     def _run(self) -> None:
         try:
             run_broker(self._worker)
-        except Exception as error:  # noqa: BLE001  whatever it is, it is the test's to tell
+        except Exception as error:  # noqa: BLE001  the test handles every exception
             self.failure = error
         finally:
             self.ready.set()
@@ -75,7 +75,7 @@ class Process:
 
 @contextmanager
 def serving(segment: Segment, address: Address, program: str = "embedded", **config: Any) -> Iterator[Process]:
-    """Unless ``account`` says otherwise, who shows none may do everything."""
+    """Serve a broker; by default clients without an account may do everything."""
     config.setdefault("prefix", PREFIX)
     config.setdefault("account", [{"roles": ["read", "write"], "publish": ["#"]}])
     process = Process(segment, broker=program, listen=str(address), **config)
@@ -90,7 +90,7 @@ def serving(segment: Segment, address: Address, program: str = "embedded", **con
 
 @contextmanager
 def bridged(segment: Segment) -> Iterator[Running]:
-    """A bridge to the broker of this instance."""
+    """Run a bridge to the broker of this instance."""
     running = Running(segment, Mqtt(listen="127.0.0.1:1", prefix=PREFIX))
     try:
         running.until(lambda: running.bridge.connection.up)
@@ -100,7 +100,7 @@ def bridged(segment: Segment) -> Iterator[Running]:
 
 
 class Raw:
-    """A client that sends what it likes; MQTT 3.1.1."""
+    """A client of MQTT 3.1.1 that can send any packet."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class Raw:
         account: tuple[str, ...] = (),
         will: tuple[str, str] | None = None,
     ) -> None:
-        """``will``: topic and payload of a retained one."""
+        """Connect. ``will``: topic and payload of a retained last will."""
         self._socket = socket.create_connection((address.host, address.port), TIMEOUT_S)
         self._numbers = 0
         flags = 2 * clean | (0xC0 if account else 0) | (0x24 if will else 0)
@@ -136,7 +136,7 @@ class Raw:
         self._socket.sendall(bytes([kind, *length, rest]) + body)
 
     def packet(self) -> tuple[int, bytes]:
-        """The next one; ConnectionError: there will be none."""
+        """Return the next packet; ConnectionError if the connection has ended."""
         (kind,) = self._exactly(1)
         size, place = 0, 0
         while True:
@@ -156,7 +156,7 @@ class Raw:
         return read
 
     def ended(self) -> bool:
-        """Wait for its end; TimeoutError: there is none."""
+        """Wait until the broker closes the connection; TimeoutError if it does not."""
         with suppress(ConnectionError):
             while True:
                 self.packet()
@@ -170,7 +170,7 @@ class Raw:
         self.send(0x30 | qos << 1 | retain, _text(topic) + (self.number() if qos else b"") + payload)
 
     def subscribe(self, *filters: str) -> bytes:
-        """What the broker says to each: 0, or 0x80, it refuses."""
+        """Subscribe; return the broker's code for each filter: 0, or 0x80 for a refusal."""
         self.send(0x82, self.number() + b"".join(_text(one) + b"\1" for one in filters))
         while True:
             kind, told = self.packet()
@@ -183,7 +183,7 @@ class Raw:
             pass
 
     def ping(self) -> None:
-        """Wait until all that was sent has been read."""
+        """Wait until the broker has read all packets."""
         self.send(0xC0, b"")
         while self.packet()[0] != 0xD0:
             pass

@@ -1,4 +1,4 @@
-"""Both endpoints on one segment."""
+"""The gRPC and MQTT endpoints on one segment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BATCH = 20
 
 
 def positions(count: int) -> list[float]:
-    """REALs of all sizes, each another one than that before, some of them there again and again."""
+    """Return REALs of all sizes, each different from the previous one, some repeated."""
     chosen = random.Random(1)
     some = [0.1, -0.0, 1e-30, 3.4e38, 16777216.0, *(chosen.uniform(-1000, 1000) for _ in range(20))]
     found = [0.0]
@@ -28,7 +28,7 @@ def positions(count: int) -> list[float]:
     return found
 
 
-def test_a_client_of_each_sees_the_same_values_in_the_same_order(
+def test_clients_of_both_endpoints_see_the_same_values_in_the_same_order(
     segment: Segment, make_broker: Callable[..., Mosquitto]
 ) -> None:
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")

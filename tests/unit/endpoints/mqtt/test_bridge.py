@@ -1,4 +1,4 @@
-"""The bridge against a real broker: what goes out."""
+"""What the bridge publishes to a real broker."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tests.unit.endpoints.mqtt.harness import PREFIX, Listener, bridge, listenin
 OUT = f"{PREFIX}/+/#"
 
 
-def test_what_changes_goes_out_and_nothing_else(segment: Segment, broker: Mosquitto) -> None:
+def test_only_changes_are_published(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(position=1.5, step=7), cycle=1)
     with listening(broker.address) as listener:
         with bridge(segment, broker.address):
             assert listener.until("status") == b"online"
-            assert listener.until("cell/secret/out") == b"0"  # the last of all
+            assert listener.until("cell/secret/out") == b"0"  # the last topic of the first round
             writer.publish(image(position=2.5, step=7), cycle=2)
             writer.publish(image(position=2.5, step=8, inputs=b"\1\2"), cycle=3)
             assert listener.until("cell/step/out") == b"8"
@@ -37,7 +37,7 @@ def test_what_changes_goes_out_and_nothing_else(segment: Segment, broker: Mosqui
     assert listener.values("cell/running/out") == ["false"]
 
 
-def test_who_comes_later_finds_the_present_values(segment: Segment, broker: Mosquitto) -> None:
+def test_a_later_subscriber_gets_the_current_values(segment: Segment, broker: Mosquitto) -> None:
     segment.writer("cell").publish(image(position=1.5), cycle=1)
     with listening(broker.address) as first, bridge(segment, broker.address):
         first.until("cell/secret/out")
@@ -46,8 +46,8 @@ def test_who_comes_later_finds_the_present_values(segment: Segment, broker: Mosq
             assert listener.heard
 
 
-def test_a_source_that_turns_bad_says_so_on_each_topic(segment: Segment, broker: Mosquitto) -> None:
-    """As text there is no value any more, also for who comes later; as JSON the last one is told to be bad."""
+def test_bad_quality_is_published_on_each_topic(segment: Segment, broker: Mosquitto) -> None:
+    """The text topic is emptied, also for later subscribers; the JSON topic has the last value, marked as bad."""
     rules = [MqttTopic(match="cell/step", payload="json")]
     writer = segment.writer("cell")
     writer.publish(image(position=1.5, step=3), cycle=1)
@@ -66,13 +66,13 @@ def test_a_source_that_turns_bad_says_so_on_each_topic(segment: Segment, broker:
         assert (bad["value"], bad["quality"], bad["reason"]) == (3, "bad", "cable out")
         listener.until("cell/secret/out")
         with listening(broker.address, f"{PREFIX}/cell/axis/#", f"{PREFIX}/cell/status") as later:
-            assert later.message().topic == f"{PREFIX}/cell/status"  # the text's topic is empty
+            assert later.message().topic == f"{PREFIX}/cell/status"  # the text topic is empty
         writer.publish(image(position=1.5, step=3), cycle=3)
         assert listener.until("cell/axis/position/out") == b"1.5"
         assert listener.json("cell/step/out")["quality"] == "good"
 
 
-def test_a_source_that_falls_silent_turns_bad(soon_stale: Segment, broker: Mosquitto) -> None:
+def test_a_source_without_new_frames_turns_bad(soon_stale: Segment, broker: Mosquitto) -> None:
     soon_stale.processes.add(ProcessSpec("mqtt", "mqtt"))
     writer = soon_stale.writer("cell")
     writer.publish(image(position=1.5), cycle=1)
@@ -83,7 +83,7 @@ def test_a_source_that_falls_silent_turns_bad(soon_stale: Segment, broker: Mosqu
         assert listener.until("cell/axis/position/out", b"") == b""
 
 
-def test_uncertain_values_are_shown_and_told(segment: Segment, broker: Mosquitto) -> None:
+def test_uncertain_values_are_published_and_marked(segment: Segment, broker: Mosquitto) -> None:
     rules = [MqttTopic(match="cell/step", payload="json")]
     writer = segment.writer("cell")
     writer.publish(image(position=1.5), cycle=1)
@@ -95,7 +95,7 @@ def test_uncertain_values_are_shown_and_told(segment: Segment, broker: Mosquitto
         assert listener.until("cell/axis/position/out") == b"2.5"
 
 
-def test_injected_values_are_the_ones_shown(segment: Segment, broker: Mosquitto) -> None:
+def test_injected_values_are_published(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(position=1.5), cycle=1)
     with listening(broker.address) as listener, bridge(segment, broker.address):
@@ -104,7 +104,7 @@ def test_injected_values_are_the_ones_shown(segment: Segment, broker: Mosquitto)
         assert listener.until("cell/axis/position/out") == b"9.5"
 
 
-def test_json_says_whose_value_is_injected_also_if_it_is_the_same(segment: Segment, broker: Mosquitto) -> None:
+def test_json_marks_injected_registers_even_with_an_equal_value(segment: Segment, broker: Mosquitto) -> None:
     cell, writer, data = segment.blocks["cell"], segment.writer("cell"), image(position=1.5, step=7)
 
     def stand(*places: tuple[int, int]) -> None:
@@ -135,7 +135,7 @@ def test_json_says_whose_value_is_injected_also_if_it_is_the_same(segment: Segme
     assert len(listener.values("cell/axis/speed/out")) == 1
 
 
-def test_rules_say_what_is_published_and_how(segment: Segment, broker: Mosquitto) -> None:
+def test_rules_choose_what_is_published_and_how(segment: Segment, broker: Mosquitto) -> None:
     rules = [
         MqttTopic(match="cell/axis/speed", publish=False),
         MqttTopic(match="cell/inputs", elements=True),
@@ -167,7 +167,7 @@ def test_bits_and_slices_have_topics_where_a_rule_names_them(segment: Segment, b
     writer.publish(image(inputs=b"\3\4"), cycle=1)
     with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
         assert listener.until("cell/inputs/1.%X2/out") == b"true"
-        writer.publish(image(inputs=b"\3\5"), cycle=2)  # a neighbour
+        writer.publish(image(inputs=b"\3\5"), cycle=2)  # a neighbouring bit
         writer.publish(image(inputs=b"\3\1"), cycle=3)
         assert listener.until("cell/inputs/1.%X2/out") == b"false"
         assert json.loads(listener.until("cell/inputs/0..1/out", b"[3,1]")) == [3, 1]
@@ -181,7 +181,7 @@ def wait_for(listener: Listener, topic: str, count: int) -> list[str]:
     return values
 
 
-def test_changes_within_the_dead_band_are_not_told(segment: Segment, broker: Mosquitto) -> None:
+def test_changes_within_the_dead_band_are_not_published(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(position=1.0), cycle=1)
     rules = [MqttTopic(match="cell/axis/position", deadband=0.5)]
@@ -193,7 +193,7 @@ def test_changes_within_the_dead_band_are_not_told(segment: Segment, broker: Mos
     assert listener.values("cell/axis/position/out") == ["1.0", "1.5", "1.0"]
 
 
-def test_a_rate_leaves_out_what_is_between_and_never_the_last(segment: Segment, broker: Mosquitto) -> None:
+def test_a_rate_limit_skips_values_but_never_the_last(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(position=0.0), cycle=1)
     rules = [MqttTopic(match="cell/axis/position", max_rate_hz=5)]
@@ -209,7 +209,7 @@ def test_a_rate_leaves_out_what_is_between_and_never_the_last(segment: Segment, 
 
 
 def test_a_structure_is_one_message_for_each_frame_that_changes_it(segment: Segment, broker: Mosquitto) -> None:
-    """Whatever an earlier rule does not take; a register that is named by itself is no structure."""
+    """It has all members that no earlier rule matches; a rule that names a register itself sends it alone."""
     rules = [
         MqttTopic(match="cell/long", publish=False),
         MqttTopic(match=["cell/axis", "cell/step"], payload="structure"),
@@ -239,8 +239,8 @@ def test_a_structure_is_one_message_for_each_frame_that_changes_it(segment: Segm
     }
 
 
-def test_text_that_is_none_and_names_that_need_encoding(segment: Segment, broker: Mosquitto) -> None:
-    """A STRING is its text; arrays are JSON; what JSON does not know is text in it."""
+def test_texts_and_values_without_a_json_form(segment: Segment, broker: Mosquitto) -> None:
+    """A STRING is sent as its text, an array as JSON; NaN is the text "NaN" in JSON."""
     rules = [MqttTopic(match="cell/axis", payload="json")]
     data = bytearray(image(position=float("nan"), running=True))
     data[16:20] = bytes([8, 2]) + b"hi"
@@ -257,7 +257,7 @@ def burst(writer: BlockWriter, cycles: range) -> None:
         writer.publish(image(position=cycle, step=cycle), cycle=cycle)
 
 
-def test_more_frames_than_it_follows_end_with_the_last(segment: Segment, broker: Mosquitto) -> None:
+def test_a_burst_of_frames_ends_with_the_last_value(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     burst(writer, range(1, 3))
     with listening(broker.address) as listener, bridge(segment, broker.address):
@@ -269,7 +269,7 @@ def test_more_frames_than_it_follows_end_with_the_last(segment: Segment, broker:
 
 
 @pytest.mark.parametrize("sparkplug", [None, Sparkplug(group="plant")])
-def test_frames_that_a_bridge_was_too_slow_for_are_counted_and_told(
+def test_frames_that_the_bridge_missed_are_counted_and_reported(
     segment: Segment,
     make_broker: Callable[..., Mosquitto],
     sparkplug: Sparkplug | None,

@@ -1,4 +1,4 @@
-"""What comes in from a real broker: values for a source's device, and what became of each."""
+"""Commands from a real broker: values for a source's device, and their results."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.unit.endpoints.plant import Plant
 
 @contextmanager
 def running(segment: Segment, broker: Mosquitto, **settings: Any) -> Iterator[tuple[Plant, Listener]]:
-    """A device, a bridge that is connected, and a client."""
+    """Run a device, a connected bridge and a client."""
     plant = Plant(segment.writer("cell"))
     plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)
     plant.run()
@@ -39,7 +39,7 @@ def running(segment: Segment, broker: Mosquitto, **settings: Any) -> Iterator[tu
         plant.stop()
 
 
-def test_a_value_reaches_the_device_and_its_end_comes_back(segment: Segment, broker: Mosquitto) -> None:
+def test_a_value_reaches_the_device_and_its_result_is_published(segment: Segment, broker: Mosquitto) -> None:
     with running(segment, broker) as (_, listener):
         listener.publish("cell/axis/position/in", "2.5", CorrelationData=b"mine")
         listener.publish("cell/inputs/1/in", "7")
@@ -87,7 +87,7 @@ def test_a_bit_and_a_slice_leave_their_neighbours_alone(segment: Segment, broker
         ("cell/name/in", b"x" * 2_000_000, "longer than"),
     ],
 )
-def test_what_cannot_be_done_is_told_and_the_bridge_goes_on(
+def test_failed_commands_have_a_result_and_the_bridge_continues(
     segment: Segment,
     broker: Mosquitto,
     topic: str,
@@ -106,7 +106,7 @@ def test_what_cannot_be_done_is_told_and_the_bridge_goes_on(
         assert listener.json("cell/step/in/result")["done"]
 
 
-def test_a_topic_that_leaves_no_room_for_a_result_is_passed_over(segment: Segment, broker: Mosquitto) -> None:
+def test_a_topic_too_long_for_its_result_is_ignored(segment: Segment, broker: Mosquitto) -> None:
     with running(segment, broker) as (plant, listener):
         longest = 65535 - len(f"{PREFIX}/cell//in")
         listener.publish(f"cell/{'x' * longest}/in", "1")
@@ -116,7 +116,7 @@ def test_a_topic_that_leaves_no_room_for_a_result_is_passed_over(segment: Segmen
         assert not plant.written
 
 
-def test_the_devices_refusal_is_told(segment: Segment, broker: Mosquitto) -> None:
+def test_a_refusal_by_the_device_is_a_result(segment: Segment, broker: Mosquitto) -> None:
     with running(segment, broker) as (plant, listener):
         plant.refusal = "access denied"
         listener.publish("cell/step/in", "5")
@@ -125,8 +125,8 @@ def test_the_devices_refusal_is_told(segment: Segment, broker: Mosquitto) -> Non
         }  # fmt: skip
 
 
-def test_a_command_that_was_there_before_is_not_carried_out(segment: Segment, broker: Mosquitto) -> None:
-    """Nobody knows how old it is. Its sender, if he is still there, publishes it again."""
+def test_a_retained_command_is_not_carried_out(segment: Segment, broker: Mosquitto) -> None:
+    """Its age is unknown; a sender that still exists can publish it again."""
     with listening(broker.address, "none") as before:
         before.publish("cell/step/in", "5", retain=True)
     with running(segment, broker) as (plant, listener):
@@ -139,10 +139,10 @@ def test_a_command_that_was_there_before_is_not_carried_out(segment: Segment, br
         assert len(plant.written) == 1
 
 
-def test_what_another_broker_had_before_is_not_carried_out(
+def test_a_retained_command_of_a_bridged_broker_is_not_carried_out(
     segment: Segment, make_broker: Callable[..., Mosquitto], tmp_path: Path
 ) -> None:
-    """A broker that is joined to ours: each time the way between them is back, ours takes what that retains for new."""
+    """A broker bridged to ours: whenever their connection is restored, ours takes its retained messages as new."""
     (tmp_path / "elsewhere").mkdir()
     with reserved_port() as address:
         elsewhere = Mosquitto(tmp_path / "elsewhere", address)
@@ -162,7 +162,7 @@ def test_what_another_broker_had_before_is_not_carried_out(
             elsewhere.stop()
 
 
-def test_results_go_where_their_client_wants_them_below_the_prefix(segment: Segment, broker: Mosquitto) -> None:
+def test_results_go_to_the_clients_response_topic_below_the_prefix(segment: Segment, broker: Mosquitto) -> None:
     with running(segment, broker) as (_, listener):
         listener.publish("cell/step/in", "5", ResponseTopic=f"{PREFIX}/shmio/results/me")
         assert listener.json("shmio/results/me")["done"]
@@ -176,7 +176,7 @@ def test_results_go_where_their_client_wants_them_below_the_prefix(segment: Segm
         ("cell/step/in/result", "shmio/results/me"))]  # fmt: skip
 
 
-def test_json_registers_take_a_value_or_an_object_with_one(segment: Segment, broker: Mosquitto) -> None:
+def test_a_json_register_accepts_a_value_or_an_object_with_one(segment: Segment, broker: Mosquitto) -> None:
     rules = [MqttTopic(match="cell", payload="json")]
     with running(segment, broker, topic=rules) as (_, listener):
         for payload in ('{"value": 2.5, "quality": "good"}', "3.5", '{"value": "NaN"}'):
@@ -205,7 +205,7 @@ def test_a_flood_of_commands_is_bounded_and_answered(segment: Segment, broker: M
 def test_commands_are_taken_a_few_at_a_time(
     segment: Segment, make_broker: Callable[..., Mosquitto], qos: int, bound: int
 ) -> None:
-    """Also while results wait for acknowledgements; else many of them would hold up what else there is to do."""
+    """Also while results wait for acknowledgements, as many of them would delay all other work."""
     broker = make_broker("allow_anonymous true", "max_inflight_messages 1000", "max_queued_messages 0")
     writer, slot = segment.writer("cell"), segment.processes.find("mqtt")
     writer.publish(image(), cycle=1)

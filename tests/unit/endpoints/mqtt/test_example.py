@@ -1,4 +1,4 @@
-"""``examples/mqtt.py``: what it says when nothing comes."""
+"""``examples/mqtt.py``: its messages when nothing arrives."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ def command(address: Address, *words: str) -> list[str]:
 
 
 def fails(address: Address, *words: str) -> str:
-    """The one line that it says."""
+    """Run the example, which must fail; return its one line."""
     done = subprocess.run(command(address, *words), capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done.stderr
     return done.stderr
 
 
-def test_where_nothing_listens_is_told() -> None:
+def test_an_address_without_a_broker_is_reported() -> None:
     with reserved_port() as address:
         told = fails(address, PATH)
     assert told == f"{address}: Connection refused; shmio-supervisor status says whether the broker runs\n"
 
 
-def test_a_topic_on_which_nothing_comes_is_named(broker: Mosquitto) -> None:
+def test_a_topic_without_messages_is_named(broker: Mosquitto) -> None:
     told = fails(broker.address, "--count", "1", "--timeout", "0.2", "cell/Nope")
     assert told == f"0 messages in 0.2 s on {PREFIX}/cell/Nope/out; shmio list names the registers\n"
     told = fails(broker.address, "--timeout", "0.2", "--write", "cell/Nope=1")
     assert told == f"0 messages in 0.2 s on {PREFIX}/cell/Nope/in/result; shmio list names the registers\n"
 
 
-def test_a_broker_that_is_killed_meanwhile_is_told(broker: Mosquitto) -> None:
+def test_a_killed_broker_is_reported(broker: Mosquitto) -> None:
     with listening(broker.address) as listener:
         listener.publish(f"{PATH}/out", "1.5", retain=True)
     done = subprocess.run(
@@ -60,6 +60,6 @@ def test_a_broker_that_is_killed_meanwhile_is_told(broker: Mosquitto) -> None:
     )
 
 
-def test_a_broker_that_wants_an_account_is_told(make_broker: Callable[..., Mosquitto]) -> None:
+def test_a_broker_that_needs_an_account_is_reported(make_broker: Callable[..., Mosquitto]) -> None:
     broker = make_broker("allow_anonymous false")
     assert fails(broker.address, PATH) == f"{broker.address}: the broker refuses us: Not authorized\n"

@@ -1,4 +1,4 @@
-"""A broker that goes away, and comes back: what changes meanwhile is kept, in order."""
+"""A broker that disconnects and returns: changes in between are kept, in order."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ AWAY = "nothing listens there"
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tests do not wait for a bridge that has given up for a while."""
+    """Shorten the back-off of a bridge that reconnects."""
     monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.02, 0.1))
 
 
 def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mosquitto) -> None:
-    """They come in order, with their own times, marked as late; then everything as it is now."""
+    """They come in order with their times, marked as late; then come the current values."""
     rules = [MqttTopic(match="cell/step", payload="json")]
     writer = segment.writer("cell")
     writer.publish(image(step=1), cycle=1)
@@ -42,7 +42,7 @@ def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mos
         listener.until("cell/secret/out")
         running.until(lambda: not running.bridge.connection.in_flight)
         proxy.refuse()
-        listener.until("status", b"offline")  # its last will
+        listener.until("status", b"offline")  # the last will
         running.until(lambda: AWAY in running.bridge.problem)
         for step in range(2, 12):
             writer.publish(image(step=step, position=step), cycle=step)
@@ -52,7 +52,7 @@ def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mos
         listener.until("status", b"online")
         stamps: list[float] = []
         while (message := listener.message()).topic != f"{PREFIX}/cell/secret/out":
-            if message.topic == f"{PREFIX}/cell/axis/position/out":  # as text, which has no place for its time
+            if message.topic == f"{PREFIX}/cell/axis/position/out":  # a text message has its time in a user property
                 stamps += [float(text) for _, text in vars(message.properties).get("UserProperty", ())]
         running.until(lambda: not running.bridge.problem)
         assert running.bridge.outbox.dropped == 0
@@ -67,7 +67,7 @@ def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mos
 
 
 class Load:
-    """A source whose step counts up, a frame each."""
+    """A source whose register step counts up with each frame."""
 
     def __init__(self, writer: BlockWriter) -> None:
         self.last = 0
@@ -93,11 +93,11 @@ class Load:
         self.stop()
 
 
-def test_a_connection_that_is_cut_again_and_again_loses_no_change(
+def test_a_connection_cut_repeatedly_loses_no_change(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Under load. What the broker may or may not have had comes once more; nothing comes before what was before it."""
-    # A busy host is not to be taken for a broker that is too slow, for which changes are conflated.
+    """Under load. Changes that the broker may have missed are sent again; their order is kept."""
+    # A busy host must not look like a slow broker, for which changes are conflated.
     monkeypatch.setattr("shmio.endpoints.mqtt.feed.CATCH_UP_S", 10.0)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
     with (
@@ -119,7 +119,7 @@ def test_a_connection_that_is_cut_again_and_again_loses_no_change(
     assert first == list(range(first[0], load.last + 1))
 
 
-def test_a_broker_that_dies_again_and_again_is_found_again(segment: Segment, broker: Mosquitto) -> None:
+def test_the_bridge_reconnects_to_a_broker_killed_repeatedly(segment: Segment, broker: Mosquitto) -> None:
     load = Load(segment.writer("cell"))
     try:
         with bridge(segment, broker.address) as running:
@@ -138,11 +138,13 @@ def test_a_broker_that_dies_again_and_again_is_found_again(segment: Segment, bro
         load.stop()
 
 
-def test_who_listens_by_another_way_misses_nothing_of_a_broker_that_is_killed_again_and_again(
+def test_another_client_misses_no_change_though_the_broker_is_killed_repeatedly(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Under load. The bridge's own way is held up before each kill, so that what it sends then is acknowledged by none:
-    what a broker has acknowledged and takes to its grave nobody could send again."""
+    """Under load, with the bridge's connection frozen before each kill, so that it gets no more acknowledgements.
+
+    A message that a broker has acknowledged and then lost cannot be sent again.
+    """
     monkeypatch.setattr("shmio.endpoints.mqtt.feed.CATCH_UP_S", 10.0)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
     filters = [f"{PREFIX}/{topic}" for topic in ("cell/step/out", "kill")]
@@ -176,7 +178,7 @@ def test_who_listens_by_another_way_misses_nothing_of_a_broker_that_is_killed_ag
     assert first == list(range(first[0], load.last + 1))
 
 
-def test_more_than_may_be_kept_goes_oldest_first_and_is_counted(segment: Segment, broker: Mosquitto) -> None:
+def test_beyond_the_bound_the_oldest_changes_are_dropped_and_counted(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(step=1), cycle=1)
     with bridge(segment, broker.address, backlog_mb=0.01) as running:
@@ -198,7 +200,9 @@ def test_more_than_may_be_kept_goes_oldest_first_and_is_counted(segment: Segment
             assert listener.until("cell/step/out") == b"301"
 
 
-def test_a_second_broker_takes_the_place_of_the_first(segment: Segment, make_broker: Callable[..., Mosquitto]) -> None:
+def test_the_second_broker_is_used_if_the_first_is_absent(
+    segment: Segment, make_broker: Callable[..., Mosquitto]
+) -> None:
     broker = make_broker()
     segment.writer("cell").publish(image(step=1), cycle=1)
     with reserved_port() as nobody, bridge(segment, [nobody, broker.address]) as running:
@@ -214,7 +218,7 @@ def secret(folder: Path, text: str) -> str:
     return str(file)
 
 
-def test_a_wrong_password_is_told_and_the_right_one_heals(
+def test_a_wrong_password_is_reported_until_the_file_has_the_right_one(
     segment: Segment, make_broker: Callable[..., Mosquitto], tmp_path: Path
 ) -> None:
     from shmio.config.credentials import hashed
@@ -235,7 +239,7 @@ def test_a_wrong_password_is_told_and_the_right_one_heals(
 
 
 class Answers:
-    """A broker that gives each who connects the same bytes, and closes."""
+    """A broker that sends the same bytes to each client, and disconnects."""
 
     def __init__(self, answer: bytes) -> None:
         self._answer = answer
@@ -272,7 +276,7 @@ class Answers:
         (b"\x20\x02\x00\x05", "refuses our login"),
     ],
 )
-def test_what_a_broker_says_is_told(segment: Segment, answer: bytes, told: str) -> None:
+def test_the_brokers_answer_is_reported(segment: Segment, answer: bytes, told: str) -> None:
     segment.writer("cell").publish(image(step=1), cycle=1)
     answers = Answers(answer)
     try:
@@ -282,7 +286,7 @@ def test_what_a_broker_says_is_told(segment: Segment, answer: bytes, told: str) 
         answers.close()
 
 
-def test_a_host_that_accepts_and_says_nothing_is_given_up(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_that_accepts_but_never_answers_times_out(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.mqtt.connection.connection.CONNECT_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = Address("127.0.0.1", silent.getsockname()[1])
@@ -290,10 +294,10 @@ def test_a_host_that_accepts_and_says_nothing_is_given_up(segment: Segment, monk
             running.until(lambda: "does not answer" in running.bridge.problem)
 
 
-def test_a_file_that_cannot_be_read_at_present_holds_up_nothing(
+def test_a_file_that_cannot_be_read_yet_blocks_nothing(
     segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """As one on the network whose server is away: here, a pipe that nobody writes to."""
+    """Such as a file on a network server that is down; here it is a pipe without a writer."""
     monkeypatch.setattr("shmio.endpoints.mqtt.connection.attempt.SLOW_S", 0.1)
     pipe = tmp_path / "ca.pem"
     os.mkfifo(pipe)
@@ -302,13 +306,13 @@ def test_a_file_that_cannot_be_read_at_present_holds_up_nothing(
     with bridge(segment, broker.address, tls=MqttTls(ca=str(pipe))) as running:
         running.until(lambda: "no answer yet" in running.bridge.problem)
         writer.publish(image(step=2), cycle=2)
-        running.until(lambda: running.bridge.outbox.backlog)  # it goes on
-        with pipe.open("wb"):  # the one who waits has it now
+        running.until(lambda: running.bridge.outbox.backlog)  # the bridge continues
+        with pipe.open("wb"):  # lets the waiting reader continue
             pipe.unlink()
         running.until(lambda: "mqtt.tls.ca" in running.bridge.problem)
 
 
-def test_of_several_brokers_the_fault_of_each_is_told(segment: Segment) -> None:
+def test_the_problem_of_each_of_several_brokers_is_reported(segment: Segment) -> None:
     with reserved_port() as one, reserved_port() as other, bridge(segment, [one, other]) as running:
         told = sorted(f"broker {address}: nothing listens there" for address in (one, other))
         running.until(lambda: running.bridge.problem == "; ".join(told))

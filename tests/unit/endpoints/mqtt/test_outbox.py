@@ -1,4 +1,4 @@
-"""What waits for the broker: order, conflation, and the bounded store for when it is away. No broker."""
+"""The queue to the broker: order, conflation, and the bounded backlog for outages. No broker runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shmio.endpoints.mqtt.topics import Message
 
 
 class FakeConnection:
-    """Takes ``room`` messages."""
+    """A connection that accepts ``room`` messages."""
 
     def __init__(self) -> None:
         self.up = True
@@ -25,7 +25,7 @@ class FakeConnection:
 
 
 class Counter:
-    """A topic whose payload is how it stands when it is asked."""
+    """A topic whose payload is its value when it is asked."""
 
     def __init__(self, topic: str, *, keep: bool = True) -> None:
         self.topic = topic
@@ -36,7 +36,7 @@ class Counter:
         return Message(self.topic, str(self.value).encode(), 1, retain=not late, keep=self._keep)
 
 
-def test_a_topic_that_waits_keeps_its_place_and_has_its_newest_value() -> None:
+def test_a_waiting_topic_keeps_its_place_and_gets_its_newest_value() -> None:
     connection = FakeConnection()
     outbox, a, b = Outbox(connection, connection, 10_000), Counter("a"), Counter("b")
     connection.room = 0
@@ -50,7 +50,7 @@ def test_a_topic_that_waits_keeps_its_place_and_has_its_newest_value() -> None:
     assert connection.sent == ["a2", "b1"]
 
 
-def test_no_turn_is_longer_than_others_can_wait() -> None:
+def test_a_turn_sends_a_limited_number_of_messages() -> None:
     connection = FakeConnection()
     outbox = Outbox(connection, connection, 0)
     outbox.mark_all(Counter(str(number)) for number in range(2 * TURN_MESSAGES + 1))
@@ -63,7 +63,7 @@ def test_no_turn_is_longer_than_others_can_wait() -> None:
     assert not outbox.can_send
 
 
-def test_nothing_is_kept_before_there_was_anything_to_wait_for() -> None:
+def test_nothing_is_kept_before_the_first_connection() -> None:
     connection = FakeConnection()
     connection.up = False
     outbox = Outbox(connection, connection, 10_000)
@@ -71,7 +71,7 @@ def test_nothing_is_kept_before_there_was_anything_to_wait_for() -> None:
     assert not outbox.busy
 
 
-def test_what_was_lost_and_what_waited_comes_before_what_is_new() -> None:
+def test_lost_and_waiting_messages_are_sent_before_new_ones() -> None:
     connection = FakeConnection()
     outbox, a, b, status = Outbox(connection, connection, 10_000), Counter("a"), Counter("b"), Counter("s", keep=False)
     outbox.keeping = True
@@ -85,7 +85,7 @@ def test_what_was_lost_and_what_waited_comes_before_what_is_new() -> None:
     connection.up, connection.room = True, 100
     outbox.resend([a, b, status])
     a.value = 4
-    outbox.mark(a)  # while what was kept is still on its way
+    outbox.mark(a)  # while the backlog is being sent
     outbox.flush()
     assert connection.sent == ["a1!", "b3!", "a2!", "a3!", "a4!", "a4", "b3", "s0"]
     a.value = 5
@@ -94,7 +94,7 @@ def test_what_was_lost_and_what_waited_comes_before_what_is_new() -> None:
     assert connection.sent[-1] == "a5"
 
 
-def test_the_oldest_go_when_there_is_no_room() -> None:
+def test_the_oldest_messages_are_dropped_when_the_backlog_is_full() -> None:
     connection = FakeConnection()
     connection.up = False
     outbox, a = Outbox(connection, connection, 3 * (OVERHEAD_BYTES + 1)), Counter("a")
@@ -102,7 +102,7 @@ def test_the_oldest_go_when_there_is_no_room() -> None:
     for a.value in range(1, 8):
         outbox.mark(a)
     assert (outbox.backlog, outbox.dropped) == (3, 4)
-    outbox.lose([Message("a", b"0", 1, retain=True, keep=True)])  # older than all of them
+    outbox.lose([Message("a", b"0", 1, retain=True, keep=True)])  # older than all others
     assert (outbox.backlog, outbox.dropped) == (3, 5)
     connection.up = True
     outbox.resend([a])
@@ -110,8 +110,8 @@ def test_the_oldest_go_when_there_is_no_room() -> None:
     assert connection.sent == ["a5!", "a6!", "a7!", "a7"]
 
 
-def test_a_store_that_is_full_when_the_broker_is_back_makes_place_for_the_newest_value() -> None:
-    """What comes then is conflated, not dropped."""
+def test_a_backlog_that_is_full_at_reconnection_accepts_the_newest_value() -> None:
+    """Values that change meanwhile are conflated, not dropped."""
     connection = FakeConnection()
     connection.up = False
     outbox, a = Outbox(connection, connection, OVERHEAD_BYTES + 1), Counter("a")
@@ -126,7 +126,7 @@ def test_a_store_that_is_full_when_the_broker_is_back_makes_place_for_the_newest
     assert (connection.sent, outbox.dropped) == (["a1!", "a3"], 0)
 
 
-def test_results_are_bounded_and_hold_up_no_value() -> None:
+def test_results_are_bounded_and_delay_no_value() -> None:
     values, results = FakeConnection(), FakeConnection()
     outbox = Outbox(values, results, 0)
     results.room = 0
@@ -165,8 +165,8 @@ def test_results_and_values_wait_for_their_own_connection() -> None:
     assert not outbox.busy
 
 
-def test_a_broker_that_takes_less_than_there_is_comes_back_to_the_present() -> None:
-    """Else what changes while the past is told would be put behind it for ever."""
+def test_a_broker_slower_than_the_changes_still_catches_up() -> None:
+    """Otherwise changes during the catch-up would stay in the backlog for ever."""
     connection = FakeConnection()
     connection.up = False
     outbox, topics = Outbox(connection, connection, 10_000), [Counter(name) for name in "abc"]
@@ -185,8 +185,8 @@ def test_a_broker_that_takes_less_than_there_is_comes_back_to_the_present() -> N
     assert outbox.dropped == 0
 
 
-def test_what_changes_after_it_was_shown_is_shown_again() -> None:
-    """What is kept is sent without the retain flag: the broker would go on telling the value before."""
+def test_a_change_after_the_resend_is_sent() -> None:
+    """Messages of the backlog are sent without the retain flag, so the broker would still retain the older value."""
     connection = FakeConnection()
     outbox, a, b = Outbox(connection, connection, 10_000), Counter("a"), Counter("b")
     connection.room = 1

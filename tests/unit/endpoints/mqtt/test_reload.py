@@ -1,4 +1,4 @@
-"""An instance that is reloaded: sources come, go and change; the broker remembers nothing that is no more."""
+"""An instance that is reloaded: sources are added, removed and changed, and stale retained topics are cleared."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SMALLER = Layout(
 )
 
 
-def test_a_source_that_changes_goes_on_and_what_it_no_longer_has_is_forgotten(
+def test_a_changed_source_continues_and_topics_of_removed_registers_are_cleared(
     segment: Segment, broker: Mosquitto
 ) -> None:
     segment.writer("cell").publish(image(position=1.5, step=3), cycle=1)
@@ -47,8 +47,8 @@ def test_a_source_that_changes_goes_on_and_what_it_no_longer_has_is_forgotten(
     assert kept == registers | {"status", "cell/status", "other/status"}
 
 
-def test_what_a_bridge_before_has_published_by_other_rules_is_forgotten(segment: Segment, broker: Mosquitto) -> None:
-    """A reload of the rules starts a bridge anew: nobody would tell any more that those values are old."""
+def test_topics_of_earlier_rules_are_cleared(segment: Segment, broker: Mosquitto) -> None:
+    """A reload of the rules restarts the bridge, which must clear values that no rule updates any more."""
     segment.writer("cell").publish(image(step=1), cycle=1)
     before = [MqttTopic(match="cell/inputs", elements=True), MqttTopic(match="cell", payload="frames")]
     with bridge(segment, broker.address, topic=before) as running:
@@ -71,7 +71,7 @@ def test_what_a_bridge_before_has_published_by_other_rules_is_forgotten(segment:
     assert not topics & {f"{PREFIX}/{topic}" for topic in gone}
 
 
-def test_a_source_that_is_removed_is_forgotten(segment: Segment, broker: Mosquitto) -> None:
+def test_the_topics_of_a_removed_source_are_cleared(segment: Segment, broker: Mosquitto) -> None:
     segment.writer("cell").publish(image(step=3), cycle=1)
     with Segment.open(segment.instance, writable=True) as opened, listening(broker.address) as listener:
         with bridge(opened, broker.address) as running:
@@ -85,7 +85,7 @@ def test_a_source_that_is_removed_is_forgotten(segment: Segment, broker: Mosquit
             assert {topic for topic, payload in later.heard if payload} == {f"{PREFIX}/status"}
 
 
-def test_what_is_removed_while_the_broker_is_away_is_forgotten_when_it_is_back(
+def test_topics_of_a_source_removed_during_an_outage_are_cleared_afterwards(
     segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.1, 0.1))
@@ -106,7 +106,7 @@ def test_what_is_removed_while_the_broker_is_away_is_forgotten_when_it_is_back(
             listener.until(topic, b"")
 
 
-def test_commands_reach_a_source_that_has_come(segment: Segment, broker: Mosquitto) -> None:
+def test_commands_reach_an_added_source(segment: Segment, broker: Mosquitto) -> None:
     segment.writer("cell").publish(image(step=3), cycle=1)
     spec = BlockSpec("other", SMALLER, 10_000_000, STALE_NS, 1 << 20, Attributes("test", ()))
     with (

@@ -1,4 +1,4 @@
-"""Virtual time: a step is over when the broker has all that it changed, and its marker."""
+"""Virtual time: a step is done when the broker has all its changes and its marker."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def coordinator(segment: Segment) -> Iterator[Coordinator]:
 
 
 def changes(listener: Listener) -> list[tuple[str, bytes]]:
-    """What has come up to the next marker, this included."""
+    """Return the messages up to and including the next marker."""
     found = []
     while True:
         message = listener.message()
@@ -69,7 +69,7 @@ def test_a_step_is_delivered_whole_and_in_order(models: Segment, broker: Mosquit
         listener.until("two/row/out")
         for number in (1, 2, 3):
             step = time.step()
-            assert running.bridge.steps.done == step.number  # and not only soon after
+            assert running.bridge.steps.done == step.number  # already now, not only soon
             came = changes(listener)
             assert [topic for topic, _ in came] == [
                 *(f"{source}/{name}/out" for source in ("one", "two") for name in ("count", "doubled", "row")),
@@ -79,7 +79,7 @@ def test_a_step_is_delivered_whole_and_in_order(models: Segment, broker: Mosquit
             assert json.loads(came[-1][1]) == {"step": number, "time_s": step.time_ns / 1e9}
 
 
-def test_many_steps_are_all_told(models: Segment, broker: Mosquitto) -> None:
+def test_each_of_many_steps_is_published(models: Segment, broker: Mosquitto) -> None:
     with listening(broker.address) as listener, bridge(models, broker.address), coordinator(models) as time:
         listener.until("two/row/out")
         for _ in range(200):
@@ -88,8 +88,8 @@ def test_many_steps_are_all_told(models: Segment, broker: Mosquitto) -> None:
             assert ("two/doubled/out", str(2 * number).encode()) in changes(listener)
 
 
-def test_a_broker_that_is_away_holds_up_no_step(models: Segment, broker: Mosquitto) -> None:
-    """What the steps change is kept for it."""
+def test_a_broker_that_is_away_delays_no_step(models: Segment, broker: Mosquitto) -> None:
+    """The changes of the steps are kept for the broker."""
     with (
         FaultProxy(broker.address, framing=None) as proxy,
         listening(broker.address) as listener,
@@ -107,7 +107,7 @@ def test_a_broker_that_is_away_holds_up_no_step(models: Segment, broker: Mosquit
     assert list(counts) == [0, 1, 2, 3, 4, 5]
 
 
-def test_a_broker_that_does_not_answer_is_given_up(
+def test_a_step_stops_waiting_for_a_broker_that_does_not_answer(
     models: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shmio.endpoints.mqtt.steps.PATIENCE_S", 0.2)
@@ -133,7 +133,7 @@ def test_no_step_waits_for_a_bridge_that_has_ended(models: Segment, broker: Mosq
         assert time.step().number == 2
 
 
-def test_when_time_is_released_changes_are_told_as_they_come(instance: str, broker: Mosquitto) -> None:
+def test_after_a_release_changes_are_published_at_once(instance: str, broker: Mosquitto) -> None:
     with (
         _models(instance, "one", virtual=False) as (model,),
         Segment.open(instance, writable=True) as segment,
@@ -144,9 +144,9 @@ def test_when_time_is_released_changes_are_told_as_they_come(instance: str, brok
         listener.until("one/row/out")
         number = time.step(60_000_000_000).number
         while json.loads(changes(listener)[-1][1])["step"] != number:
-            pass  # what was when time was taken over
+            pass  # messages from when control was taken
         model.image[0:4] = (7).to_bytes(4, "big")
-        model.publish(number)  # it waits for a step
+        model.publish(number)  # waits for a step
         time.release()
         assert listener.message().payload == b"7"
         model.image[0:4] = (8).to_bytes(4, "big")

@@ -1,4 +1,4 @@
-"""What others publish on the bridge's topics, at a broker that lets them: corrected, and not for ever."""
+"""Messages that other clients publish on the bridge's topics: corrected, but at a bounded rate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.unit.endpoints.harness import image
 from tests.unit.endpoints.mqtt.harness import PREFIX, bridge, listening
 
 
-def test_what_is_forged_is_told_again_at_once(segment: Segment, broker: Mosquitto) -> None:
+def test_forged_messages_are_corrected_at_once(segment: Segment, broker: Mosquitto) -> None:
     segment.writer("cell").publish(image(step=7), cycle=1)
     with bridge(segment, broker.address) as running, listening(broker.address) as listener:
         listener.shown("cell/step/out", "7")
@@ -59,7 +59,7 @@ def test_two_bridges_of_one_prefix_do_not_answer_each_other_for_ever(
 
 
 class Owner:
-    """Counts what a guard asks for."""
+    """Counts the calls of a guard."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -82,7 +82,7 @@ class Owner:
         self.all += 1
 
 
-def test_corrections_become_rarer_as_long_as_others_go_on() -> None:
+def test_corrections_become_rarer_while_the_forging_continues() -> None:
     owner = Owner()
     for _ in range(100_000):
         owner.guard.report("status")
@@ -101,7 +101,7 @@ def test_corrections_become_rarer_as_long_as_others_go_on() -> None:
     assert len(owner.corrected) < 45
 
 
-def test_many_topics_are_corrected_some_at_a_time_and_too_many_by_telling_all() -> None:
+def test_many_topics_are_corrected_in_portions_and_too_many_by_resending_all() -> None:
     owner = Owner()
     for number in range(AT_ONCE + 1):
         owner.guard.report(f"t{number}")
@@ -114,7 +114,7 @@ def test_many_topics_are_corrected_some_at_a_time_and_too_many_by_telling_all() 
     assert (owner.all, len(owner.corrected)) == (1, AT_ONCE)
 
 
-def test_a_flood_is_not_listened_to_and_then_everything_is_told_again() -> None:
+def test_during_a_flood_the_guard_stops_listening_and_then_resends_everything() -> None:
     owner = Owner()
     rests = []
     for _ in range(3):
@@ -123,7 +123,7 @@ def test_a_flood_is_not_listened_to_and_then_everything_is_told_again() -> None:
         assert owner.watching == 0
         owner.guard.report("status")
         owner.guard.begin()
-        assert owner.watching == 0, "also by another connection"
+        assert owner.watching == 0, "a new connection does not end the pause"
         rests.append(owner.guard.turn())
         owner.now_s += rests[-1]
         told = owner.all

@@ -1,4 +1,4 @@
-"""Subscribe to ``/in``: what anybody writes toward a source, in the order in which it was accepted."""
+"""Subscriptions to ``/in``: every write toward a source, in the order in which the source accepted it."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def with_plant(segment: Segment, test: Callable[[Endpoint, Plant], Awaitable[Non
 
 
 async def joined(served: Endpoint, *paths: str) -> list[Any]:
-    """Streams that miss nothing of what is written from now on."""
+    """Open streams that receive every later write."""
     streams = [served.subscribe(path) for path in paths]
     for stream in streams:
         await stream.initial_metadata()
     return streams
 
 
-def test_who_listens_to_in_sees_what_is_written_by_whomever(segment: Segment, instance: str) -> None:
+def test_a_subscriber_of_in_sees_writes_of_all_clients(segment: Segment, instance: str) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         (stream,) = await joined(served, "cell/step/in")
         await publish(served, [message("cell/step", "5"), message("cell/step", "5"), message("cell/inputs/0", "1")])
@@ -58,7 +58,7 @@ def test_who_listens_to_in_sees_what_is_written_by_whomever(segment: Segment, in
     with_plant(segment, test)
 
 
-def test_its_message_has_the_type_and_the_time(segment: Segment) -> None:
+def test_the_message_has_type_and_time(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         (stream,) = await joined(served, "cell/axis/position/in")
         before = served.segment.clock_ns(0)
@@ -72,7 +72,7 @@ def test_its_message_has_the_type_and_the_time(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_a_bit_is_its_own_and_no_neighbours(segment: Segment) -> None:
+def test_writing_a_bit_is_not_shown_for_its_neighbours(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         running, bit, other = await joined(served, "cell/running/in", "cell/bits/9/in", "cell/bits/8/in")
         await publish(served, [message("cell/running", "true"), message("cell/bits/9", "true")])
@@ -87,7 +87,7 @@ def test_a_bit_is_its_own_and_no_neighbours(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_elements_and_arrays_see_each_others_writes(segment: Segment) -> None:
+def test_element_and_array_subscribers_see_each_others_writes(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         array, element = await joined(served, "cell/inputs/in", "cell/inputs/1/in")
         await publish(served, [message("cell/inputs", "[1,2]")])
@@ -105,7 +105,7 @@ def test_elements_and_arrays_see_each_others_writes(segment: Segment) -> None:
 
 
 def accept(served: Endpoint, command: int, offset: int, data: bytes, *, item: int = 0) -> None:
-    """Tell of a part of an accepted write, as a source does."""
+    """Publish an event for a part of an accepted write, as a source does."""
     served.writer.event(Record(EventKind.ACCEPTED, "", 7, command, item, 1, offset, 0, len(data), data))
 
 
@@ -116,7 +116,7 @@ def test_a_long_write_is_shown_once_and_whole(segment: Segment) -> None:
         for number in range(1, 21):
             for offset, size in ((26, 256), (282, 256), (538, 88)):
                 accept(served, number, offset, bytes([number]) * size)
-                served.publish(image(step=number))  # in the middle of the write, and without it
+                served.publish(image(step=number))  # published during the write and after it
         shown = [await value(array) for _ in range(20)]
         assert [set(text.strip("[]").split(",")) for text in shown] == [{str(number)} for number in range(1, 21)]
         assert [await value(element) for _ in range(20)] == [str(number) for number in range(1, 21)]
@@ -126,7 +126,7 @@ def test_a_long_write_is_shown_once_and_whole(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_who_joins_in_the_middle_of_a_write_is_shown_the_next_one(segment: Segment) -> None:
+def test_a_subscriber_that_joins_during_a_write_sees_only_the_next_one(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         events = served.feeds["cell"].commands._events
 
@@ -157,12 +157,12 @@ async def end(stream: Any) -> tuple[list[str], grpc.aio.AioRpcError]:
             return values, error
 
 
-def test_events_that_were_missed_end_the_stream(segment: Segment) -> None:
+def test_missed_events_end_the_stream(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image())
         step, array = await joined(served, "cell/step/in", "cell/long/in")
-        accept(served, 2, 26, b"\1" * 256)  # nobody will hear of it
-        for number in range(2 * EVENT_SLOTS):  # not once is it the event loop's turn meanwhile
+        accept(served, 2, 26, b"\1" * 256)  # no listener receives it
+        for number in range(2 * EVENT_SLOTS):  # without a turn of the event loop
             accept(served, 3, 282, bytes([number % 256]) * 256)
         for stream in (step, array):
             values, error = await end(stream)
@@ -171,7 +171,7 @@ def test_events_that_were_missed_end_the_stream(segment: Segment) -> None:
             assert "events of source cell were missed" in str(error.details())
         await served.until(lambda: listening(served, 0))
         (again,) = await joined(served, "cell/long/in")
-        accept(served, 3, 538, b"\1" * 88)  # of the command of which it does not know the first part
+        accept(served, 3, 538, b"\1" * 88)  # belongs to a command whose first part it missed
         accept(served, 4, 28, b"\4")
         accept(served, 5, 12, b"\0\0")
         assert (await value(again))[:7] == "[0,0,4,"
@@ -180,13 +180,13 @@ def test_events_that_were_missed_end_the_stream(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_listener_that_is_too_slow_is_told_so(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_listeners_stream_ends_with_the_reason(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.streams.outbox.EVENT_BOUND", 8)
 
     async def test(served: Endpoint) -> None:
         served.publish(image())
         slow, other = await joined(served, "cell/step/in", "cell/inputs/in")
-        for number in range(2, 40):  # not once is it the event loop's turn meanwhile
+        for number in range(2, 40):  # without a turn of the event loop
             accept(served, number, 12, bytes([0, number]))
         accept(served, 40, 10, b"\5\6")
         values, error = await end(slow)
@@ -205,7 +205,7 @@ def test_a_burst_arrives_whole_and_in_order(segment: Segment) -> None:
         streams = await joined(served, "cell/step/in", "cell/step/in")
         block = served.feeds["cell"].block
         sender, events = CommandSender(block, 7), block.events.cursor()
-        for number in range(400):  # not once is it the event loop's turn meanwhile
+        for number in range(400):  # without a turn of the event loop
             command = sender.submit([Write(12, 0, number.to_bytes(2, "big"))], FAR_NS)
             while (event := events.next(TIMEOUT_S)) is not None and event.command != command:
                 pass
@@ -217,14 +217,16 @@ def test_a_burst_arrives_whole_and_in_order(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_several_writes_of_a_part_in_one_command_are_one_value(segment: Segment) -> None:
+def test_several_partial_writes_in_one_command_are_one_value(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         array, word = await joined(served, "cell/long/in", "cell/step/in")
         sender = CommandSender(served.feeds["cell"].block, 7)
         sender.submit([Write(26, 0, b"\1"), Write(28, 0, b"\3"), Write(12, 0, b"\0"), Write(13, 0, b"\4")], FAR_NS)
         assert (await value(array))[:7] == "[1,0,3,"
         assert await value(word) == "4"
-        sender.submit([Write(25, 0, b"\0\5"), Write(24, 0, b"\0")], FAR_NS)  # over the edge of another register
+        sender.submit(
+            [Write(25, 0, b"\0\5"), Write(24, 0, b"\0")], FAR_NS
+        )  # also covers a part of the preceding register
         assert (await value(array))[:7] == "[5,0,3,"
         for stream in (array, word):
             stream.cancel()
@@ -232,7 +234,7 @@ def test_several_writes_of_a_part_in_one_command_are_one_value(segment: Segment)
     with_plant(segment, test)
 
 
-def test_what_is_rejected_is_not_shown(segment: Segment) -> None:
+def test_rejected_writes_are_not_shown(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         (stream,) = await joined(served, "cell/step/in")
         device.commands.close("away")
@@ -245,7 +247,7 @@ def test_what_is_rejected_is_not_shown(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_out_is_shown_as_it_is_read_and_not_as_it_is_written(segment: Segment) -> None:
+def test_a_subscriber_of_out_sees_the_read_value_not_the_written_one(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         out, plain = served.subscribe("cell/step/out"), served.subscribe("cell/step")
         assert (await value(out), await value(plain)) == ("0", "0")

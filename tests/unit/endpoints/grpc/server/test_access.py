@@ -1,4 +1,4 @@
-"""Who may call what: tokens, certificates, and the roles of an address, over real sockets."""
+"""Which client may call what: tokens, certificates, and the roles of an address, over real sockets."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def follow(channel: grpc.aio.Channel, secret: str) -> Any:
     return multi(STEP, metadata=shown(secret), timeout=TIMEOUT_S)
 
 
-def test_a_token_may_what_its_roles_say(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_token_has_exactly_its_roles(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
     async def test(served: Endpoint) -> None:
         async with (
             guarded(served, Listeners(LOCAL).listeners) as (server, (port,)),
@@ -95,7 +95,7 @@ def test_a_token_may_what_its_roles_say(segment: Segment, caplog: pytest.LogCapt
     assert not any(secret in caplog.text for secret in (READER, WRITER, "guessed-"))
 
 
-def test_no_call_of_any_service_passes_without_its_role(segment: Segment) -> None:
+def test_every_call_is_refused_without_its_role(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         nobody = Listener(Address("127.0.0.1", 0), ListenerAccess(Keys(), ()))
         names = ("simulation.", "simlog.", "grpc.health.", "grpc.reflection.")
@@ -115,7 +115,7 @@ def test_no_call_of_any_service_passes_without_its_role(segment: Segment) -> Non
     serve(segment, test)
 
 
-def test_a_call_that_is_not_in_the_table_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_call_without_a_table_entry_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(NEEDS, GET)
 
     async def test(served: Endpoint) -> None:
@@ -128,7 +128,7 @@ def test_a_call_that_is_not_in_the_table_is_refused(segment: Segment, monkeypatc
     serve(segment, test)
 
 
-def test_a_reload_ends_the_streams_of_tokens_that_went_and_no_others(segment: Segment) -> None:
+def test_a_reload_ends_only_the_streams_of_removed_tokens(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
         listeners = Listeners(LOCAL)
@@ -151,13 +151,13 @@ def test_a_reload_ends_the_streams_of_tokens_that_went_and_no_others(segment: Se
             assert server.calls.review() == 1
             assert (await refusal(stays.read()))[0] is DENIED
             listeners.take(Grpc(listen=LOCAL.listen))
-            assert await call(channel, GET), "open, as without tokens"
+            assert await call(channel, GET), "any client may read, as no tokens are configured any more"
             stays.cancel()
 
     serve(segment, test)
 
 
-def test_an_address_gives_its_roles_to_who_shows_nothing(segment: Segment) -> None:
+def test_an_address_gives_its_roles_to_clients_without_a_token(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         config = Grpc(listen=[], token=BOTH, address=[Listening(listen="127.0.0.1:0", roles=["read"])])
         exposed = Listener(Address("127.0.0.1", 0), ListenerAccess(Keys.of(config), ["read"], takes_tokens=False))
@@ -177,7 +177,7 @@ def test_an_address_gives_its_roles_to_who_shows_nothing(segment: Segment) -> No
     serve(segment, test)
 
 
-def test_certificates_have_roles_by_their_names(segment: Segment, tmp_path: Path) -> None:
+def test_the_names_of_a_certificate_give_its_roles(segment: Segment, tmp_path: Path) -> None:
     authority = trustme.CA()
     server_cert = authority.issue_cert("localhost")
     server_cert.private_key_pem.write_to_path(tmp_path / "key.pem")
@@ -210,7 +210,7 @@ def test_certificates_have_roles_by_their_names(segment: Segment, tmp_path: Path
                 assert await call(channel, GET)
                 told, message = await refusal(call(channel, PUBLISH, b""))
                 assert (told, "the certificate of 'dash.lab.example' has read" in message) == (DENIED, True)
-                assert await call(channel, PUBLISH, b"", WRITER) == b"", "roles of both add up"
+                assert await call(channel, PUBLISH, b"", WRITER) == b"", "the roles of certificate and token add up"
             async with as_client("x@example.org", common_name="planner") as channel:
                 assert await call(channel, PUBLISH, b"") == b""
             async with as_client("dash.lab.example.evil.org") as channel:
@@ -220,8 +220,8 @@ def test_certificates_have_roles_by_their_names(segment: Segment, tmp_path: Path
     serve(segment, test)
 
 
-def test_those_who_call_are_told_at_once_however_little_they_send(segment: Segment) -> None:
-    """Before the message of a call has come, and without reading it."""
+def test_a_caller_without_a_token_is_refused_at_once(segment: Segment) -> None:
+    """The refusal comes before the call's message, which is not read."""
 
     async def test(served: Endpoint) -> None:
         async with (

@@ -1,4 +1,4 @@
-"""How many calls there may be, and what becomes of messages that are none."""
+"""Limits on open calls, and messages that cannot be decoded."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STEP = wire.TopicDescriptor(path="cell/step")
 
 
 class Another:
-    """A client with a connection of its own."""
+    """A client with its own connection."""
 
     def __init__(self, served: Endpoint) -> None:
         self._channel = grpc.aio.insecure_channel(f"127.0.0.1:{served.port}", [("grpc.use_local_subchannel_pool", 1)])
@@ -32,7 +32,7 @@ class Another:
         self.streams: list[Any] = []
 
     async def open(self, count: int) -> None:
-        """So many streams, one behind the other."""
+        """Open streams one after another."""
         for _ in range(count):
             stream = self._subscribe(STEP, timeout=TIMEOUT_S)
             self.streams.append(stream)
@@ -50,7 +50,7 @@ class Another:
         await self._channel.close()
 
 
-def test_connections_beyond_the_limit_are_closed_and_the_others_go_on(segment: Segment) -> None:
+def test_connections_beyond_the_limit_are_closed_and_open_ones_continue(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image())
         polite = Another(served)
@@ -61,12 +61,12 @@ def test_connections_beyond_the_limit_are_closed_and_the_others_go_on(segment: S
             reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
             with suppress(ConnectionResetError):
                 async with asyncio.timeout(TIMEOUT_S):
-                    assert await reader.read() == b"", "it is not even greeted"
+                    assert await reader.read() == b"", "it gets no greeting"
             writer.close()
             with suppress(ConnectionResetError):
                 await writer.wait_closed()
         await polite.open(1)
-        assert await value(polite.streams[1]), "who is there goes on"
+        assert await value(polite.streams[1]), "open streams continue"
         await idle[0].drop(reset=True)
 
         async def room() -> bool:
@@ -95,7 +95,7 @@ async def until_calls(served: Endpoint, count: int) -> None:
     await served.until(reached)
 
 
-def test_one_client_cannot_have_all_calls_and_no_more_than_there_are_are_open(segment: Segment) -> None:
+def test_one_client_cannot_take_all_calls_and_their_total_is_limited(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
         clients = [Another(served) for _ in range(3)]
@@ -125,14 +125,14 @@ def test_one_client_cannot_have_all_calls_and_no_more_than_there_are_are_open(se
 
 
 def test_the_limits_hold_as_documented(segment: Segment) -> None:
-    """With the numbers of the page on roles and limits: 4,096 in all, of which one client leaves 1,024."""
+    """The numbers of the page on roles and limits: 4,096 calls, of which one client leaves 1,024."""
 
     async def test(served: Endpoint) -> None:
         method, request = "/simulation.server.SimlogAPI/Subscribe", STEP.SerializeToString()
         greedy, *others = [await http2.Connection.open(served.port) for _ in range(17)]
         reading = asyncio.create_task(greedy.reader.read())
         calls = [http2.call(method, request, 2 * number + 1) for number in range(3073)]
-        await greedy.send(b"".join(calls[:3072]))  # at once, of which none gets lost
+        await greedy.send(b"".join(calls[:3072]))  # in one burst, of which no call is lost
         await until_calls(served, 3072)
         await greedy.send(calls[3072])
         await refused(served, 1)
@@ -158,7 +158,7 @@ async def refused(served: Endpoint, count: int) -> None:
     await served.until(reached)
 
 
-def test_a_call_without_its_message_ends(segment: Segment) -> None:
+def test_a_call_that_sends_no_message_is_ended(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         silent: Any = served.channel.stream_unary(GET)(timeout=TIMEOUT_S)
         assert await refusal(silent) == (
@@ -177,15 +177,15 @@ PUBLISHES = [method for method in NEEDS if method.endswith("/Publish")]
 
 
 @pytest.mark.parametrize("method", [method for method in NEEDS if method not in PUBLISHES])
-def test_bytes_that_are_no_message_are_refused_in_a_word(
+def test_undecodable_bytes_are_refused_without_a_log_line(
     segment: Segment, method: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Of Publish they are passed over, which its own tests show."""
+    """Publish skips them instead; its own tests check that."""
 
     async def test(served: Endpoint) -> None:
         call: Any = served.channel.unary_unary(method)
         told, message = await refusal(call(b"\xff" * 7, timeout=TIMEOUT_S))
-        if told is not grpc.StatusCode.UNIMPLEMENTED:  # it has no message, or is not there yet
+        if told is not grpc.StatusCode.UNIMPLEMENTED:  # it takes no message, or is not served yet
             assert (told, message) == (
                 grpc.StatusCode.INVALID_ARGUMENT,
                 f"{method}: 7 bytes are not a valid message of this call",
@@ -208,11 +208,11 @@ def test_bytes_that_are_no_message_are_refused_in_a_word(
         ("ipv4:10.0.0.5:5001", "dash", "token dash"),
     ],
 )
-def test_a_client_is_a_token_or_a_host_or_here_a_connection(peer: str, token: str | None, client: str) -> None:
+def test_clients_are_counted_by_token_host_or_local_connection(peer: str, token: str | None, client: str) -> None:
     assert client_of(peer, token) == client
 
 
-def test_a_turn_has_few_lines_and_the_rest_is_told_at_its_end(caplog: pytest.LogCaptureFixture) -> None:
+def test_refusals_beyond_a_few_lines_are_logged_as_a_count(caplog: pytest.LogCaptureFixture) -> None:
     async def test() -> None:
         refusals = Refusals(turn_s=0.01)
         for number in range(3 * LINES):
@@ -222,7 +222,7 @@ def test_a_turn_has_few_lines_and_the_rest_is_told_at_its_end(caplog: pytest.Log
             f"publish refused: reason {number}" for number in range(LINES)
         ]
         async with asyncio.timeout(20):
-            while len(caplog.records) <= LINES:  # noqa: ASYNC110  the log is what is waited for
+            while len(caplog.records) <= LINES:  # noqa: ASYNC110  waits for a log line
                 await asyncio.sleep(0)
         assert caplog.records[-1].getMessage() == f"publish refused: {2 * LINES} more in 0.01 s"
         refusals.add("once more", "cell/a", "ipv4:127.0.0.1:5")

@@ -1,4 +1,4 @@
-"""Health as its standard clients see it, and beside one that takes nothing."""
+"""The health service, with a standard client and with a watcher that does not read."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ async def told(watch: Any) -> int:
     return int((await asyncio.wait_for(watch.read(), TIMEOUT_S)).status)
 
 
-def test_watchers_are_told_changes_and_the_end(segment: Segment) -> None:
+def test_watchers_receive_changes_and_the_end(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         server = Server(served.service.calls)
         [port] = await server.start([LOOPBACK])
@@ -48,7 +48,7 @@ def test_watchers_are_told_changes_and_the_end(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_watcher_that_takes_nothing_keeps_no_news_from_others(segment: Segment) -> None:
+def test_a_watcher_that_does_not_read_delays_no_other(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         server = Server(served.service.calls)
         [port] = await server.start([LOOPBACK])

@@ -1,4 +1,4 @@
-"""Clients leave the process its descriptors, its memory and the event loop's time."""
+"""Limits of file descriptors, memory and event-loop time that clients can use."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ INFINITE = resource.RLIM_INFINITY
         (64, 64, 1, 64),
     ],
 )
-def test_the_limit_is_raised_as_far_as_it_may_be(
+def test_the_limit_of_open_files_is_raised_as_far_as_allowed(
     monkeypatch: pytest.MonkeyPatch, soft: int, hard: int, connections: int, after: int
 ) -> None:
     limits = [soft, hard]
@@ -47,7 +47,7 @@ def test_the_limit_is_raised_as_far_as_it_may_be(
     assert limits == [after, hard]
 
 
-def test_so_few_connections_that_programs_are_turned_away_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shortage_of_connections_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (64, 64))
     told = shortage(1, 2048)
     assert told.startswith(
@@ -57,11 +57,11 @@ def test_so_few_connections_that_programs_are_turned_away_are_told(monkeypatch: 
     assert shortage(2, 2) == ""
 
 
-def test_free_memory_is_given_back_again_and_again_after_a_flood() -> None:
+def test_free_memory_is_returned_repeatedly_after_a_flood() -> None:
     now_s, trims = 100.0, []
     trimmer = Trimmer(lambda: now_s, lambda _: trims.append(now_s))
     trimmer.look(FLOOD_CALLS - 1)
-    assert trims == [], "a few calls are no flood"
+    assert trims == [], "a few calls do not count as a flood"
     trimmer.look(FLOOD_CALLS)
     for _ in range(200):
         now_s += EVERY_S / 2
@@ -69,7 +69,7 @@ def test_free_memory_is_given_back_again_and_again_after_a_flood() -> None:
     assert trims == [100.0 + EVERY_S * number for number in range(round(AFTER_S / EVERY_S))]
 
 
-def test_others_get_their_turn_between_items_that_take_long() -> None:
+def test_other_tasks_run_between_slow_items() -> None:
     seen: list[str] = []
 
     async def work() -> None:

@@ -1,4 +1,4 @@
-"""The table of roles has every call that the endpoint serves, and none that nobody knows."""
+"""The table of roles has every call that the endpoint serves, and no unknown one."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_every_call_that_is_served_has_its_role(segment: Segment) -> None:
     serve(segment, test)
     own = set().union(*(calls(pool.FindServiceByName(name)) for name in names))
     assert own <= set(NEEDS), (
-        f"not in shmio/endpoints/grpc/server/access.py, and so refused: {sorted(own - set(NEEDS))}"
+        f"refused, as they are missing in shmio/endpoints/grpc/server/access.py: {sorted(own - set(NEEDS))}"
     )
     for module in (health_pb2, reflection_pb2):
         (service,) = module.DESCRIPTOR.services_by_name.values()

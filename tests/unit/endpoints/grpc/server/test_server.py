@@ -1,4 +1,4 @@
-"""A server that nobody can stop from outside."""
+"""Clients cannot stop the server, whatever they call."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ async def known(channel: grpc.aio.Channel) -> bool:
 
 
 async def refused(server: Server, flood: Flood, calls: int) -> None:
-    """Wait until so many calls more were refused."""
+    """Wait until this many more calls were refused."""
     until = flood.answered + calls
     async with asyncio.timeout(TIMEOUT_S):
-        while flood.answered < until:  # noqa: ASYNC110  it is another thread's doing
+        while flood.answered < until:  # noqa: ASYNC110  another thread changes it
             await asyncio.sleep(0.01)
     assert server.unknown >= until
     assert server.alive
 
 
-def test_calls_of_unknown_names_stop_nobody(
+def test_calls_to_unknown_methods_do_not_stop_the_server(
     segment: Segment, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """By TCP, by TLS and by a UNIX socket."""
+    """Tested by TCP, by TLS and by a UNIX socket."""
     authority = trustme.CA()
     certificate = authority.issue_cert("localhost")
     certificate.private_key_pem.write_to_path(tmp_path / "key.pem")
@@ -90,7 +90,7 @@ def test_calls_of_unknown_names_stop_nobody(
                         call: Any = after.unary_unary(UNKNOWN.decode())
                         assert await code(call(b"", timeout=TIMEOUT_S)) is grpc.StatusCode.UNIMPLEMENTED
                     served.publish(image(step=number + 100))
-                    assert await value(stream) == str(number + 100), "what is open goes on"
+                    assert await value(stream) == str(number + 100), "open streams continue"
                     await refused(server, flood, 100)
                 assert flood.lost == 0
                 stream.cancel()
@@ -101,7 +101,9 @@ def test_calls_of_unknown_names_stop_nobody(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_grpcio_without_what_we_build_on_is_refused_at_start(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grpcio_without_the_needed_internals_is_refused_at_start(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def test(served: Endpoint) -> None:
         with pytest.raises(EndpointError, match=r"grpcio \S+ lacks _ServicerContext.* install another version"):
             await Server(served.service.calls).start([LOOPBACK])
@@ -115,8 +117,8 @@ def test_grpcio_without_what_we_build_on_is_refused_at_start(segment: Segment, m
     asyncio.run(run())
 
 
-def test_an_endpoint_that_serves_no_more_says_so(segment: Segment) -> None:
-    """Its process ends then: gRPC does not survive a second server in it."""
+def test_a_stopped_server_is_not_alive(segment: Segment) -> None:
+    """Its process exits then: gRPC does not survive a second server in one process."""
 
     async def test(served: Endpoint) -> None:
         assert served.server.alive
@@ -126,7 +128,7 @@ def test_an_endpoint_that_serves_no_more_says_so(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_headers_that_are_no_text_leave_nothing_in_the_log(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+def test_undecodable_headers_log_nothing(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
     field = b"\0\1x\2\xff\xfe"
 
     async def test(served: Endpoint) -> None:

@@ -1,4 +1,4 @@
-"""Publish as clients do it, the rude ones too; a device on the other side."""
+"""Publish, with well-behaved and misbehaving clients, and a device behind the source."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def message(path: str, value: str = "", kind: str = "double", **content: Any) ->
 
 
 async def publish(served: Endpoint, messages: Iterable[wire.PubRequest]) -> None:
-    """Send all at once, half-close, and wait for the answer."""
-    await served.stub.Publish(iter(messages), timeout=9 * TIMEOUT_S)  # a busy host takes its time for 10 000
+    """Send all messages at once, half-close, and wait for the answer."""
+    await served.stub.Publish(iter(messages), timeout=9 * TIMEOUT_S)  # a busy host is slow with 10 000
 
 
 def counted(served: Endpoint) -> tuple[int, int]:
@@ -70,7 +70,7 @@ def with_plant(segment: Segment, test: Callable[[Endpoint, Plant], Awaitable[Non
 @pytest.mark.parametrize(
     "path", ["cell/step", "cell/step/in", "/cell/step/in", "step", "CELL://step/in", "cell://step", "cell:///step/in"]
 )
-def test_a_topic_is_named_as_in_get_topic(segment: Segment, path: str) -> None:
+def test_topic_paths_are_those_of_get_topic(segment: Segment, path: str) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await publish(served, [message(path, "7")])
         assert device.memory[12:14] == b"\0\7"
@@ -96,7 +96,7 @@ def test_a_topic_is_named_as_in_get_topic(segment: Segment, path: str) -> None:
         ("cell/long", str([7] * 600), 26, bytes([7]) * 600),
     ],
 )
-def test_values_are_read_as_java_prints_them_whatever_the_type_says(
+def test_values_are_parsed_as_java_prints_them_whatever_the_type(
     segment: Segment, path: str, text: str, offset: int, expected: bytes
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
@@ -118,7 +118,7 @@ def test_a_bit_leaves_its_neighbours_alone(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_a_time_stamp_beside_the_value_does_not_matter(segment: Segment) -> None:
+def test_a_time_stamp_in_the_message_is_ignored(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await publish(served, [message("cell/step", "3", timeStamp=wire.Header(seq=1))])
         assert device.memory[13] == 3
@@ -152,7 +152,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("wrong", "reason"), WRONG, ids=[reason[:30] for _, reason in WRONG])
-def test_what_is_wrong_is_counted_and_told_and_the_stream_goes_on(
+def test_invalid_values_are_counted_and_logged_and_the_stream_continues(
     segment: Segment, caplog: pytest.LogCaptureFixture, wrong: wire.PubRequest, reason: str
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
@@ -167,11 +167,11 @@ def test_what_is_wrong_is_counted_and_told_and_the_stream_goes_on(
     assert len(line.getMessage()) < 500
 
 
-def test_bytes_that_are_no_message_do_not_end_the_stream(segment: Segment) -> None:
+def test_undecodable_bytes_do_not_end_the_stream(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         raw: Any = served.channel.stream_unary(PUBLISH)
         good = message("cell/step", "1").SerializeToString()
-        utf8 = b"\x0a\x03\x0a\x01\xff"  # a path that is not UTF-8
+        utf8 = b"\x0a\x03\x0a\x01\xff"  # path that is not UTF-8
         await raw(iter([good, b"\xff\xff\xff", utf8, message("cell/step", "2").SerializeToString()]), timeout=TIMEOUT_S)
         assert counted(served) == (2, 2)
         assert device.memory[13] == 2
@@ -179,7 +179,7 @@ def test_bytes_that_are_no_message_do_not_end_the_stream(segment: Segment) -> No
     with_plant(segment, test)
 
 
-def test_half_close_at_once_is_answered(segment: Segment) -> None:
+def test_an_immediate_half_close_is_answered(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await publish(served, [])
         assert counted(served) == (0, 0)
@@ -187,7 +187,7 @@ def test_half_close_at_once_is_answered(segment: Segment) -> None:
     with_plant(segment, test, running=False)
 
 
-def test_the_answer_comes_when_the_device_has_everything_and_not_before(segment: Segment) -> None:
+def test_the_answer_comes_once_the_device_has_every_value(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         answer = asyncio.ensure_future(publish(served, [message("cell/step", str(n)) for n in range(1, 4)]))
         await waiting(served, device, 3)
@@ -208,7 +208,7 @@ async def waiting(served: Endpoint, device: Plant, items: int) -> None:
     await served.until(reached)
 
 
-def test_ten_thousand_at_once_keep_their_order(segment: Segment) -> None:
+def test_ten_thousand_values_at_once_keep_their_order(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await publish(served, [message("cell/step", str(n)) for n in range(10_000)])
         assert counted(served) == (10_000, 0)
@@ -219,7 +219,7 @@ def test_ten_thousand_at_once_keep_their_order(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_ten_thousand_wrong_ones_do_not_fill_the_log(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+def test_ten_thousand_invalid_values_do_not_fill_the_log(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         begun_s = time.monotonic()
         await publish(served, [message("cell/nothing", str(n)) for n in range(10_000)])
@@ -233,7 +233,7 @@ def test_ten_thousand_wrong_ones_do_not_fill_the_log(segment: Segment, caplog: p
     assert 0 < len(caplog.records) <= turns[0] * (LINES + 1)
 
 
-def test_a_connection_dropped_in_the_middle_leaves_what_was_received_to_be_done_in_silence(
+def test_received_values_are_written_though_the_connection_drops(
     segment: Segment, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
@@ -255,7 +255,7 @@ def test_a_connection_dropped_in_the_middle_leaves_what_was_received_to_be_done_
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
-def test_a_client_that_leaves_while_it_is_slowed_down_loses_nothing_that_was_received(segment: Segment) -> None:
+def test_received_values_are_written_though_a_slowed_client_cancels(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         call: Any = served.channel.stream_unary(PUBLISH)()
         for number in range(2000):
@@ -280,7 +280,9 @@ async def idle(served: Endpoint) -> bool:
     return not served.feeds["cell"].commands._in_flight and not served.service._publisher._waiting
 
 
-def test_what_the_device_refuses_is_refused(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+def test_values_that_the_device_refuses_are_counted_and_logged(
+    segment: Segment, caplog: pytest.LogCaptureFixture
+) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         device.refusal = "the address does not exist"
         await publish(served, [message("cell/step", "1"), message("cell/bits", str([1] * 10))])
@@ -302,14 +304,14 @@ def test_a_source_that_is_not_connected_refuses_at_once(segment: Segment, caplog
     assert "rejected: the source is not connected: cable out" in caplog.text
 
 
-def test_what_was_meant_for_a_source_before_its_restart_is_never_done(
+def test_commands_for_an_earlier_process_of_the_source_are_never_done(
     segment: Segment, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def test(served: Endpoint) -> None:
         async with plant(served, running=False) as first:
             answer = asyncio.ensure_future(publish(served, [message("cell/step", "1")]))
             await waiting(served, first, 1)
-        # It took one, which nobody will hear of again; two more lie in the queue when it is gone.
+        # The first process took one command and never answers it; two more are in the queue after its end.
         late = asyncio.ensure_future(publish(served, [message("cell/step", "2"), message("cell/inputs/0", "9")]))
 
         async def sent() -> bool:
@@ -333,7 +335,7 @@ def test_what_was_meant_for_a_source_before_its_restart_is_never_done(
     assert caplog.text.count("it was for an earlier process of the source") == 2
 
 
-def test_a_source_that_says_nothing_holds_nobody_for_long(
+def test_a_source_that_does_not_answer_delays_publishers_only_briefly(
     segment: Segment, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", 0)
@@ -342,7 +344,7 @@ def test_a_source_that_says_nothing_holds_nobody_for_long(
         async with endpoint(segment) as served:
             await publish(served, [message("cell/step", str(n)) for n in range(3000)])
             assert counted(served) == (0, 3000)
-            monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)  # now it is to have the time to answer
+            monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)  # from now on the source has time to answer
             served.writer = segment.writer("cell")
             async with plant(served) as device:
                 await publish(served, [message("cell/step", "3")])
@@ -365,7 +367,7 @@ def test_a_source_that_a_reload_ends_refuses_at_once(segment: Segment, caplog: p
     assert caplog.text.count("the source was changed or removed by a reload") == 2
 
 
-def test_others_are_served_while_it_is_found_out_what_is_writable(
+def test_the_event_loop_runs_while_the_writable_registers_are_computed(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, known = threading.Event(), threading.Event()
@@ -392,7 +394,7 @@ def test_others_are_served_while_it_is_found_out_what_is_writable(
     with_plant(segment, test)
 
 
-def test_two_writers_meet_in_the_order_the_source_decides(segment: Segment, instance: str) -> None:
+def test_the_source_decides_the_order_of_two_writers(segment: Segment, instance: str) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         events = served.writer.block.events.cursor()
         with shmio.attach(instance, writable=True) as guest:

@@ -1,4 +1,4 @@
-"""Version 1's Inject, over real sockets: between who publishes and the device, or the source and who subscribes."""
+"""Inject of version 1, over real sockets: between publishers and the device, or between source and subscribers."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ async def seen(stream: Any, wanted: str) -> None:
         pass
 
 
-def test_what_is_written_goes_to_the_injector_and_what_it_publishes_to_the_device(segment: Segment) -> None:
+def test_on_in_the_injector_gets_writes_and_the_device_gets_its_values(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         originals = await laid(served, "cell/step/in", "cell/step/shadow")
         await publish(served, ("cell/step/in", "7"), ("cell/step", "7"), ("cell/step/in", "9"))
         assert [await value(originals) for _ in range(3)] == ["7", "7", "9"]
-        assert counted(served) == (3, 0), "who published cannot tell"
+        assert counted(served) == (3, 0), "the publisher does not notice"
         assert device.written == []
         await publish(served, ("cell/step/shadow", "8"))
         assert device.memory[12:14] == b"\0\x08"
@@ -66,18 +66,18 @@ def test_what_is_written_goes_to_the_injector_and_what_it_publishes_to_the_devic
         await publish(served, ("cell/step/in", "5"))
         assert device.memory[12:14] == b"\0\5"
         await publish(served, ("cell/step/shadow", "6"))
-        assert counted(served) == (5, 1), "the shadow is gone with its injection"
+        assert counted(served) == (5, 1), "the shadow ends with its injection"
 
     with_plant(segment, test)
 
 
-def test_consumers_get_what_the_injector_publishes_and_it_what_the_source_delivers(segment: Segment) -> None:
+def test_on_out_consumers_get_the_injectors_values_and_it_gets_the_sources(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await publish(served, ("cell/step", "3"))
         consumer = served.subscribe("cell/step")
         await seen(consumer, "3")
         originals = await laid(served, "cell/step/out", "cell/step/shadow")
-        assert await value(originals) == "3", "the present value first"
+        assert await value(originals) == "3", "the current value first"
         await publish(served, ("cell/step/shadow", "-1"))
         assert await value(consumer) == "-1"
         await publish(served, ("cell/step", "4"))
@@ -94,10 +94,10 @@ def test_consumers_get_what_the_injector_publishes_and_it_what_the_source_delive
     with_plant(segment, test)
 
 
-def test_until_its_first_value_consumers_hold_the_last_one(segment: Segment) -> None:
+def test_consumers_keep_the_last_value_until_the_injector_gives_one(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await publish(served, ("cell/step", "3"))
-        originals = await laid(served, "cell/step", "s")  # without a suffix: over /out
+        originals = await laid(served, "cell/step", "s")  # without a suffix it is on /out
         await publish(served, ("cell/step", "4"))
         await seen(originals, "4")
         assert await value(served.subscribe("cell/step")) == "3"
@@ -106,7 +106,7 @@ def test_until_its_first_value_consumers_hold_the_last_one(segment: Segment) -> 
     with_plant(segment, test)
 
 
-def test_the_shadow_is_a_topic_of_its_own_while_the_injection_stands(segment: Segment) -> None:
+def test_the_shadow_is_a_topic_while_the_injection_lasts(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         shadow = wire.TopicDescriptor(path=f"/{SHADOW}")
         assert await code(served.stub.GetTopic(shadow)) is Status.NOT_FOUND
@@ -127,7 +127,7 @@ def test_the_shadow_is_a_topic_of_its_own_while_the_injection_stands(segment: Se
     with_plant(segment, test)
 
 
-def test_several_streams_join_one_injection_and_the_last_one_lifts_it(segment: Segment) -> None:
+def test_several_streams_share_an_injection_and_the_last_lifts_it(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         streams = [await laid(served, path, "s") for path in ("cell/step/in", "CELL://step/in", "/step/in")]
         assert len(standing(served)) == 1
@@ -162,7 +162,7 @@ def test_elements_and_whole_arrays(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         whole = await laid(served, "cell/inputs/in", "a")
         await publish(served, ("cell/inputs", "[1, 2]"), ("cell/inputs/1", "3"))
-        assert [await value(whole) for _ in range(2)] == ["[1,2]", "[1,3]"], "with what was written before"
+        assert [await value(whole) for _ in range(2)] == ["[1,2]", "[1,3]"], "the other elements as last written"
         await publish(served, ("a", "[4, 5]"))
         assert device.memory[10:12] == b"\4\5"
         bit = await laid(served, "cell/bits/9/in", "b")
@@ -178,7 +178,7 @@ def test_elements_and_whole_arrays(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_injections_over_each_other_are_a_chain(segment: Segment) -> None:
+def test_injections_on_one_register_form_a_chain(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         inner, outer = await laid(served, "cell/step/in", "i"), await laid(served, "cell/step/in", "o")
         await publish(served, ("cell/step", "1"))
@@ -197,13 +197,13 @@ def test_injections_over_each_other_are_a_chain(segment: Segment) -> None:
         await publish(served, ("i", "4"))
         await seen(consumer, "4")
         outer = await laid(served, "cell/step", "o")
-        assert await value(outer) == "4", "what the inner one gives"
+        assert await value(outer) == "4", "the inner injection's value"
         await publish(served, ("o", "5"), ("i", "6"), ("cell/step", "7"))
         await seen(consumer, "5")
         assert await value(outer) == "6"
         assert await value(inner) == "7"
         inner.cancel()
-        assert await value(outer) == "7", "the source's own again"
+        assert await value(outer) == "7", "the source's value again"
         outer.cancel()
         await seen(consumer, "7")
 
@@ -231,7 +231,7 @@ def test_injections_over_each_other_are_a_chain(segment: Segment) -> None:
         ),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(
+def test_invalid_injections_are_refused_with_the_reason(
     segment: Segment, target: str, shadow: str, status: Status, reason: str
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
@@ -247,7 +247,7 @@ def test_what_cannot_be_is_refused_by_name(
     with_plant(segment, test)
 
 
-def test_toward_a_device_that_is_not_armed_it_is_refused_and_over_out_is_not(segment: Segment) -> None:
+def test_an_unarmed_source_refuses_injections_on_in_but_not_on_out(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         device = Plant(served.writer, armed=False)
         device.cycle()
@@ -264,7 +264,7 @@ def test_toward_a_device_that_is_not_armed_it_is_refused_and_over_out_is_not(seg
     serve(segment, test)
 
 
-def test_no_shadow_path_is_too_odd(segment: Segment) -> None:
+def test_unusual_shadow_paths_work(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         for shadow in (
             "a//b",
@@ -284,7 +284,7 @@ def test_no_shadow_path_is_too_odd(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_while_quality_is_bad_no_original_is_sent_and_on_recovery_it_is_again(segment: Segment) -> None:
+def test_originals_are_sent_again_when_quality_recovers(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         device.cycle()
         originals = await laid(served, "cell/step", "s")
@@ -301,7 +301,7 @@ def test_while_quality_is_bad_no_original_is_sent_and_on_recovery_it_is_again(se
     with_plant(segment, test, running=False)
 
 
-def test_somebody_else_may_lift_it_and_the_stream_says_so(segment: Segment) -> None:
+def test_the_stream_ends_with_a_reason_when_another_client_lifts_it(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         for target in ("cell/step/in", "cell/step/out"):
             originals = await laid(served, target, "s")
@@ -320,24 +320,24 @@ async def _end(stream: Any) -> tuple[Status, str] | None:
 
 
 async def _next(stream: Any) -> tuple[Any, tuple[Status, str] | None]:
-    """A message, or how the stream has ended."""
+    """Return a message, or the status with which the stream has ended."""
     try:
         return await stream.read(), None
     except grpc.aio.AioRpcError as error:
         return None, (error.code(), str(error.details()))
 
 
-def test_a_client_that_does_not_read_what_is_written_loses_its_injection_and_no_value_silently(
+def test_a_client_that_does_not_read_originals_loses_its_injection(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.streams.outbox.EVENT_BOUND", 20)
 
     async def test(served: Endpoint, device: Plant) -> None:
-        # The client's window is filled value by value, which takes a busy machine its time.
+        # Fills the client's window value by value, which is slow on a busy host.
         originals = await laid(served, "cell/long/in", "s", timeout=9 * TIMEOUT_S)
         sent: list[str] = []
         while standing(served):
-            # One by one: on a busy machine more than the bound would come at once, before any of it could be sent.
+            # One by one: a busy host would otherwise queue more than the bound before it could send any.
             sent.append(str([len(sent) % 256] * 600))
             await publish(served, ("cell/long", sent[-1]))
         got, told = [], None
@@ -374,7 +374,7 @@ async def _drop(served: Endpoint, stream: Any) -> None:
 
 @pytest.mark.parametrize("ending", [_deadline, _cancel, _drop])
 @pytest.mark.parametrize("target", ["cell/step/in", "cell/step/out"])
-def test_however_a_stream_ends_its_shadow_goes(segment: Segment, target: str, ending: Ending) -> None:
+def test_however_a_stream_ends_its_injection_is_lifted(segment: Segment, target: str, ending: Ending) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         stream = inject(served, target, "s", timeout=1 if ending is _deadline else TIMEOUT_S)
         await stream.initial_metadata()
@@ -390,7 +390,7 @@ def test_however_a_stream_ends_its_shadow_goes(segment: Segment, target: str, en
     with_plant(segment, test)
 
 
-def test_a_call_that_is_gone_before_it_is_answered_leaves_nothing(segment: Segment) -> None:
+def test_a_call_cancelled_before_its_answer_leaves_no_injection(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         for turn in range(20):
             stream = inject(served, "cell/step/in", "s")
@@ -406,10 +406,10 @@ def test_a_call_that_is_gone_before_it_is_answered_leaves_nothing(segment: Segme
     with_plant(segment, test)
 
 
-def test_what_is_published_while_it_is_laid_is_its_own(segment: Segment) -> None:
+def test_a_value_published_to_the_shadow_before_the_injection_is_laid_counts(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         call: Any = served.stub.Publish(timeout=TIMEOUT_S)
-        with device.output.turn:  # the source takes its time
+        with device.output.turn:  # delays the source's answer
             stream = inject(served, "cell/step/in", "s")
 
             async def named() -> bool:
@@ -435,7 +435,7 @@ def test_what_is_published_while_it_is_laid_is_its_own(segment: Segment) -> None
     with_plant(segment, test)
 
 
-def test_a_source_that_does_not_answer_refuses_it_and_lays_nothing_later(
+def test_an_injection_that_the_source_does_not_answer_is_never_laid(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", 0)
@@ -459,7 +459,7 @@ def test_a_source_that_does_not_answer_refuses_it_and_lays_nothing_later(
     serve(segment, test)
 
 
-def test_at_most_so_many_at_once(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_injections_is_limited(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.services.injection.MAX_INJECTIONS", 2)
 
     async def test(served: Endpoint, device: Plant) -> None:
@@ -474,7 +474,7 @@ def test_at_most_so_many_at_once(segment: Segment, monkeypatch: pytest.MonkeyPat
     with_plant(segment, test)
 
 
-def test_a_program_lays_one_beneath_or_above_those_of_clients(segment: Segment) -> None:
+def test_a_program_can_inject_beneath_those_of_clients(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         originals = await laid(served, "cell/step", "s")
         await value(originals)
@@ -489,7 +489,7 @@ def test_a_program_lays_one_beneath_or_above_those_of_clients(segment: Segment) 
     with_plant(segment, test)
 
 
-def test_publishing_to_a_shadow_is_counted_and_its_refusals_logged(
+def test_values_published_to_a_shadow_are_counted_and_refusals_logged(
     segment: Segment, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
@@ -502,7 +502,7 @@ def test_publishing_to_a_shadow_is_counted_and_its_refusals_logged(
     with_plant(segment, test)
 
 
-def test_what_declared_injections_further_in_make_of_it_is_in_the_originals(segment: Segment) -> None:
+def test_originals_include_the_effect_of_inner_declared_injections(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         consumer = served.subscribe("cell/step")
         program = SourceWriter(segment.blocks["cell"], GUEST)

@@ -1,4 +1,4 @@
-"""Version 2's single calls, over real sockets: what a topic is, writing, reading, and the whole as clients call it."""
+"""The unary calls of version 2, over real sockets: topic info, Write, Read, and a whole session of a client."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PUBLISH = "/simlog.server.SimlogAPI/Publish"
 
 
 def request(path: str, value: Any = None, **kind: Any) -> v2.PubRequest:
-    """A value for a topic: as JSON has it, or one of Value's kinds by name."""
+    """Return a request that gives a topic a value: as in JSON, or one of Value's kinds by name."""
     data = Value(**kind) if kind else ParseDict(value, Value())
     return v2.PubRequest(topic=path, data=v2.SimlogMessage(type=v2.NULL, value=data))  # the type does not matter
 
@@ -56,7 +56,7 @@ async def read(served: Endpoint, *paths: str) -> list[tuple[int, str, Any]]:
         ("cell/axis/in", v2.STRUCT, v2.IN),
     ],
 )
-def test_what_a_topic_is(segment: Segment, path: str, kind: int, direction: int) -> None:
+def test_topic_info_gives_type_and_direction(segment: Segment, path: str, kind: int, direction: int) -> None:
     async def test(served: Endpoint) -> None:
         info = await served.v2.GetTopicInfo(v2.TopicInfoRequest(path=path), timeout=TIMEOUT_S)
         assert (info.path, info.type, info.direction, info.exists) == (path, kind, direction, True)
@@ -80,7 +80,7 @@ UNKNOWN = [
 
 
 @pytest.mark.parametrize("path", UNKNOWN)
-def test_what_does_not_exist_is_told_without_an_error_and_else_not_found(segment: Segment, path: str) -> None:
+def test_an_unknown_topic_has_empty_info_and_other_calls_fail_with_not_found(segment: Segment, path: str) -> None:
     async def test(served: Endpoint) -> None:
         info = await served.v2.GetTopicInfo(v2.TopicInfoRequest(path=path), timeout=TIMEOUT_S)
         assert info == v2.TopicInfo(path=path)
@@ -98,8 +98,8 @@ def test_what_does_not_exist_is_told_without_an_error_and_else_not_found(segment
     serve(segment, test)
 
 
-def test_a_client_that_calls_as_clients_do(segment: Segment) -> None:
-    """The calls of the wire contract, in their order; the first Write comes before anything was received."""
+def test_a_typical_client_session(segment: Segment) -> None:
+    """The calls of the wire contract, in order; the first Write comes before any message was received."""
 
     async def test(served: Endpoint, device: Plant) -> None:
         published: Any = served.v2.Publish(timeout=TIMEOUT_S)
@@ -154,7 +154,7 @@ def test_write_and_publish_take_values_of_any_fitting_kind(
     with_plant(segment, test)
 
 
-def test_lists_are_arrays(segment: Segment) -> None:
+def test_lists_are_written_to_arrays(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await write(served, "cell/inputs", [1, 2])
         await write(served, "cell/bits", [True, False] * 5)
@@ -191,14 +191,14 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("wrong", "status", "reason"), REFUSED, ids=[reason for _, _, reason in REFUSED])
-def test_what_cannot_be_written_is_refused_by_name(
+def test_invalid_writes_are_refused_with_the_reason(
     segment: Segment, caplog: pytest.LogCaptureFixture, wrong: v2.PubRequest, status: Status, reason: str
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         found, text = await refusal(served.v2.Write(wrong, timeout=TIMEOUT_S))
         assert (found, reason in text) == (status, True), text
         assert counted(served) == (0, 1)
-        assert caplog.records == []  # who wrote it knows
+        assert caplog.records == []  # its writer knows from the status
         await served.v2.Publish(iter([wrong, request("cell/inputs/0", 9)]), timeout=TIMEOUT_S)
         assert counted(served) == (1, 2)
         assert device.memory[10] == 9
@@ -208,11 +208,11 @@ def test_what_cannot_be_written_is_refused_by_name(
     assert reason in line.getMessage()
 
 
-def test_write_returns_when_the_source_has_accepted_and_before_the_device_has_it(segment: Segment) -> None:
+def test_write_returns_once_the_source_has_accepted_the_value(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await write(served, "cell/step", 3)
         assert device.written == []
-        await write(served, "cell/long", [7] * 600)  # its data are several events
+        await write(served, "cell/long", [7] * 600)  # its data span several events
         assert counted(served) == (0, 0)
         device.cycle()
         await counts(served, 2, 0)
@@ -221,7 +221,7 @@ def test_write_returns_when_the_source_has_accepted_and_before_the_device_has_it
     with_plant(segment, test, running=False)
 
 
-def test_what_the_device_refuses_after_that_is_in_the_log(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_later_refusal_by_the_device_is_logged(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         device.refusal = "the address does not exist"
         await write(served, "cell/step", 3)
@@ -256,7 +256,7 @@ def test_a_source_that_does_not_answer_leaves_a_write_unknown(
     serve(segment, test)
 
 
-def test_writes_whose_clients_left_are_done_or_not_but_harm_nobody(segment: Segment) -> None:
+def test_cancelled_writes_do_not_disturb_others(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         calls = [served.v2.Write(request("cell/step", n), timeout=TIMEOUT_S) for n in range(1000)]
         for call in calls[::2]:
@@ -276,7 +276,7 @@ def test_writes_whose_clients_left_are_done_or_not_but_harm_nobody(segment: Segm
     with_plant(segment, test, running=False)
 
 
-def test_publish_goes_on_after_bytes_that_are_no_message_and_ends_with_its_connection(
+def test_publish_skips_undecodable_bytes_and_ends_with_its_connection(
     segment: Segment, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
@@ -295,7 +295,7 @@ def test_publish_goes_on_after_bytes_that_are_no_message_and_ends_with_its_conne
     assert caplog.text.count("bytes are not a PubRequest") == 2
 
 
-def test_one_read_is_one_frame(segment: Segment) -> None:
+def test_all_values_of_a_read_are_of_one_frame(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(position=0.5, running=True, inputs=b"\1\2", step=-3))
         assert await read(served, "CELL://step", "cell/running/out", "inputs", "cell/axis", "cell/name/in", "step") == [
@@ -315,7 +315,7 @@ def test_one_read_is_one_frame(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_read_sees_no_frame_in_part(segment: Segment) -> None:
+def test_a_read_never_mixes_frames(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         for number in range(200):
             served.publish(image(position=number, speed=number, step=number))
@@ -325,7 +325,7 @@ def test_a_read_sees_no_frame_in_part(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_what_is_bad_is_read_as_null(segment: Segment) -> None:
+def test_bad_values_are_read_as_null(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         assert await read(served, "cell/step") == [(v2.NULL, "cell/step", None)]
         served.publish(image(step=1), Quality.BAD)
@@ -333,7 +333,7 @@ def test_what_is_bad_is_read_as_null(segment: Segment) -> None:
             (v2.NULL, "cell/step", None),
             (v2.NULL, "cell/axis", None),
         ]
-        served.publish(image()[:17] + b"\x09" + image()[18:])  # a STRING[8] of 9 characters
+        served.publish(image()[:17] + b"\x09" + image()[18:])  # a STRING[8] with length 9
         assert await read(served, "cell/name", "cell/step") == [
             (v2.NULL, "cell/name", None),
             (v2.NUMBER, "cell/step", 0.0),
@@ -342,7 +342,7 @@ def test_what_is_bad_is_read_as_null(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_read_of_too_much_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_of_too_many_values_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.services.simlog_v2.MAX_ELEMENTS", 700)
 
     async def test(served: Endpoint) -> None:
@@ -356,7 +356,7 @@ def test_a_read_of_too_much_is_refused(segment: Segment, monkeypatch: pytest.Mon
     serve(segment, test)
 
 
-def test_requests_that_are_no_messages_end_alone(segment: Segment) -> None:
+def test_undecodable_requests_fail_without_effect_on_others(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
         for name in ("GetTopicInfo", "Subscribe", "Write", "PublishSynch", "Read"):

@@ -1,4 +1,4 @@
-"""Version 2's streams: all topics of a subscriber on one, for polite clients and for rude ones."""
+"""The streams of version 2: all topics of a subscriber in one, with well-behaved and misbehaving clients."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ async def messages(stream: Any, count: int) -> list[tuple[str, Any]]:
 
 
 async def end(stream: Any) -> tuple[grpc.StatusCode, str]:
-    """How a stream ends, after all that still comes."""
+    """Drain the stream and return how it ended."""
     while True:
         try:
             await message(stream)
@@ -49,7 +49,7 @@ async def end(stream: Any) -> tuple[grpc.StatusCode, str]:
 
 
 async def left(served: Endpoint) -> bool:
-    """Whether nobody is listening any more."""
+    """Return whether all listeners have left."""
     feed = served.feeds["cell"]
     return await listening(served, 0) and not feed._channels and not feed.commands.write_subscriptions.busy
 
@@ -78,7 +78,7 @@ def test_current_values_come_first_then_every_change_of_all_topics_in_the_order_
     serve(segment, test)
 
 
-def test_one_register_under_several_names_is_each_names_value(segment: Segment) -> None:
+def test_a_register_subscribed_under_several_paths_is_sent_for_each(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
         paths = ["cell/step", "step", "CELL://step", "cell/step/out"]
@@ -108,7 +108,7 @@ def test_both_versions_are_served_beside_each_other(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_nothing_is_sent_while_bad_and_the_values_again_on_recovery(segment: Segment) -> None:
+def test_no_values_are_sent_while_bad_and_all_again_on_recovery(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1), Quality.BAD)
         stream = await served.subscriber("one", "cell/step", "cell/axis/speed")
@@ -124,13 +124,13 @@ def test_nothing_is_sent_while_bad_and_the_values_again_on_recovery(segment: Seg
     serve(segment, test)
 
 
-def test_in_is_what_is_written_by_whomever(segment: Segment, instance: str) -> None:
+def test_a_subscriber_of_in_sees_writes_of_all_clients(segment: Segment, instance: str) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         stream = await served.subscriber("one", "CELL://step/in", "cell/axis/in", "cell/inputs/1/in")
         await write(served, "cell/step", 5)
         await write(served, "cell/step", 5)
         await write(served, "cell/inputs", [1, 2])
-        await write(served, "cell/axis/speed", 2)  # of a part of it, the rest as it was
+        await write(served, "cell/axis/speed", 2)  # one member; the other as last written
         with shmio.attach(instance, writable=True) as guest:
             await asyncio.to_thread(guest.write, {"cell/axis/position": 1.5, "cell/axis/speed": 3.0})
             await asyncio.to_thread(guest.write, {"cell/running": True})
@@ -178,7 +178,7 @@ def test_an_unknown_subscriber_is_not_found(segment: Segment, monkeypatch: pytes
 
 
 @pytest.mark.parametrize(("name", "uuid"), [("a", ""), ("a", "u" * 257), ("n" * 257, "u")])
-def test_a_subscriber_has_a_uuid_of_reasonable_length(segment: Segment, name: str, uuid: str) -> None:
+def test_an_empty_or_too_long_uuid_or_name_is_refused(segment: Segment, name: str, uuid: str) -> None:
     async def test(served: Endpoint) -> None:
         stream = served.v2.CreateSubscriber(v2.Subscriber(name=name, uuid=uuid), timeout=TIMEOUT_S)
         assert (await refusal(stream.read()))[0] is Status.INVALID_ARGUMENT
@@ -187,8 +187,8 @@ def test_a_subscriber_has_a_uuid_of_reasonable_length(segment: Segment, name: st
     serve(segment, test)
 
 
-def test_who_comes_again_takes_the_place_of_the_stream_before(segment: Segment) -> None:
-    """A client whose connection broke comes back before the server knows that it did."""
+def test_a_reconnecting_client_replaces_its_earlier_stream(segment: Segment) -> None:
+    """A client whose connection broke reconnects before the server notices the loss."""
 
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
@@ -213,7 +213,7 @@ def test_who_comes_again_takes_the_place_of_the_stream_before(segment: Segment) 
 @pytest.mark.parametrize(
     ("bound", "text"), [("MAX_TOPICS", "too many subscriptions"), ("MAX_ALL_TOPICS", "too many subscriptions")]
 )
-def test_there_are_so_many_topics_and_no_more(
+def test_the_number_of_topics_is_limited(
     segment: Segment, monkeypatch: pytest.MonkeyPatch, bound: str, text: str
 ) -> None:
     monkeypatch.setattr(simlog_v2, bound, 2)
@@ -229,7 +229,7 @@ def test_there_are_so_many_topics_and_no_more(
     serve(segment, test)
 
 
-def test_there_are_so_many_subscribers_and_no_more(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_subscribers_is_limited(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simlog_v2, "MAX_SUBSCRIBERS", 2)
 
     async def test(served: Endpoint) -> None:
@@ -237,7 +237,7 @@ def test_there_are_so_many_subscribers_and_no_more(segment: Segment, monkeypatch
         streams = [await served.subscriber(uuid, "cell/step") for uuid in ("one", "two")]
         third = served.v2.CreateSubscriber(v2.Subscriber(uuid="three"), timeout=TIMEOUT_S)
         assert (await refusal(third.read()))[0] is Status.RESOURCE_EXHAUSTED
-        again = await served.subscriber("two", "cell/step")  # in place of one that there is
+        again = await served.subscriber("two", "cell/step")  # takes the place of the existing one
         streams[0].cancel()
         assert await message(again) == ("cell/step", 0.0)
         again.cancel()
@@ -271,7 +271,7 @@ def test_a_thousand_topics_on_one_stream(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_client_that_never_reads_is_given_the_newest_and_disturbs_nobody(
+def test_values_are_conflated_for_a_client_that_does_not_read(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(outbox, "TOPIC_BOUND", 4)
@@ -295,7 +295,7 @@ def test_a_client_that_never_reads_is_given_the_newest_and_disturbs_nobody(
 
         await served.until(conflated)
         last: dict[str, Any] = {}
-        while last.get("cell/step") != number:  # what was on its way before, then the newest
+        while last.get("cell/step") != number:  # first what was already on its way, then the newest values
             path, value = await message(deaf)
             last[path] = value
         assert (last["cell/long"][:2], last["cell/long/out"][:2]) == ([number >> 8, number & 255],) * 2
@@ -306,7 +306,7 @@ def test_a_client_that_never_reads_is_given_the_newest_and_disturbs_nobody(
     serve(segment, test)
 
 
-def test_a_client_that_vanishes_while_it_does_not_read_leaves_nothing(segment: Segment) -> None:
+def test_a_client_that_vanishes_without_reading_leaves_nothing(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image())
         async with grpc.aio.insecure_channel(f"127.0.0.1:{served.port}") as channel:
@@ -330,13 +330,13 @@ def test_a_client_that_vanishes_while_it_does_not_read_leaves_nothing(segment: S
     serve(segment, test)
 
 
-def test_who_does_not_read_what_is_written_is_told_so(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_does_not_read_writes_loses_its_stream(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outbox, "EVENT_BOUND", 8)
 
     async def test(served: Endpoint) -> None:
         served.publish(image())
         stream = await served.subscriber("one", "cell/step/in", "cell/running")
-        for number in range(2, 40):  # not once is it the event loop's turn meanwhile
+        for number in range(2, 40):  # without a turn of the event loop
             accept(served, number, 12, bytes([0, number]))
         assert await message(stream) == ("cell/running", False)
         status, text = await end(stream)
@@ -365,7 +365,7 @@ def test_a_deadline_or_a_cancelled_call_ends_one_stream(segment: Segment) -> Non
     serve(segment, test)
 
 
-def test_a_structure_that_no_message_can_hold_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_structure_too_large_for_a_message_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.services.simlog_v2.MAX_MEMBERS", 1)
 
     async def test(served: Endpoint) -> None:
@@ -377,11 +377,11 @@ def test_a_structure_that_no_message_can_hold_is_refused(segment: Segment, monke
     serve(segment, test)
 
 
-def test_a_reload_moves_topics_and_one_that_is_gone_comes_back_with_its_source(segment: Segment) -> None:
+def test_topics_survive_a_reload_and_removed_registers_resume_when_they_return(segment: Segment) -> None:
     fewer = Layout("DB1", 1, LAYOUT.size, False, LAYOUT.registers[:4])
 
     def change(served: Endpoint, layout: Layout) -> None:
-        """What :meth:`Feeds.follow` does: another feed for the same source."""
+        """Replace the source's feed, as :meth:`Feeds.follow` does."""
         spec = BlockSpec("cell", layout, 10_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE[:1]))
         segment.change(retire=["cell"], add=[spec])
         old = served.feeds["cell"]
@@ -408,8 +408,8 @@ def test_a_reload_moves_topics_and_one_that_is_gone_comes_back_with_its_source(s
     serve(segment, test)
 
 
-def test_a_uuid_is_its_clients_alone(segment: Segment) -> None:
-    """Who knows it can neither end the stream nor have topics added to it; who shows the same token is the same."""
+def test_a_uuid_belongs_to_its_client(segment: Segment) -> None:
+    """Other clients can neither end its stream nor add topics; a client is recognised by its token."""
     first, other = (("authorization", "Bearer one"),), (("authorization", "Bearer other"),)
     subscriber, topic = v2.Subscriber(name="a", uuid="a"), v2.SubscriptionRequest(path="cell/step", subscriberUUID="a")
 
@@ -444,7 +444,7 @@ def test_a_uuid_is_its_clients_alone(segment: Segment) -> None:
         ("unix:", "ipv4:10.0.0.1:5000", False),
     ],
 )
-def test_without_a_token_a_client_is_known_by_its_host(one: str, other: str, same: bool) -> None:
+def test_without_a_token_a_client_is_recognised_by_its_host(one: str, other: str, same: bool) -> None:
     assert (holder_of(one, (), None) == holder_of(other, (), None)) is same
     assert holder_of(one, (("authorization", "Bearer x"),), None) != holder_of(one, (), None)
     assert holder_of(one, (), {"x509_common_name": [b"a"]}) == holder_of(other, (), {"x509_common_name": [b"a"]})

@@ -1,4 +1,4 @@
-"""Values of version 2 as who reads them gets them."""
+"""Encoding of values for version 2."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from tests.unit.endpoints.harness import plain
         [1, [2.5, "a"], None],
     ],
 )
-def test_a_value_is_protobufs_value(value: Any) -> None:
+def test_values_encode_to_equal_protobuf_values(value: Any) -> None:
     assert plain(to_wire(value)) == value
 
 
@@ -78,7 +78,7 @@ class Picture:
         ("BOOL", [True, False] * 5),
     ],
 )
-def test_an_array_is_a_list_of_the_same_values(kind: str, values: list[Any], order: ByteOrder) -> None:
+def test_an_array_is_encoded_as_a_list_of_its_values(kind: str, values: list[Any], order: ByteOrder) -> None:
     element = element_type(kind)
     assert element is not None
     bit = 0 if kind == "BOOL" else None
@@ -97,7 +97,7 @@ def test_an_array_is_a_list_of_the_same_values(kind: str, values: list[Any], ord
     assert repr(plain(message.value)) == repr([float(v) if type(v) is int else v for v in plain(to_wire(values))])
 
 
-def test_a_structure_has_the_names_of_its_members_and_null_for_bytes_that_are_no_value() -> None:
+def test_a_structure_has_its_members_names_and_null_for_invalid_bytes() -> None:
     registers = (
         Register("zone/level", "INT", (), 0, None, 2, 1),
         Register("zone/a%2Fb/%6Fut", "STRING[2]", (), 2, None, 4, 1),
@@ -122,7 +122,7 @@ def test_a_structure_has_the_names_of_its_members_and_null_for_bytes_that_are_no
     assert plain(message.value) == {"level": 1.0, "a/b": {"out": None, "1": [1.0, 2.0]}}
 
 
-def test_the_deepest_structure_can_be_read_and_a_deeper_one_is_refused() -> None:
+def test_structures_are_readable_up_to_the_limit_of_depth() -> None:
     for levels in (MAX_LEVELS, MAX_LEVELS + 1, 5000):
         path = "/".join(["a"] * levels + ["b"])
         register = Register(path, "BYTE", ((0, 0),) * 6, 0, None, 1, 1)
@@ -139,18 +139,18 @@ def test_the_deepest_structure_can_be_read_and_a_deeper_one_is_refused() -> None
 
 
 @pytest.mark.parametrize("clock_ns", [0, 1, 999_999_999, 10**9, 123_456_789_012_345_678])
-def test_time_is_ns_since_the_start(clock_ns: int) -> None:
+def test_the_time_stamp_is_the_instance_clock(clock_ns: int) -> None:
     assert v2.Header.FromString(time_stamp(clock_ns)).timestamp.ToNanoseconds() == clock_ns
 
 
-def test_a_text_has_all_digits_of_a_long_number() -> None:
+def test_a_large_integer_can_be_given_exactly_as_text() -> None:
     counter = Shape("counter", (Register("counter", "LINT", (), 0, None, 8, 1),), whole=True)
     assert from_wire(Value(string_value=str(2**63 - 1)), counter) == {"counter": 2**63 - 1}
     assert from_wire(Value(number_value=2**53), counter) == {"counter": 2**53}
 
 
 @pytest.mark.parametrize("clock_ns", [0, 1, 999_999_999, 1_000_000_000, 3_000_000_007, 2**62])
-def test_times_are_as_protobuf_writes_them(clock_ns: int) -> None:
+def test_time_stamps_of_both_versions_decode_to_the_same_time(clock_ns: int) -> None:
     seconds, nanos = divmod(clock_ns, 1_000_000_000)
     header = v2.SimlogMessage.FromString(EncodedMessage(time_stamp(clock_ns), b"").under(b"")).header
     assert (header.timestamp.seconds, header.timestamp.nanos) == (seconds, nanos)
@@ -158,7 +158,7 @@ def test_times_are_as_protobuf_writes_them(clock_ns: int) -> None:
     assert (stamp.seq, stamp.stamp.sec, stamp.stamp.nsec) == (5, seconds, clock_ns)
 
 
-def test_one_value_is_sent_under_each_of_its_paths() -> None:
+def test_an_encoded_value_can_be_sent_under_several_paths() -> None:
     encoded = EncodedMessage(time_stamp(5), b"")
     paths = ["cell/a", "CELL://a", "cell/a", ""]
     found = [v2.SimlogMessage.FromString(encoded.under(path_field(path))).header.path for path in paths]

@@ -1,4 +1,4 @@
-"""Calls of shmio.v1 as any client makes them: with the generated code alone."""
+"""Calls of shmio.v1 with the generated code only, as any client can make them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def subscribe(served: Endpoint, *patterns: str, **options: Any) -> Stream:
 
 
 class Stream:
-    """Tables, updates and ends of one stream, one by one."""
+    """Tables, updates and ends of one stream, one at a time."""
 
     def __init__(self, call: Any) -> None:
         self.call = call
@@ -37,7 +37,7 @@ class Stream:
         self._waiting: list[Any] = []
 
     async def next(self) -> Any:
-        """The next table, update or end."""
+        """Return the next table, update or end."""
         while not self._waiting:
             message = await asyncio.wait_for(self.call.read(), TIMEOUT_S)
             assert message is not grpc.aio.EOF
@@ -48,19 +48,21 @@ class Stream:
         return found
 
     async def update(self) -> Any:
-        """The next update."""
+        """Return the next update."""
         while not isinstance(found := await self.next(), wire.Update):
             pass
         return found
 
     async def values(self) -> dict[str, Any]:
-        """The registers that the next update is about, by path."""
+        """Return the next update's values by path."""
         update = await self.update()
         return values(self.tables[update.table].registers, update.values)
 
 
 def values(registers: Iterable[Any], found: Any) -> dict[str, Any]:
-    """Scalars and whole arrays of ``Values``, by path; of arrays in part their elements by index."""
+    """Return the scalars and whole arrays of ``Values`` by path.
+
+    For an array in part, the value is a dict of its elements by index."""
     elements: dict[tuple[int, int], Any] = {}
     for column, name in enumerate(COLUMNS):
         if name and found.HasField(name):

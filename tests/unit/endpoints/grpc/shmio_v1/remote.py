@@ -1,4 +1,4 @@
-"""A source whose model is elsewhere, its process in threads, behind an endpoint."""
+"""A source whose model a client computes, with its process in threads, behind an endpoint."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def spec(source: str, period_ns: int = 20_000_000) -> BlockSpec:
 
 @contextmanager
 def remote_segment(instance: str, *, virtual: bool = True) -> Iterator[Segment]:
-    """A segment with the sources ``drive``, whose model is elsewhere, and ``cell``, which has none."""
+    """Create a segment with the sources ``drive``, computed by a client, and ``cell``, which is not."""
     plain = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("memory", WRITABLE))
     processes = [ProcessSpec("drive", "source"), ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]
     with Segment.create(instance, [spec("drive"), plain], processes, stepped=virtual) as segment:
@@ -59,7 +59,7 @@ def serve_remote(
     timeout_ms: float = LONG_MS,
     virtual: bool = True,
 ) -> None:
-    """Run a test against an endpoint that has such a source, whose process runs."""
+    """Run a test with an endpoint and the running process of such a source."""
 
     async def run(segment: Segment, drive: Running) -> None:
         async with endpoint(segment) as served:

@@ -1,4 +1,4 @@
-"""Time by shmio.v1: steps, and what they bring to streams before their call returns."""
+"""Time by shmio.v1: steps, and the updates that streams receive before the call returns."""
 
 from __future__ import annotations
 
@@ -33,9 +33,7 @@ async def next_message(call: Any) -> Any:
 
 
 @pytest.mark.parametrize("mode", [wire.MODE_LATEST, wire.MODE_EVERY_FRAME])
-def test_all_that_a_step_changes_comes_before_its_marker_and_that_before_the_call_returns(
-    instance: str, mode: Any
-) -> None:
+def test_streams_get_a_steps_changes_then_its_marker_before_the_call_returns(instance: str, mode: Any) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         call = subscribe(served, "sim/count", "other/doubled", mode=mode).call
         tables: dict[int, Any] = {}
@@ -56,7 +54,7 @@ def test_all_that_a_step_changes_comes_before_its_marker_and_that_before_the_cal
                 over = message.HasField("step")
             assert told == {"count": number, "doubled": 2 * number}
             assert (message.step.number, message.step.time_ns) == (number, number * 20 * MS)
-        await step_v1(served)  # whoever steps
+        await step_v1(served)  # a step by another client
         while not (message := await next_message(call)).HasField("step"):
             pass
         assert message.step.number == 4
@@ -64,7 +62,7 @@ def test_all_that_a_step_changes_comes_before_its_marker_and_that_before_the_cal
     simulate(instance, test, "sim", "other")
 
 
-def test_what_is_written_before_a_step_is_done_in_it(instance: str) -> None:
+def test_a_step_applies_the_writes_before_it(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
             assert (await cell.set_step_size(0.02)).step_size_ns == 20 * MS
@@ -82,7 +80,7 @@ def test_what_is_written_before_a_step_is_done_in_it(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_playing_and_watching(instance: str) -> None:
+def test_play_and_watch_clock(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         watching = stub(served).WatchClock(wire.WatchClockRequest(), timeout=TIMEOUT_S)
         assert (await next_message(watching)).time_ns == 0
@@ -99,7 +97,7 @@ def test_playing_and_watching(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_released_time_is_told_and_what_is_published_then_waits_for_no_step(instance: str) -> None:
+def test_after_a_release_frames_are_sent_without_a_step(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         call = subscribe(served, "sim/count").call
         clock = served.subscribe("/model/clock")
@@ -113,7 +111,9 @@ def test_released_time_is_told_and_what_is_published_then_waits_for_no_step(inst
             while not (await next_message(call)).HasField("step"):
                 pass
             models["sim"].image[0:4] = (7).to_bytes(4, "big")
-            models["sim"].publish(done.step)  # as by a write that is shown at once: it waits for a step
+            models["sim"].publish(
+                done.step
+            )  # a frame that would wait for a step, as after a write that is shown at once
             released = await cell.release()
             assert (released.virtual, released.time_ns >= done.time_ns) == (False, True)
             while (await next_message(watching)).virtual:
@@ -130,7 +130,7 @@ def test_released_time_is_told_and_what_is_published_then_waits_for_no_step(inst
             while (await asyncio.wait_for(clock.read(), TIMEOUT_S)).timeStamp.stamp.sec < 1800:
                 pass
             told = [(await asyncio.wait_for(clock.read(), TIMEOUT_S)).timeStamp.stamp for _ in range(2)]
-            assert all(stamp.sec >= 1800 for stamp in told), "it ticks again"
+            assert all(stamp.sec >= 1800 for stamp in told), "the clock topic is sent again"
             assert (await cell.step()).step > done.step
             while not (message := await next_message(call)).HasField("step"):
                 pass
@@ -138,7 +138,7 @@ def test_released_time_is_told_and_what_is_published_then_waits_for_no_step(inst
     simulate(instance, test, virtual=False)
 
 
-def test_time_that_was_never_real_is_not_released(instance: str) -> None:
+def test_time_that_started_virtual_cannot_be_released(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         code, text = await refusal(stub(served).Release(wire.ReleaseRequest(), timeout=TIMEOUT_S))
         assert (code, "virtual from its start" in text) == (grpc.StatusCode.FAILED_PRECONDITION, True)
@@ -146,7 +146,7 @@ def test_time_that_was_never_real_is_not_released(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_a_step_that_fails_says_why(instance: str) -> None:
+def test_a_failed_step_gives_the_reason(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         models["sim"].failure = "division by zero"
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
@@ -156,7 +156,7 @@ def test_a_step_that_fails_says_why(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_a_stream_that_takes_long_to_open_holds_up_no_step(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_that_is_slow_to_open_delays_no_step(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     begun, go_on = threading.Event(), threading.Event()
     select = selection._select
 
@@ -181,9 +181,7 @@ def test_a_stream_that_takes_long_to_open_holds_up_no_step(instance: str, monkey
     simulate(instance, test)
 
 
-def test_a_stream_that_is_not_read_does_not_hold_up_steps_for_ever(
-    instance: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stream_that_is_not_read_is_ended_and_steps_continue(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.subscribe.PATIENCE_S", 0.2)
 
     async def test(served: Endpoint, models: Models) -> None:

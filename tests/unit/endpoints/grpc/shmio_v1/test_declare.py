@@ -1,4 +1,4 @@
-"""Declare over real sockets: what is laid, what comes down of it, and how it ends."""
+"""Declare over real sockets: laying injections, the events of a campaign, and how it ends."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def until(campaign: Iterator[Happening], what: str) -> Happening:
     return next(one for one in campaign if one.what == what)
 
 
-def test_every_operation_is_laid_as_it_was_declared(segment: Segment) -> None:
+def test_every_operation_is_laid_as_declared(segment: Segment) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         with cell.declare(EVERY_OPERATION) as campaign:
             assert [one.name for one in campaign.declared] == [one["name"] for one in EVERY_OPERATION]
@@ -71,7 +71,7 @@ def test_every_operation_is_laid_as_it_was_declared(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_what_the_source_delivered_is_read_beneath_it(segment: Segment) -> None:
+def test_originals_can_be_read_under_a_declared_injection(segment: Segment) -> None:
     def test(cell: Client, device: Plant, served: Endpoint) -> None:
         struct.pack_into(">f", device.memory, 0, 1.5)
         with cell.declare([OFFSET]):
@@ -90,7 +90,7 @@ def test_what_the_source_delivered_is_read_beneath_it(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_the_record_says_what_is_done_and_when(segment: Segment) -> None:
+def test_the_campaigns_events_say_what_happens_and_when(segment: Segment) -> None:
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         struct.pack_into(">f", device.memory, 0, 1.5)
         with cell.declare([OFFSET | {"when": "cell/step > 5"}]) as campaign:
@@ -121,7 +121,7 @@ def test_the_record_says_what_is_done_and_when(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_it_ends_when_all_of_it_is_over(segment: Segment) -> None:
+def test_a_campaign_ends_when_all_its_injections_are_over(segment: Segment) -> None:
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         once = {"when": "cell/running", "times": 1}
         campaign = cell.declare([OFFSET | once, OFFSET | once | {"name": "other", "target": "cell/axis/speed"}])
@@ -153,7 +153,9 @@ def test_it_ends_when_all_of_it_is_over(segment: Segment) -> None:
         ({"target": "cell/secret/in"}, CommandError, "not writable"),
     ],
 )
-def test_all_or_none(segment: Segment, wrong: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_one_invalid_declaration_lays_none(
+    segment: Segment, wrong: dict[str, Any], error: type[Exception], message: str
+) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         with pytest.raises(error, match=message):
             cell.declare([OFFSET, OFFSET | {"name": "wrong"} | wrong])
@@ -162,7 +164,7 @@ def test_all_or_none(segment: Segment, wrong: dict[str, Any], error: type[Except
     with_client(segment, test)
 
 
-def test_a_client_that_dies_takes_what_is_not_kept_with_it(segment: Segment) -> None:
+def test_a_dead_clients_injections_are_lifted_unless_kept(segment: Segment) -> None:
     def test(cell: Client, _: Plant, served: Endpoint) -> None:
         with connect(f"127.0.0.1:{served.port}", timeout_s=TIMEOUT_S) as other:
             other.declare([OFFSET])
@@ -178,7 +180,7 @@ def test_a_client_that_dies_takes_what_is_not_kept_with_it(segment: Segment) -> 
     with_client(segment, test)
 
 
-def test_lift_all_lifts_it_and_the_record_says_so(segment: Segment) -> None:
+def test_lift_all_lifts_a_campaign_and_its_events_say_so(segment: Segment) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         with cell.declare([OFFSET, OFFSET | {"name": "second"}]) as campaign:
             assert len(cell.lift_all()) == 2
@@ -187,7 +189,7 @@ def test_lift_all_lifts_it_and_the_record_says_so(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_messages_that_make_no_sense(segment: Segment) -> None:
+def test_invalid_declarations_are_refused(segment: Segment) -> None:
     def declaration(**fields: Any) -> wire.Declaration:
         return wire.Declaration(name="x", targets=["cell/step"], **fields)
 
@@ -218,7 +220,7 @@ def test_messages_that_make_no_sense(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_too_many_are_refused_before_any_is_looked_at(segment: Segment) -> None:
+def test_too_many_declarations_are_refused_before_any_is_checked(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         call = stub(served).Declare(wire.DeclareRequest(declarations=[wire.Declaration()] * 257), timeout=TIMEOUT_S)
         code, text = await refusal(call.read())
@@ -227,19 +229,17 @@ def test_too_many_are_refused_before_any_is_looked_at(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_what_a_client_that_is_gone_has_declared_is_not_looked_at_to_the_end(
-    segment: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compilation_stops_when_its_client_has_left(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     begun, over = threading.Event(), threading.Event()
 
     def slow(_: object, __: object, wanted: Callable[[], bool]) -> list[Program]:
         begun.set()
         until_s = time.monotonic() + TIMEOUT_S
         while wanted():
-            assert time.monotonic() < until_s, "it goes on for nobody"
+            assert time.monotonic() < until_s, "the compilation continues though its client has left"
             time.sleep(0.01)
         over.set()
-        raise CommandError("nobody waits for it any more")
+        raise CommandError("no client waits for it any more")
 
     async def test(served: Endpoint, _: Plant) -> None:
         first = stub(served).Declare(wire.DeclareRequest(declarations=[NOISE]), timeout=TIMEOUT_S)
@@ -248,7 +248,7 @@ def test_what_a_client_that_is_gone_has_declared_is_not_looked_at_to_the_end(
         assert await asyncio.to_thread(over.wait, 2 * TIMEOUT_S)
         monkeypatch.undo()
         second = stub(served).Declare(wire.DeclareRequest(declarations=[NOISE]), timeout=TIMEOUT_S)
-        assert (await second.read()).declared.injections, "and the next one has its turn"
+        assert (await second.read()).declared.injections, "the next call is served"
         second.cancel()
 
     monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.declare.compile_declarations", slow)
@@ -256,7 +256,7 @@ def test_what_a_client_that_is_gone_has_declared_is_not_looked_at_to_the_end(
 
 
 @BOTH
-def test_what_is_done_is_told_to_both_clients(segment: Segment, connects: Connect) -> None:
+def test_both_clients_receive_the_campaigns_events(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         async with connects(f"127.0.0.1:{served.port}") as cell:
             async with await cell.declare([OFFSET]) as campaign:

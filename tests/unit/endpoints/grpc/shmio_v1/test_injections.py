@@ -1,4 +1,4 @@
-"""Inject, the list and lifting over real sockets, by the clients and with the generated code alone."""
+"""Inject, list and lift over real sockets, by the clients and with the generated code only."""
 
 from __future__ import annotations
 
@@ -55,18 +55,18 @@ async def converse(call: Any, requests: list[wire.InjectRequest]) -> None:
 
 
 def seen(cell: Client, path: str, value: object) -> None:
-    """Wait until consumers see this."""
+    """Wait until consumers see this value."""
     for update in cell.subscribe(path):
         if update[path] == value:
             return
 
 
-def test_consumers_see_what_is_given_and_the_original_again_after_that(segment: Segment) -> None:
+def test_consumers_see_the_given_values_and_the_originals_after_the_end(segment: Segment) -> None:
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         struct.pack_into(">f", device.memory, 0, 1.5)
         seen(cell, "cell/axis/position", 1.5)
         with cell.inject("cell/axis", "cell/running", name="drift") as shadow:
-            assert cell["cell/axis/position"] == 1.5  # held until it is given a value
+            assert cell["cell/axis/position"] == 1.5  # held until the client gives a value
             (outcome,) = shadow.set({"cell/axis/position": 9.0})
             assert (outcome.kind, outcome.done) == ("shadowed", True)
             found = cell.read("cell/axis", originals=True).of("cell/axis/position")
@@ -85,7 +85,7 @@ def test_consumers_see_what_is_given_and_the_original_again_after_that(segment: 
     with_client(segment, test)
 
 
-def test_originals_come_down(segment: Segment) -> None:
+def test_originals_are_streamed(segment: Segment) -> None:
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         struct.pack_into(">f", device.memory, 0, 1.5)
         seen(cell, "cell/axis/position", 1.5)
@@ -102,7 +102,7 @@ def test_originals_come_down(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_an_outer_one_stands_over_what_an_inner_one_gives(segment: Segment) -> None:
+def test_the_originals_of_an_outer_injection_are_the_inner_ones_values(segment: Segment) -> None:
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         struct.pack_into(">f", device.memory, 0, 1.5)
         seen(cell, "cell/axis/position", 1.5)
@@ -122,14 +122,14 @@ def test_an_outer_one_stands_over_what_an_inner_one_gives(segment: Segment) -> N
     with_client(segment, test)
 
 
-def test_over_in_what_is_written_comes_down_and_what_is_given_reaches_the_device(segment: Segment) -> None:
+def test_on_in_writes_are_streamed_and_given_values_reach_the_device(segment: Segment) -> None:
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         with cell.inject("cell/step/in", "cell/name/in", originals=True) as shadow:
             assert [one.kind for one in cell.write({"cell/step": 5, "cell/axis/position": 2.0})] == ["taken", "written"]
             update = next(shadow)
             assert update.changed == ["cell/step"]
             assert update["cell/step"] == 5
-            cell.write({"cell/step": 5})  # the same again is told again
+            cell.write({"cell/step": 5})  # an equal write is reported again
             assert next(shadow).changed == ["cell/step"]
             assert device.memory[12:14] == b"\0\0"
             (outcome,) = shadow.set({"cell/step": 6})
@@ -141,7 +141,7 @@ def test_over_in_what_is_written_comes_down_and_what_is_given_reaches_the_device
     with_client(segment, test)
 
 
-def test_a_client_that_dies_takes_its_injection_with_it(segment: Segment) -> None:
+def test_a_dead_clients_injection_is_lifted(segment: Segment) -> None:
     def test(cell: Client, _: Plant, served: Endpoint) -> None:
         with connect(f"127.0.0.1:{served.port}") as other:
             other.inject("cell/axis").set({"cell/axis/position": 3.0})
@@ -178,7 +178,7 @@ def test_lift_all_ends_the_streams_of_all(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_its_time_is_over(segment: Segment) -> None:
+def test_an_injection_ends_when_its_time_is_over(segment: Segment) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         with cell.inject("cell/axis", for_s=0.05, originals=True) as shadow:
             drain(shadow)
@@ -189,7 +189,7 @@ def test_its_time_is_over(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_what_cannot_be_laid_or_given(segment: Segment) -> None:
+def test_invalid_injections_and_values_are_refused(segment: Segment) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         with pytest.raises(PathError, match="no such register"):
             cell.inject("cell/nothing")
@@ -226,7 +226,7 @@ def test_what_cannot_be_laid_or_given(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_messages_that_make_no_sense(segment: Segment) -> None:
+def test_invalid_messages_are_refused(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         lay = wire.InjectRequest(lay=wire.Lay(patterns=["cell/axis"], quiet=True))
         wrong: list[list[wire.InjectRequest]] = [
@@ -250,7 +250,7 @@ def test_messages_that_make_no_sense(segment: Segment) -> None:
 
 
 @BOTH
-def test_values_given_and_originals_by_both_clients(segment: Segment, connects: Connect) -> None:
+def test_both_clients_give_values_and_read_originals(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         async with connects(f"127.0.0.1:{served.port}") as cell:
             async with await cell.inject("cell/axis", originals=True) as shadow:
@@ -309,7 +309,7 @@ def _pieces(update: Any) -> list[tuple[int, bytes]]:
     return [(piece.offset, piece.data) for piece in update.pieces]
 
 
-def test_ranges_over_in_beside_registers(segment: Segment) -> None:
+def test_ranges_on_in_together_with_registers(segment: Segment) -> None:
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         with cell.inject("cell/step/in", ranges=[(26, 600)], originals=True) as shadow:
             assert (shadow.table.direction, shadow.table.ranges) == ("in", ((26, 600, 0xFF),))
@@ -340,7 +340,7 @@ def test_a_whole_section_of_a_block(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_what_is_no_range(segment: Segment) -> None:
+def test_invalid_ranges_are_refused(segment: Segment) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         for ranges, message in (
             ([(0, 0)], "at least one byte"),
@@ -362,7 +362,7 @@ def test_what_is_no_range(segment: Segment) -> None:
     with_client(segment, test)
 
 
-def test_too_many_pieces_are_refused_before_any_is_looked_at(segment: Segment) -> None:
+def test_too_many_pieces_are_refused_before_any_is_checked(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         call = stub(served).Inject(timeout=TIMEOUT_S)
         lay = wire.Lay(source="cell", ranges=[wire.Range(offset=26, size=600)], quiet=True)
@@ -377,8 +377,8 @@ def test_too_many_pieces_are_refused_before_any_is_looked_at(segment: Segment) -
     with_plant(segment, test)
 
 
-def test_what_a_declared_one_further_in_makes_is_an_original(segment: Segment) -> None:
-    """Until it is lifted: then it is what the source delivers."""
+def test_originals_include_the_effect_of_an_inner_declared_injection(segment: Segment) -> None:
+    """After it was lifted, the source's value is the original."""
 
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         struct.pack_into(">f", device.memory, 0, 1.5)
@@ -396,7 +396,7 @@ def test_what_a_declared_one_further_in_makes_is_an_original(segment: Segment) -
     with_client(segment, test)
 
 
-def test_events_that_were_missed_end_what_cannot_be_told_in_full(segment: Segment) -> None:
+def test_missed_events_end_only_streams_that_need_every_event(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
             outward, inward = await cell.inject("cell/axis"), await cell.inject("cell/step/in", originals=True)

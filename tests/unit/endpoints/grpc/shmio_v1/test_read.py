@@ -59,7 +59,7 @@ def test_a_table_that_the_client_has_is_not_sent_again(segment: Segment) -> None
     serve(segment, test)
 
 
-def test_a_source_that_never_had_a_value(segment: Segment) -> None:
+def test_a_source_without_a_frame(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         (update,) = (await read(served, "cell/axis")).updates
         assert (update.quality, update.reason) == (wire.QUALITY_BAD, "no data yet")
@@ -71,7 +71,7 @@ def test_a_source_that_never_had_a_value(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_what_is_bad_comes_with_its_last_value_and_the_reason(segment: Segment) -> None:
+def test_bad_values_have_the_last_value_and_the_reason(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.writer.publish(image(2.5), cycle=3, quality=Quality.BAD, reason="cable out")
         answer = await read(served, "cell/axis/position")
@@ -82,7 +82,7 @@ def test_what_is_bad_comes_with_its_last_value_and_the_reason(segment: Segment) 
     serve(segment, test)
 
 
-def test_what_is_too_old_is_bad(soon_stale: Segment) -> None:
+def test_stale_values_are_bad(soon_stale: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.writer.publish(image(2.5), cycle=3, asked_ns=0)
         (update,) = (await read(served, "cell/axis")).updates
@@ -92,7 +92,7 @@ def test_what_is_too_old_is_bad(soon_stale: Segment) -> None:
     serve(soon_stale, test)
 
 
-def test_bytes_that_are_no_value_are_marked(segment: Segment) -> None:
+def test_undecodable_bytes_are_marked_as_invalid(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         wrong = bytearray(image())
         wrong[17] = 200  # the length of a STRING[8]
@@ -105,7 +105,7 @@ def test_bytes_that_are_no_value_are_marked(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_injected_registers_are_marked_and_their_originals_told(segment: Segment) -> None:
+def test_injected_registers_are_marked_and_have_their_originals(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         block = segment.blocks["cell"]
         ranges = ((0, 4, 0xFF), (8, 1, 1 << 3))
@@ -145,7 +145,9 @@ def test_injected_registers_are_marked_and_their_originals_told(segment: Segment
         (("cell/axis",) * 257, Status.INVALID_ARGUMENT, "257 patterns, at most 256"),
     ],
 )
-def test_refusals_say_what_is_wrong(segment: Segment, patterns: tuple[str, ...], code: Any, message: str) -> None:
+def test_invalid_reads_are_refused_with_the_reason(
+    segment: Segment, patterns: tuple[str, ...], code: Any, message: str
+) -> None:
     async def test(served: Endpoint) -> None:
         found, text = await refusal(read(served, *patterns))
         assert found is code
@@ -154,7 +156,7 @@ def test_refusals_say_what_is_wrong(segment: Segment, patterns: tuple[str, ...],
     serve(segment, test)
 
 
-def test_limits(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_of_too_many_values_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     async def test(served: Endpoint) -> None:
         monkeypatch.setattr(selection, "MAX_ELEMENTS", 600)
         assert (await refusal(read(served, "cell")))[0] is Status.INVALID_ARGUMENT
@@ -170,7 +172,7 @@ def test_limits(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     serve(segment, test)
 
 
-def test_layouts(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_get_layouts(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "PART_REGISTERS", 4)
 
     async def test(served: Endpoint) -> None:
@@ -195,7 +197,9 @@ def test_layouts(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
             )
             assert (there.bit if there.HasField("bit") else None) == here.bit
             assert [(bounds.low, bounds.high) for bounds in there.dims] == list(here.dims)
-        often = wire.GetLayoutsRequest(sources=["cell"] * 1000)  # a small request is not answered with a million parts
+        often = wire.GetLayoutsRequest(
+            sources=["cell"] * 1000
+        )  # a small request must not cause an answer of a million parts
         assert [part async for part in stub(served).GetLayouts(often, timeout=TIMEOUT_S)] == parts
         call = stub(served).GetLayouts(wire.GetLayoutsRequest(sources=["cell", "x"]), timeout=TIMEOUT_S)
         with pytest.raises(grpc.aio.AioRpcError, match="no source 'x'; there are: cell"):
@@ -204,7 +208,7 @@ def test_layouts(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     serve(segment, test)
 
 
-def test_status_is_that_of_the_process_table(instance: str, segment: Segment) -> None:
+def test_get_status_reads_the_process_table(instance: str, segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         slot = segment.processes.find("cell")
         slot.report = Report(4711, Activity.RUNNING, 1, (5, 2, 0, 1, 900, 50_000), "well")
@@ -221,18 +225,18 @@ def test_status_is_that_of_the_process_table(instance: str, segment: Segment) ->
         )
         assert process.source.overruns == 2
 
-    with Segment.open(instance, writable=True) as opened:  # as another process: a holder does not see its own locks
+    with Segment.open(instance, writable=True) as opened:  # another mapping, as a process does not see its own locks
         serve(opened, test)
 
 
-def test_hostile_requests_end_with_a_word_and_nothing_else(segment: Segment) -> None:
+def test_hostile_requests_are_refused_without_further_effect(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(1.0))
         for method in ("Read", "Subscribe", "GetLayouts", "GetStatus"):
             for message in (b"\xff\xff\xff", b"\x0a\xff\xff\xff\xff\x0f", b"\x0a\x02\xff\xfe", bytes(1000)):
                 raw: Any = served.channel.unary_stream(f"/shmio.v1.Shmio/{method}")
                 call = raw(message, timeout=TIMEOUT_S)
-                with suppress(grpc.aio.AioRpcError):  # to some calls some of these are messages
+                with suppress(grpc.aio.AioRpcError):  # some of these are valid messages of some calls
                     while await asyncio.wait_for(call.read(), TIMEOUT_S) is not grpc.aio.EOF:
                         pass
         deep = wire.ReadRequest(patterns=["/".join("a" * 3000), "*" * 1025, "**/" * 300 + "x", "cell/\0", "cell//"])

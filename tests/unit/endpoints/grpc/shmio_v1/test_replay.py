@@ -1,4 +1,4 @@
-"""Replays are moved by shmio.v1, and shown to its clients step by step."""
+"""Replays are controlled by shmio.v1, and its clients see them step by step."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Test = Callable[[Endpoint, Playing], Awaitable[None]]
 
 
 def replay(folder: Path, instance: str, test: Test, *, stepped: bool = False) -> None:
-    """Serve a replay that begins paused, or in virtual time."""
+    """Serve a replay that starts paused, or in virtual time."""
     file = record(folder, instance)
     with built(instance, stepped=stepped) as segment, Playing(segment, file, paused=not stepped) as playing:
         playing.next()
         serve(segment, lambda served: test(served, playing))
 
 
-def test_a_client_moves_it(tmp_path: Path, instance: str) -> None:
+def test_a_client_controls_the_replay(tmp_path: Path, instance: str) -> None:
     async def test(served: Endpoint, playing: Playing) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
             [status] = await cell.replay()
@@ -56,7 +56,9 @@ def test_a_client_moves_it(tmp_path: Path, instance: str) -> None:
         ({"event": "none"}, CommandError),
     ],
 )
-def test_what_cannot_be_is_refused(tmp_path: Path, instance: str, wish: object, error: type[ShmioError]) -> None:
+def test_invalid_replay_requests_are_refused(
+    tmp_path: Path, instance: str, wish: object, error: type[ShmioError]
+) -> None:
     async def test(served: Endpoint, _: Playing) -> None:
         def call() -> None:
             with connect(f"127.0.0.1:{served.port}") as cell, pytest.raises(error):
@@ -67,7 +69,7 @@ def test_what_cannot_be_is_refused(tmp_path: Path, instance: str, wish: object, 
     replay(tmp_path, instance, test)
 
 
-def test_a_search_holds_up_nobody_and_ends_with_its_call(
+def test_a_search_does_not_block_others_and_ends_with_its_call(
     tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun = threading.Event()
@@ -86,7 +88,7 @@ def test_a_search_holds_up_nobody_and_ends_with_its_call(
     replay(tmp_path, instance, test)
 
 
-def test_without_a_replay_it_says_so(instance: str) -> None:
+def test_replay_is_refused_if_no_source_plays_a_recording(instance: str) -> None:
     async def test(served: Endpoint) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
             with pytest.raises(CommandError, match="plays no recording"):
@@ -96,7 +98,7 @@ def test_without_a_replay_it_says_so(instance: str) -> None:
         serve(segment, test)
 
 
-def test_a_step_delivers_what_it_has_played(tmp_path: Path, instance: str) -> None:
+def test_a_step_delivers_the_frames_that_it_played(tmp_path: Path, instance: str) -> None:
     async def test(served: Endpoint, _: Playing) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
             seen = []

@@ -1,4 +1,4 @@
-"""Simulate over real sockets: with the generated code alone, as any client has it, and by the clients of Python."""
+"""Simulate over real sockets: with the generated code only, as any client has it, and by the Python clients."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Request = wire.SimulateRequest
 
 
 class Raw:
-    """A model that speaks the wire itself."""
+    """A model that sends and reads the messages of shmio.v1 itself."""
 
     def __init__(self, served: Endpoint) -> None:
         self.call = stub(served).Simulate(timeout=TIMEOUT_S)
@@ -48,7 +48,7 @@ class Raw:
         return found
 
     async def work(self) -> Any:
-        """The next step."""
+        """Return the next step."""
         found = await self.read()
         assert found.WhichOneof("what") == "work"
         return found.work
@@ -65,7 +65,7 @@ def assigned(**given: Any) -> list[wire.Assignment]:
 
 
 def stepping(served: Endpoint, count: int = 1) -> asyncio.Task[Any]:
-    """Steps, under way."""
+    """Start this many steps in a task."""
 
     async def steps() -> Any:
         for _ in range(count):
@@ -83,7 +83,7 @@ async def read(served: Endpoint, pattern: str = "drive") -> dict[str, Any]:
 # ---- on the wire -----------------------------------------------------------------------------------------------------
 
 
-def test_a_model_is_told_what_there_is_then_its_steps(instance: str) -> None:
+def test_a_model_gets_tables_and_values_then_its_steps(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         model = Raw(served)
         joined = await model.join()
@@ -104,7 +104,7 @@ def test_a_model_is_told_what_there_is_then_its_steps(instance: str) -> None:
         bools = wire.Bools(values=[True, False, *[True] * 10])
         await model.done(1, values=wire.Values(doubles=wire.Doubles(values=[7.5]), bools=bools))
         work = await model.work()
-        assert (work.step, model.inputs(work)) == (2, {}), "only what has changed"
+        assert (work.step, model.inputs(work)) == (2, {}), "only changed inputs"
         ints = wire.Int32s(slots=[0, 2], values=[5, -3])
         await model.done(
             2, values=wire.Values(int32s=ints), assignments=assigned(**{"drive/axis/name": "x1", "row/2/2": 9})
@@ -115,7 +115,7 @@ def test_a_model_is_told_what_there_is_then_its_steps(instance: str) -> None:
         found = await read(served)
         assert (found["axis/position"], found["axis/moving"], found["axis/ready"]) == (7.5, True, False)
         assert (found["axis/count"], found["row"], found["axis/name"]) == (5, [0, -3, 0, 0, 0, 9], "x1")
-        assert found["lamps"] == [True] * 10, "what an in-out shows"
+        assert found["lamps"] == [True] * 10, "the in-out register's new value"
         await model.call.done_writing()
         await shown(drive, Quality.BAD)
         assert await model.call.read() is grpc.aio.EOF
@@ -123,7 +123,7 @@ def test_a_model_is_told_what_there_is_then_its_steps(instance: str) -> None:
     serve_remote(instance, test)
 
 
-def test_what_is_written_reaches_it_and_bytes_that_are_no_value_are_marked(instance: str) -> None:
+def test_writes_reach_the_model_as_inputs(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         model = Raw(served)
         await model.join()
@@ -143,7 +143,7 @@ def test_what_is_written_reaches_it_and_bytes_that_are_no_value_are_marked(insta
     serve_remote(instance, test)
 
 
-def test_one_that_joins_again_goes_on_from_what_was_shown(instance: str) -> None:
+def test_a_rejoining_model_gets_the_last_values(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         model = Raw(served)
         await model.join()
@@ -158,7 +158,7 @@ def test_one_that_joins_again_goes_on_from_what_was_shown(instance: str) -> None
         assert values(joined.outputs.registers, joined.values)["axis/position"] == 3.5
         task = stepping(served)
         work = await again.work()
-        assert (work.step, again.inputs(work)["target"]) == (2, 1.5), "all inputs at first"
+        assert (work.step, again.inputs(work)["target"]) == (2, 1.5), "the first step has all inputs"
         await again.done(2)
         await task
         assert (await read(served))["axis/position"] == 3.5
@@ -186,7 +186,7 @@ def test_one_that_joins_again_goes_on_from_what_was_shown(instance: str) -> None
         ({"values": wire.Values(floats=wire.Floats(slots=[0], values=[1.0]))}, "floats: the table has no slot 0"),
     ],
 )
-def test_a_step_fails_with_what_is_wrong_and_the_next_goes_on(instance: str, given: Any, reason: str) -> None:
+def test_an_invalid_answer_fails_its_step_and_the_next_step_works(instance: str, given: Any, reason: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         model = Raw(served)
         await model.join()
@@ -206,7 +206,7 @@ def test_a_step_fails_with_what_is_wrong_and_the_next_goes_on(instance: str, giv
     serve_remote(instance, test)
 
 
-def test_what_it_has_set_too_late_is_shown_with_the_next_step(instance: str) -> None:
+def test_outputs_that_come_too_late_are_shown_with_the_next_step(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         model = Raw(served)
         await model.join()
@@ -215,17 +215,17 @@ def test_what_it_has_set_too_late_is_shown_with_the_next_step(instance: str) -> 
         code, text = await refusal(task)
         assert (code, "did not answer within 200 ms" in text) == (Status.FAILED_PRECONDITION, True), text
         code, text = await refusal(stepping(served))
-        assert "did not answer within 200 ms" in text, "it has the first one in hand still"
+        assert "did not answer within 200 ms" in text, "it is still computing the first step"
         await model.done(1, assignments=assigned(**{"axis/count": 1}))
         number = 2
         link = served.segment.blocks["drive"].model_channel
         assert link is not None
-        while True:  # a busy machine may need more than one
+        while True:  # a busy host may need several attempts
             number += 1
             task = stepping(served)
             work = await model.work()
-            assert number > 3 or not link.answered.head(), "what counts for nothing is not given to the source at all"
-            assert work.step == number, "no step that nobody waits for"
+            assert number > 3 or not link.answered.head(), "the endpoint does not pass a late answer to the source"
+            assert work.step == number, "the model gets only steps with a waiting caller"
             assert number > 3 or "step 1: the answer came " in work.refused
             await model.done(number)
             try:
@@ -256,7 +256,7 @@ def test_what_it_has_set_too_late_is_shown_with_the_next_step(instance: str) -> 
         ),
     ],
 )
-def test_what_is_no_model_is_told(instance: str, requests: list[Any], code: Status, text: str) -> None:
+def test_calls_that_are_not_a_models_are_refused(instance: str, requests: list[Any], code: Status, text: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         async def converse() -> None:
             call = stub(served).Simulate(timeout=TIMEOUT_S)
@@ -269,7 +269,7 @@ def test_what_is_no_model_is_told(instance: str, requests: list[Any], code: Stat
 
         found, told = await refusal(converse())
         assert (found, text in told) == (code, True), told
-        await Raw(served).join()  # nothing is left of it
+        await Raw(served).join()  # no trace of it remains
 
     serve_remote(instance, test)
 
@@ -289,7 +289,7 @@ def test_an_answer_to_another_step_ends_the_stream(instance: str) -> None:
     serve_remote(instance, test)
 
 
-def test_who_ends_without_reading_leaves_the_source_to_others(instance: str) -> None:
+def test_a_model_that_ends_without_reading_frees_its_source(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         deaf = await http2.Connection.open(served.port, deaf=True)
         await deaf.send(http2.headers("/shmio.v1.Shmio/Simulate"))
@@ -304,7 +304,7 @@ def test_who_ends_without_reading_leaves_the_source_to_others(instance: str) -> 
     serve_remote(instance, test)
 
 
-def test_a_second_model_is_refused_by_the_name_of_the_first(instance: str) -> None:
+def test_a_second_model_is_refused_and_the_first_named(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         await Raw(served).join(name="first")
         code, text = await refusal(Raw(served).join(name="second"))
@@ -314,7 +314,7 @@ def test_a_second_model_is_refused_by_the_name_of_the_first(instance: str) -> No
     serve_remote(instance, test)
 
 
-def test_one_that_another_process_has_is_refused_too(instance: str) -> None:
+def test_a_source_that_another_process_computes_is_refused(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         with Segment.open(served.segment.instance, writable=True) as other:
             link = other.blocks["drive"].model_channel
@@ -328,7 +328,7 @@ def test_one_that_another_process_has_is_refused_too(instance: str) -> None:
     serve_remote(instance, test)
 
 
-def test_a_reload_ends_it_and_it_may_join_the_new_one(instance: str) -> None:
+def test_a_reload_ends_a_model_which_may_join_the_new_block(instance: str) -> None:
     async def run(segment: Segment) -> None:
         async with endpoint(segment) as served:
             model = Raw(served)
@@ -342,7 +342,9 @@ def test_a_reload_ends_it_and_it_may_join_the_new_one(instance: str) -> None:
         asyncio.run(run(segment))
 
 
-def test_an_endpoint_that_ends_within_a_step_gives_time_up_once(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endpoint_that_stops_during_a_step_releases_control_once(
+    instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(stepper, "REST_S", 0.02)
 
     async def test(served: Endpoint, drive: Running) -> None:
@@ -357,7 +359,7 @@ def test_an_endpoint_that_ends_within_a_step_gives_time_up_once(instance: str, m
         with pytest.raises(asyncio.CancelledError):
             await step
         rested = asyncio.Event()
-        loop.call_later(5 * stepper.REST_S, rested.set)  # longer than whoever moved time rests
+        loop.call_later(5 * stepper.REST_S, rested.set)  # longer than the stepper waits before it releases control
         await rested.wait()
         gc.collect()
         assert wrong == []
@@ -381,7 +383,7 @@ def with_client(instance: str, test: Callable[[Client, Running], None], **option
 
 
 class Serving:
-    """A model in a thread, by ``simulate``, until it is closed."""
+    """A model in a thread, run by ``simulate`` until it is closed."""
 
     def __init__(self, address: str, step: Any, **options: Any) -> None:
         self.joined = threading.Event()
@@ -416,7 +418,7 @@ class Serving:
 
 
 def seen(cell: Client, quality: str) -> None:
-    """Wait until the source is so."""
+    """Wait until the source has this quality."""
     while str(cell.read("drive").of("drive/speed").quality) != quality:
         pass
 
@@ -478,7 +480,7 @@ def test_a_function_computes_a_source(instance: str) -> None:
         (7, "step returned 7, but must return outputs by their paths"),
     ],
 )
-def test_outputs_that_cannot_be_fail_the_step(
+def test_invalid_outputs_fail_the_step(
     instance: str, outputs: Any, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     def test(cell: Client, drive: Running) -> None:
@@ -489,20 +491,20 @@ def test_outputs_that_cannot_be_fail_the_step(
                     with pytest.raises(CommandError) as caught:
                         cell.step()
             assert reason in str(caught.value)
-            if outputs != {"axis/count": 70_000}:  # which the endpoint finds
+            if outputs != {"axis/count": 70_000}:  # the endpoint finds this error itself
                 told = [record.getMessage() for record in caplog.records if record.name == "shmio.client"]
-                assert [text.startswith("drive: step 1 failed: ") for text in told] == [True], "once"
+                assert [text.startswith("drive: step 1 failed: ") for text in told] == [True], "reported once"
             good.set()
             cell.step()
             assert cell["drive/axis/count"] == 1
             if outputs == {"axis/count": 70_000}:
                 last = [record.getMessage() for record in caplog.records if record.name == "shmio.client"][-1]
-                assert last.startswith("drive: step 2: axis/count: "), "the next step has told it"
+                assert last.startswith("drive: step 2: axis/count: "), "the next step reports it"
 
     with_client(instance, test)
 
 
-def test_what_its_code_raises_is_the_reason_with_the_line(instance: str) -> None:
+def test_an_exception_in_the_model_fails_the_step_and_names_the_line(instance: str) -> None:
     def test(cell: Client, drive: Running) -> None:
         def step(time_s: float, dt_s: float, inputs: Values) -> None:
             if dt_s > 1:
@@ -521,7 +523,7 @@ def test_what_its_code_raises_is_the_reason_with_the_line(instance: str) -> None
 
 
 @BOTH
-def test_steps_one_by_one(instance: str, connects: Connect) -> None:
+def test_a_simulation_answers_steps_one_at_a_time(instance: str, connects: Connect) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         async with connects(f"127.0.0.1:{served.port}") as cell, await cell.simulation("drive") as simulation:
             with pytest.raises(RemoteError, match="there is no step to answer"):
@@ -552,7 +554,7 @@ def test_steps_one_by_one(instance: str, connects: Connect) -> None:
 
 
 @BOTH
-def test_joining_what_cannot_be_joined(instance: str, connects: Connect) -> None:
+def test_invalid_joins_are_refused(instance: str, connects: Connect) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         async with connects(f"127.0.0.1:{served.port}") as cell:
             with pytest.raises(PathError, match="no source 'x'"):
@@ -569,7 +571,7 @@ def test_joining_what_cannot_be_joined(instance: str, connects: Connect) -> None
 
 
 @BOTH
-def test_it_is_computed_until_its_client_is_closed(instance: str, connects: Connect) -> None:
+def test_simulate_ends_when_its_client_is_closed(instance: str, connects: Connect) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         joined = threading.Event()
         async with connects(f"127.0.0.1:{served.port}") as cell:
@@ -581,13 +583,13 @@ def test_it_is_computed_until_its_client_is_closed(instance: str, connects: Conn
     serve_remote(instance, test)
 
 
-def test_an_instance_that_is_not_there_is_waited_for_so_long() -> None:
+def test_simulate_waits_for_an_absent_instance_for_a_limited_time() -> None:
     with connect("127.0.0.1:1") as cell, pytest.raises(LostError, match="no instance serves there"):
         cell.simulate("drive", lambda *_: None, patience_s=0.3)
 
 
-def test_it_joins_again_when_the_endpoint_is_started_anew_and_tells_all_it_knows(instance: str) -> None:
-    """The endpoint goes with its port; another one takes the port."""
+def test_simulate_rejoins_a_restarted_endpoint_and_sends_all_outputs(instance: str) -> None:
+    """The endpoint closes its port, and another endpoint opens it."""
     with remote_segment(instance) as segment, Running(segment, "drive", source()) as drive:
 
         def step(time_s: float, dt_s: float, inputs: Values) -> dict[str, object]:
@@ -642,7 +644,7 @@ def test_a_coroutine_function_computes_a_source_until_it_is_cancelled(instance: 
     serve_remote(instance, test)
 
 
-def test_in_real_time_it_is_asked_once_a_period(instance: str) -> None:
+def test_in_real_time_the_model_steps_once_a_period(instance: str) -> None:
     def test(cell: Client, drive: Running) -> None:
         with Serving(cell.target.address, lambda time_s, dt_s, _: {"axis/position": time_s}):
             shown_at = 0.0

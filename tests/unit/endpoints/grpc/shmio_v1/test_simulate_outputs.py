@@ -1,4 +1,4 @@
-"""Values that a model gives, put into an image of its block."""
+"""The outputs of a model, encoded into an image of its block."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 ROWS = Layout("ROWS", None, 20_000, False, (Register("rows", "DINT", ((0, 4999),), 0, None, 20_000, 5000),))
 
 
-def test_values_by_path_are_few_for_each_takes_its_time(instance: str) -> None:
+def test_the_number_of_values_by_path_is_limited(instance: str) -> None:
     blocks = [BlockSpec("line", ROWS, 20_000_000, 500_000_000, 1 << 20)]
     with Segment.create(instance, blocks, []) as segment:
         try:

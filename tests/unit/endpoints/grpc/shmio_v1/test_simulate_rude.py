@@ -1,4 +1,4 @@
-"""Models that break off, stop half-way or never read: their source is free for the next, and others are served."""
+"""Models that disconnect, stop half-way or never read: they free their source, and do not disturb others."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ JOIN = Call(
 
 
 async def free(served: Endpoint, drive: Running, value: int) -> None:
-    """Nothing is left of any model: no call, and another one computes the source."""
+    """Wait until no call is open, then compute the source with another model."""
 
     async def none() -> bool:
         await asyncio.sleep(0)
@@ -45,7 +45,7 @@ async def free(served: Endpoint, drive: Running, value: int) -> None:
 
 @pytest.mark.parametrize("reset", [False, True], ids=["end", "reset"])
 @pytest.mark.parametrize("stage", ["headers", "part of the message", "message", "within a step", "half-close"])
-def test_its_connection_breaks(instance: str, stage: str, reset: bool) -> None:
+def test_a_models_connection_breaks(instance: str, stage: str, reset: bool) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         whole = http2.message(JOIN.request)
         sent = {"headers": 0, "part of the message": len(whole) - 1}.get(stage, len(whole))
@@ -80,7 +80,7 @@ def test_its_connection_breaks(instance: str, stage: str, reset: bool) -> None:
     serve_remote(instance, test)
 
 
-def test_it_is_cancelled_half_closed_or_its_deadline_passes(instance: str) -> None:
+def test_a_models_call_is_cancelled_half_closed_or_reaches_its_deadline(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         async with connect(served) as channel:
             begin(channel, JOIN).cancel()
@@ -111,7 +111,7 @@ def test_it_is_cancelled_half_closed_or_its_deadline_passes(instance: str) -> No
     serve_remote(instance, test)
 
 
-def test_one_that_never_reads_fails_its_steps_by_name_and_holds_nobody_up(instance: str) -> None:
+def test_a_model_that_never_reads_fails_its_steps_and_delays_no_other(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         connection = await http2.Connection.open(served.port)
         await connection.send(NARROW)

@@ -1,4 +1,4 @@
-"""Many steps by one call of shmio.v1."""
+"""Many steps in one call of shmio.v1."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def done(*numbers: int, dt_ms: int = 50) -> list[Stepped]:
     return [Stepped(number, number * dt_ms * MS) for number in numbers]
 
 
-def test_so_many_steps_are_done_and_all_streams_have_each_of_them(instance: str) -> None:
+def test_all_requested_steps_are_done_and_streams_get_each_one(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         stream = subscribe(served, "sim/count")
         assert await stream.values() == {"count": 0}
@@ -47,7 +47,7 @@ def test_so_many_steps_are_done_and_all_streams_have_each_of_them(instance: str)
     simulate(instance, test)
 
 
-def test_what_is_written_between_two_steps_is_done_in_the_second(instance: str) -> None:
+def test_a_step_applies_the_writes_since_the_previous_one(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         async with connect_aio(target(served)) as cell, cell.steps() as stepping:
             for goal in (7, 8, 9):
@@ -60,14 +60,14 @@ def test_what_is_written_between_two_steps_is_done_in_the_second(instance: str) 
 
 
 @BOTH
-def test_steps_that_were_asked_for_before_come_first(instance: str, connects: Connect) -> None:
+def test_steps_are_done_in_the_order_of_their_requests(instance: str, connects: Connect) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         async with connects(target(served)) as cell:
             assert [step async for step in cell.steps(3)] == done(1, 2, 3)
             assert [step async for step in cell.steps()] == []
             async with cell.steps(2) as stepping:
                 assert await anext(stepping) == done(4)[0]
-                assert await stepping.step() == done(6)[0], "behind what was asked for before"
+                assert await stepping.step() == done(6)[0], "after the steps requested earlier"
                 assert await stepping.step() == done(7)[0]
                 assert [step async for step in stepping] == []
             with pytest.raises(CommandError, match="closed"):
@@ -81,7 +81,7 @@ def test_steps_that_were_asked_for_before_come_first(instance: str, connects: Co
 
 
 @BOTH
-def test_the_first_that_fails_ends_it_and_those_behind_it_are_not_done(instance: str, connects: Connect) -> None:
+def test_a_failed_step_ends_the_call_and_the_rest_is_not_done(instance: str, connects: Connect) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         async with connects(target(served)) as cell:
             stepping = cell.steps()
@@ -103,7 +103,7 @@ def test_the_first_that_fails_ends_it_and_those_behind_it_are_not_done(instance:
     simulate(instance, test)
 
 
-def test_a_failure_is_told_after_the_answers_to_the_steps_before_it(instance: str) -> None:
+def test_a_failure_comes_after_the_answers_to_earlier_steps(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         call = stub(served).Steps(timeout=TIMEOUT_S)
         await call.write(wire.StepsRequest(count=2))
@@ -123,7 +123,7 @@ async def _until_error(call: Any) -> AsyncIterator[Any]:
         return
 
 
-def test_who_ends_it_leaves_the_rest_undone_and_time_to_others(instance: str) -> None:
+def test_closing_the_call_stops_its_steps_and_frees_time(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         async with connect_aio(target(served)) as cell:
             stepping = cell.steps(1_000_000)
@@ -131,13 +131,13 @@ def test_who_ends_it_leaves_the_rest_undone_and_time_to_others(instance: str) ->
             stepping.close()
             last = (await cell.step()).step
             async with asyncio.timeout(TIMEOUT_S):
-                while (now := (await cell.step()).step) != last + 1:  # the other takes turns until it is ended
+                while (now := (await cell.step()).step) != last + 1:  # the other call steps, too, until it has ended
                     last = now
 
     simulate(instance, test)
 
 
-def test_time_that_is_played_is_not_stepped(instance: str) -> None:
+def test_steps_are_refused_while_time_plays(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         async with connect_aio(target(served)) as cell:
             await cell.play(dt_s=0.005)
@@ -148,7 +148,7 @@ def test_time_that_is_played_is_not_stepped(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_of_who_does_not_read_the_next_steps_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_wait_while_the_client_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clock, "MAX_ANSWERS", 5)
 
     class Stepper:
@@ -169,7 +169,7 @@ def test_of_who_does_not_read_the_next_steps_wait(monkeypatch: pytest.MonkeyPatc
         sizes = []
         async for message in messages:
             sizes.append(len(wire.StepsResponse.FromString(message).steps))
-            for _ in range(50):  # turns of the event loop
+            for _ in range(50):  # lets the event loop run
                 await asyncio.sleep(0)
             assert stepper.made <= sum(sizes) + 5
         assert sum(sizes) == stepper.made == 100

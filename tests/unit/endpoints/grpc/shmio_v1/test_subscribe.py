@@ -1,4 +1,4 @@
-"""Subscribe over real sockets: what is sent, when, and what is said of what is not."""
+"""Subscribe over real sockets: values, quality, gaps, rates, reloads and refusals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ async def streams(served: Endpoint, count: int) -> None:
     await served.until(so_many)
 
 
-def test_the_present_values_first_then_what_changes(segment: Segment) -> None:
+def test_the_current_values_come_first_then_changes(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(1.0, 2.0, True))
         stream = subscribe(served, "cell/axis", "cell/running")
@@ -39,7 +39,7 @@ def test_the_present_values_first_then_what_changes(segment: Segment) -> None:
         update = await stream.next()
         assert (update.table, update.frame, update.whole) == (table.number, 1, True)
         assert values(table.registers, update.values) == {"axis/position": 1.0, "axis/speed": 2.0, "running": True}
-        served.publish(image(1.0, 2.0, True, step=7))  # of no register that was asked for
+        served.publish(image(1.0, 2.0, True, step=7))  # of a register that was not requested
         served.publish(image(1.0, 2.5, True))
         update = await stream.next()
         assert (update.frame, update.whole) == (3, False)
@@ -48,7 +48,7 @@ def test_the_present_values_first_then_what_changes(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_a_source_that_has_no_value_yet(segment: Segment) -> None:
+def test_a_source_without_a_frame(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         stream = subscribe(served, "cell/axis/position")
         await stream.next()
@@ -64,7 +64,7 @@ def test_a_source_that_has_no_value_yet(segment: Segment) -> None:
 
 
 @pytest.mark.parametrize("mode", [wire.MODE_LATEST, wire.MODE_EVERY_FRAME])
-def test_bad_quality_is_said_with_its_reason_and_its_end(segment: Segment, mode: Any) -> None:
+def test_bad_quality_is_sent_with_its_reason_and_so_is_recovery(segment: Segment, mode: Any) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(1.0))
         stream = subscribe(served, "cell/axis/position", mode=mode)
@@ -80,11 +80,11 @@ def test_bad_quality_is_said_with_its_reason_and_its_end(segment: Segment, mode:
 
 
 @pytest.mark.parametrize("mode", [wire.MODE_LATEST, wire.MODE_EVERY_FRAME])
-def test_age_is_said_too(soon_stale: Segment, mode: Any) -> None:
+def test_staleness_is_sent(soon_stale: Segment, mode: Any) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(1.0))
         stream = subscribe(served, "cell/axis/position", mode=mode)
-        while (update := await stream.update()).quality != wire.QUALITY_BAD:  # it may be too old by the first one
+        while (update := await stream.update()).quality != wire.QUALITY_BAD:  # the first update may already be stale
             assert update.frame == 1
         assert update.frame == 1
         assert update.reason.startswith("stale: ")
@@ -95,8 +95,8 @@ def test_age_is_said_too(soon_stale: Segment, mode: Any) -> None:
     serve(soon_stale, test)
 
 
-def test_a_stream_that_is_behind_catches_up_in_turns(segment: Segment) -> None:
-    """However small its updates are: others have their turn in between."""
+def test_a_stream_that_is_behind_catches_up_in_slices(segment: Segment) -> None:
+    """Even if its updates are small: other tasks run in between."""
 
     async def test(served: Endpoint) -> None:
         served.publish(image(step=0))
@@ -137,7 +137,7 @@ def test_gaps_are_counted_exactly(segment: Segment) -> None:
         served.publish(image(0))
         stream = subscribe(served, "cell/long", "cell/axis/position", mode=EVERY)
         last, missed, gaps = (await stream.update()).frame, 0, 0
-        for i in range(3 * slots):  # within one turn of the loop: nobody reads meanwhile
+        for i in range(3 * slots):  # without a turn of the event loop, so that nothing is read
             served.publish(image(i + 1))
         while last < 3 * slots + 1:
             update = await stream.update()
@@ -152,7 +152,7 @@ def test_gaps_are_counted_exactly(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_the_latest_values_are_conflated_for_a_client_that_does_not_read(segment: Segment) -> None:
+def test_values_are_conflated_for_a_client_that_does_not_read(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(0))
         stream = subscribe(served, "cell/axis/position")
@@ -167,7 +167,7 @@ def test_the_latest_values_are_conflated_for_a_client_that_does_not_read(segment
     serve(segment, test)
 
 
-def test_at_most_so_many_a_second(segment: Segment) -> None:
+def test_the_rate_of_updates_is_limited(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(0))
         stream = subscribe(served, "cell/axis/position", max_rate_hz=0.001)
@@ -186,7 +186,7 @@ def test_at_most_so_many_a_second(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_at_a_rate_the_newest_value_comes_when_it_is_due(segment: Segment) -> None:
+def test_with_a_rate_limit_the_newest_value_is_sent_when_due(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(0))
         stream = subscribe(served, "cell/axis/position", max_rate_hz=20)
@@ -205,7 +205,7 @@ def test_numbers_within_the_dead_band_are_not_sent(segment: Segment) -> None:
         assert (await stream.update()).whole
         for position in (0.5, 1.0, -1.0):
             served.publish(image(position, 0.0))
-        served.publish(image(1.5, 0.25))  # measured from what was sent, not from what was before
+        served.publish(image(1.5, 0.25))  # compared with the value last sent, not with the one before
         assert await stream.values() == {"axis/position": 1.5}
         served.publish(image(0.75, 0.25, True))
         assert await stream.values() == {"running": True}
@@ -259,7 +259,7 @@ def test_streams_of_equal_patterns_share_table_and_bytes(segment: Segment) -> No
         ({"deadband": 1.0, "format": 1}, "deadband is for the format VALUES"),
     ],
 )
-def test_options_that_are_none(segment: Segment, options: dict[str, Any], message: str) -> None:
+def test_invalid_options_are_refused(segment: Segment, options: dict[str, Any], message: str) -> None:
     async def test(served: Endpoint) -> None:
         code, text = await refusal(subscribe(served, "cell/axis", **options).call.read())
         assert code is Status.INVALID_ARGUMENT
@@ -268,7 +268,7 @@ def test_options_that_are_none(segment: Segment, options: dict[str, Any], messag
     serve(segment, test)
 
 
-def test_too_many_streams(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_streams_is_limited(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.subscribe.MAX_STREAMS", 2)
 
     async def test(served: Endpoint) -> None:
@@ -291,7 +291,7 @@ WITHOUT = Layout("DB1", 1, 4, False, (Register("speed", "DINT", (), 0, None, 4, 
 
 
 def reload(served: Endpoint, layout: Layout | None) -> None:
-    """As a reload of the configuration does it: the source has another block by now, or none."""
+    """Replace the source's block or remove it, as a reload of the configuration does."""
     block = [BlockSpec("cell", layout, 20_000_000, STALE_NS, 1 << 16, Attributes())] if layout else []
     served.segment.change(block, ["cell"])
     old = served.feeds.pop("cell")
@@ -304,7 +304,7 @@ def reload(served: Endpoint, layout: Layout | None) -> None:
 
 
 @pytest.mark.parametrize("mode", [wire.MODE_LATEST, wire.MODE_EVERY_FRAME])
-def test_a_reload_is_said_with_a_new_table_after_all_that_was_before(segment: Segment, mode: Any) -> None:
+def test_a_reload_sends_a_new_table_after_all_earlier_updates(segment: Segment, mode: Any) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(1.0))
         stream = subscribe(served, "cell/axis/position", mode=mode)
@@ -325,7 +325,7 @@ def test_a_reload_is_said_with_a_new_table_after_all_that_was_before(segment: Se
 
 
 @pytest.mark.parametrize("layout", [None, WITHOUT])
-def test_what_a_reload_takes_away_is_said_and_comes_back(segment: Segment, layout: Layout | None) -> None:
+def test_registers_removed_by_a_reload_are_reported_and_can_return(segment: Segment, layout: Layout | None) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(1.0))
         stream = subscribe(served, "cell/axis/position")
@@ -344,7 +344,7 @@ def test_what_a_reload_takes_away_is_said_and_comes_back(segment: Segment, layou
     serve(segment, test)
 
 
-def test_a_client_that_never_reads_costs_nothing_and_holds_up_nobody(segment: Segment) -> None:
+def test_a_client_that_never_reads_delays_no_other(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(0))
         silent = stub(served).Subscribe(wire.SubscribeRequest(patterns=["cell"], mode=EVERY), timeout=TIMEOUT_S)

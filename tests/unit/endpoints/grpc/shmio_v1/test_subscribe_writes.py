@@ -1,4 +1,4 @@
-"""Subscribe to ``/in``: what is written toward a source, all of it, in the order in which it was accepted."""
+"""Subscriptions to ``/in``: every write toward a source, in the order in which the source accepted it."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ async def joined(stream: Stream) -> Any:
     return table
 
 
-def test_what_all_write_comes_at_once_in_order(segment: Segment) -> None:
+def test_writes_arrive_in_order_as_soon_as_accepted(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         stream = subscribe(served, "cell/axis/in", "cell/step/in", "cell/inputs/in", "cell/running/in", "cell/name/in")
         table = await joined(stream)
         await write(served, {"cell/step": 5, "cell/axis/speed": 2.0}, until_accepted=True)
         await write(served, {"cell/inputs/1": 7}, until_accepted=True)
-        await write(served, {"cell/long/5": 7}, until_accepted=True)  # of nobody's interest
+        await write(served, {"cell/long/5": 7}, until_accepted=True)  # not subscribed
         await write(served, {"cell/running": True, "cell/name": "ab"}, until_accepted=True)
-        await write(served, {"cell/step": 5}, until_accepted=True)  # the same again is told again
+        await write(served, {"cell/step": 5}, until_accepted=True)  # an equal write is reported again
         assert await told(stream, 6) == [
             {"step": 5},
             {"axis/speed": 2.0},
@@ -56,7 +56,7 @@ def test_what_all_write_comes_at_once_in_order(segment: Segment) -> None:
     with_plant(segment, test, running=False)
 
 
-def test_publishers_of_version_1_are_heard_too(segment: Segment) -> None:
+def test_writes_of_version_1_clients_are_included(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         stream = subscribe(served, "cell/step/in")
         await joined(stream)
@@ -66,7 +66,7 @@ def test_publishers_of_version_1_are_heard_too(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_both_ways_on_one_stream(segment: Segment) -> None:
+def test_in_and_out_on_one_stream(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         async with (
             connect_aio(f"127.0.0.1:{served.port}") as cell,
@@ -82,8 +82,8 @@ def test_both_ways_on_one_stream(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_long_texts_come_whole(instance: str) -> None:
-    """Though the source tells of them in parts."""
+def test_long_texts_arrive_whole(instance: str) -> None:
+    """The source reports them in parts."""
     layout = Layout("L", 1, 1024, False, (Register("texts", "STRING[100]", ((0, 9),), 2, None, 1020, 10),))
     block = BlockSpec("cell", layout, 20_000_000, STALE_NS, 1 << 20, Attributes("test", ("**",)))
     texts = [chr(65 + index) * 100 for index in range(10)]
@@ -145,7 +145,7 @@ def test_a_reload_is_followed(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_who_does_not_keep_up_is_told_and_left(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_clients_stream_ends_with_the_reason(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outbox, "MAX_WAITING", 8)
 
     async def test(served: Endpoint, _: Plant) -> None:
@@ -156,7 +156,7 @@ def test_who_does_not_keep_up_is_told_and_left(segment: Segment, monkeypatch: py
         await stream.update()
         head = events.head()
         (accepted,) = (one for at in range(1, head + 1) if (one := events.read(at)) and one.kind == EventKind.ACCEPTED)
-        for number in range(head + 1, head + 21):  # within one turn of the loop: nobody reads meanwhile
+        for number in range(head + 1, head + 21):  # without a turn of the event loop, so that nothing is read
             feed.commands.followers.follow(accepted._replace(number=number))
         code, text = await refusal(drain(stream))
         assert code is Status.RESOURCE_EXHAUSTED
@@ -171,7 +171,7 @@ async def drain(stream: Stream) -> None:
         await asyncio.wait_for(stream.next(), TIMEOUT_S)
 
 
-def test_events_that_were_missed_end_it(segment: Segment) -> None:
+def test_missed_events_end_the_stream(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         stream = subscribe(served, "cell/step/in")
         await joined(stream)
@@ -181,7 +181,7 @@ def test_events_that_were_missed_end_it(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_what_is_not_served(segment: Segment) -> None:
+def test_unsupported_subscriptions_are_refused(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         frames = subscribe(served, "cell/in", format=wire.FORMAT_FRAMES)
         assert (await refusal(frames.next()))[0] is Status.INVALID_ARGUMENT

@@ -1,4 +1,6 @@
-"""From images to packed arrays and on to a client's numpy arrays, against the codec that has its own fixed bytes."""
+"""From images to packed arrays and on to a client's numpy arrays, compared with the codec.
+
+The codec has its own tests with fixed bytes."""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ def table_of(registers: list[Register], columns: Columns) -> Table:
 
 
 def plain(value: Value, register: Register) -> Any:
-    """What a client has of a value: of an array's element that is none, zero or an empty text."""
+    """Return what a client gets for a value: zero or an empty text for an array's invalid element."""
     if isinstance(value, list):
         return [plain(item, register) for item in value]
     if value is None:
@@ -58,7 +60,7 @@ seeds = st.integers(0, 1 << 32)
 
 
 def random_image(seed: int) -> bytes:
-    """Bytes of which many are zero, so that there are dates and texts among them."""
+    """Random bytes with many zeros, so that some are valid dates and texts."""
     random = np.random.default_rng(seed)
     return bytes(
         random.integers(0, 256, LAYOUT.size, np.uint8) * (random.random(LAYOUT.size) < seed % 5 / 4).astype(np.uint8)
@@ -66,7 +68,7 @@ def random_image(seed: int) -> bytes:
 
 
 @given(paths=chosen, little=st.booleans(), one=seeds, other=seeds, keep=st.floats(0, 1))
-def test_what_goes_by_wire_is_what_the_codec_says(
+def test_decoded_tables_equal_the_codecs_values(
     paths: list[str], little: bool, one: int, other: int, keep: float
 ) -> None:
     registers, layout = [BY_PATH[path] for path in paths], LITTLE if little else LAYOUT
@@ -81,7 +83,7 @@ def test_what_goes_by_wire_is_what_the_codec_says(
     now = columns.decode(image)
     changes = table.apply(Values.FromString(pack(now, before)))
     check(table, registers, layout, image)
-    # Exactly the registers whose bytes mean something else are told.
+    # ``changed`` names exactly the registers whose values differ.
     told = {registers[place].path for place in table.changed(changes)}
     for register in registers:
         old, new = (codec(register, layout.byte_order).decode(data) for data in (first, image))
@@ -95,9 +97,7 @@ def test_what_goes_by_wire_is_what_the_codec_says(
 
 
 @given(paths=chosen, little=st.booleans(), one=seeds, other=seeds, part=seeds)
-def test_what_a_client_gives_is_what_the_codec_makes_of_it(
-    paths: list[str], little: bool, one: int, other: int, part: int
-) -> None:
+def test_encoded_arrays_equal_the_codecs_bytes(paths: list[str], little: bool, one: int, other: int, part: int) -> None:
     registers, layout = [BY_PATH[path] for path in paths], LITTLE if little else LAYOUT
     columns = Columns(registers, layout.byte_order)
     image, given = random_image(one), columns.decode_numbers(random_image(other))
@@ -121,7 +121,7 @@ def test_what_a_client_gives_is_what_the_codec_makes_of_it(
     assert found == wanted
 
 
-def test_numbers_that_do_not_fit_are_left() -> None:
+def test_numbers_out_of_range_are_not_encoded_and_are_reported() -> None:
     register = Register("count", "INT", (), 0, None, 2, 1)
     columns, image = Columns([register], "big"), bytearray(2)
     slots = np.zeros(3, np.int64)
@@ -134,14 +134,14 @@ def holds_none(value: Value) -> bool:
 
 
 @given(seed=seeds)
-def test_nothing_is_told_of_an_image_that_stays(seed: int) -> None:
+def test_an_unchanged_image_packs_to_nothing(seed: int) -> None:
     image = random_image(seed)
     columns = Columns(LAYOUT.registers, "big")
     assert pack(columns.decode(image), columns.decode(bytes(image))) == b""
 
 
 @given(path=st.sampled_from([r.path for r in LAYOUT.registers if r.dims]), seed=seeds, data=st.data())
-def test_of_an_array_only_the_elements_that_changed_are_told(path: str, seed: int, data: Any) -> None:
+def test_only_the_changed_elements_of_an_array_are_sent(path: str, seed: int, data: Any) -> None:
     register, image = BY_PATH[path], random_image(seed)
     index = tuple(data.draw(st.integers(low, high)) for low, high in register.dims)
     element = LAYOUT.element(register, index)
@@ -163,7 +163,7 @@ def test_of_an_array_only_the_elements_that_changed_are_told(path: str, seed: in
     steps=st.lists(st.lists(st.floats(width=32), min_size=8, max_size=8), max_size=6),
     deadband=st.floats(0.001, 1e6),
 )
-def test_with_a_dead_band_nobody_is_further_off_than_it(
+def test_a_client_is_never_off_by_more_than_the_dead_band(
     old: list[float], steps: list[list[float]], deadband: float
 ) -> None:
     register = Register("a", "REAL", ((0, len(old) - 1),), 0, None, 4 * len(old), len(old))

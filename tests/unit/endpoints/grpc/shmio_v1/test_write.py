@@ -1,4 +1,4 @@
-"""Write over real sockets: all or nothing, and what became of each value."""
+"""Write over real sockets: all or nothing, with an outcome for each value."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_registers_arrays_and_elements_in_one_command(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_texts_and_large_numbers_for_numbers(segment: Segment) -> None:
+def test_values_can_be_given_as_text(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         values = {"cell/step": "12", "cell/axis/speed": "1.0E-4", "cell/inputs": "[1, 2]", "cell/running": "true"}
         assert await kinds(write(served, values)) == [KINDS.KIND_WRITTEN] * 4
@@ -63,7 +63,7 @@ def test_texts_and_large_numbers_for_numbers(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_what_the_device_refuses_is_told_with_its_reason(segment: Segment) -> None:
+def test_a_refusal_by_the_device_is_an_outcome_with_its_reason(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         device.refusal = "address out of range"
         answer = await write(served, {"cell/step": 1, "cell/axis/position": 2})
@@ -73,7 +73,7 @@ def test_what_the_device_refuses_is_told_with_its_reason(segment: Segment) -> No
     with_plant(segment, test)
 
 
-def test_what_the_source_rejects_is_not_done_at_all(segment: Segment) -> None:
+def test_a_write_that_the_source_rejects_is_not_done_at_all(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         device.commands.close("not connected")
         answer = await write(served, {"cell/step": 1, "cell/axis/position": 2})
@@ -85,7 +85,7 @@ def test_what_the_source_rejects_is_not_done_at_all(segment: Segment) -> None:
     with_plant(segment, test, running=False)
 
 
-def test_acceptance_alone_can_be_waited_for(segment: Segment) -> None:
+def test_write_can_return_once_the_values_are_accepted(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         assert await kinds(write(served, {"cell/step": 1}, until_accepted=True)) == [KINDS.KIND_ACCEPTED]
         assert not device.written
@@ -95,7 +95,7 @@ def test_acceptance_alone_can_be_waited_for(segment: Segment) -> None:
     with_plant(segment, test, running=False)
 
 
-def test_no_cycle_in_time(segment: Segment) -> None:
+def test_a_write_without_a_cycle_in_time_expires(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         answer = await write(served, {"cell/step": 1}, timeout_ms=50)
         assert [one.kind for one in answer.outcomes] == [KINDS.KIND_EXPIRED]
@@ -104,7 +104,7 @@ def test_no_cycle_in_time(segment: Segment) -> None:
     with_plant(segment, test, running=False)
 
 
-def test_many_writers_at_once_each_hear_of_their_own(segment: Segment) -> None:
+def test_each_of_many_writers_gets_its_own_outcomes(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         calls = [write(served, {"cell/inputs/0": i % 256, "cell/step": i}) for i in range(200)]
         for call in calls:
@@ -134,7 +134,9 @@ def test_many_writers_at_once_each_hear_of_their_own(segment: Segment) -> None:
         ({"cell/name": 5}, Status.INVALID_ARGUMENT, "cell/name"),
     ],
 )
-def test_refusals_before_anything_is_sent(segment: Segment, values: dict[str, Any], code: Any, message: str) -> None:
+def test_invalid_values_are_refused_before_anything_is_sent(
+    segment: Segment, values: dict[str, Any], code: Any, message: str
+) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         found, text = await refusal(write(served, values))
         assert found is code
@@ -144,7 +146,7 @@ def test_refusals_before_anything_is_sent(segment: Segment, values: dict[str, An
     with_plant(segment, test)
 
 
-def test_values_that_are_none_and_too_many(segment: Segment) -> None:
+def test_missing_values_long_time_outs_and_deep_nesting_are_refused(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         bare = wire.WriteRequest(values=[wire.Assignment(path="cell/step")])
         assert (await refusal(stub(served).Write(bare, timeout=TIMEOUT_S)))[0] is Status.INVALID_ARGUMENT
@@ -157,7 +159,7 @@ def test_values_that_are_none_and_too_many(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_too_many_are_refused_before_any_is_looked_at(segment: Segment) -> None:
+def test_too_many_values_are_refused_before_any_is_checked(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         code, text = await refusal(write(served, {f"nothing/{number}": 1 for number in range(4097)}))
         assert (code, text.startswith("4097 values, at most 4096")) == (Status.INVALID_ARGUMENT, True), text

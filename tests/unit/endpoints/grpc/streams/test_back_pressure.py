@@ -1,4 +1,4 @@
-"""A feed reads no more than its streams can take; what those take that are far behind is the newest."""
+"""Back-pressure: a feed reads no more frames than its streams can take; streams far behind get the newest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STEPS = 2**15
 
 
 class Known(LossMonitor):
-    """Says what it is told to."""
+    """A monitor with a fixed result."""
 
     def __init__(self, *, behind: bool) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class Known(LossMonitor):
 
 
 class Followed:
-    """A feed, its source, and streams of one register, of which each has had its first value."""
+    """A feed, its source, and streams of one register; each stream has received its first value."""
 
     def __init__(self, segment: Segment, *behind: bool, source: str = "cell") -> None:
         self.writer = segment.writer(source)
@@ -50,19 +50,19 @@ class Followed:
             StateLane(stream).join(self.feed, STEP)
 
     async def begin(self) -> None:
-        asking = [asyncio.ensure_future(self.next(stream)) for stream in self.streams]  # before anything is passed over
+        asking = [asyncio.ensure_future(self.next(stream)) for stream in self.streams]  # before any frame is skipped
         await self.publish(1)
         assert [await value for value in asking] == [1] * len(asking)
 
     async def publish(self, count: int) -> None:
-        """Frames with the next numbers, with time between them to be shown or passed over."""
+        """Publish frames with the next numbers, with time to show or skip each."""
         for _ in range(count):
             self.count += 1
             self.writer.publish(image(step=self.count % STEPS), cycle=self.count)
             await self.pass_by()
 
     async def fail(self) -> None:
-        """A frame that says that there are no values."""
+        """Publish a frame of bad quality, which has no values."""
         self.count += 1
         self.writer.publish(image(), cycle=self.count, quality=Quality.BAD, reason="cable out")
         await self.pass_by()
@@ -96,19 +96,19 @@ def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behin
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is looked at for its age, and nothing is new."""
+    """Never look for stale frames, count every frame as late, and wake resting feeds only by themselves."""
     monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
     monkeypatch.setattr(back_pressure, "LATE_S", 0.0)
     monkeypatch.setattr(wakeups, "REST_S", 1000.0)
 
 
-def test_frames_that_nobody_could_take_are_not_read(segment: Segment) -> None:
+def test_frames_that_no_stream_can_take_are_not_read(segment: Segment) -> None:
     async def test(followed: Followed) -> None:
         feed, (first, second) = followed.feed, followed.streams
         before = feed.messages
         await followed.publish(MANY)
         assert feed.messages == before
-        assert await followed.next(first) == MANY + 1, "the newest when it can be taken"
+        assert await followed.next(first) == MANY + 1, "the newest value when the stream asks"
         assert await followed.next(second) == MANY + 1
         assert feed.messages == before + 1
         assert first.dropped == second.dropped == MANY - 1
@@ -118,12 +118,12 @@ def test_frames_that_nobody_could_take_are_not_read(segment: Segment) -> None:
         waiting = asyncio.ensure_future(followed.next(first))
         await asyncio.sleep(0)
         await followed.publish(1)
-        assert await waiting == MANY + 3, "who waits is rung for"
+        assert await waiting == MANY + 3, "a waiting stream is woken"
 
     follow(segment, test, True, True)
 
 
-def test_of_what_is_new_they_take_several(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_far_behind_gets_the_few_newest_frames(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (back_pressure, outbox):
         monkeypatch.setattr(module, "LATE_S", 1000.0)
 
@@ -137,12 +137,12 @@ def test_of_what_is_new_they_take_several(segment: Segment, monkeypatch: pytest.
     follow(segment, test, True)
 
 
-def test_one_that_is_not_far_behind_misses_nothing_for_having_been_busy(segment: Segment) -> None:
+def test_a_stream_that_is_briefly_busy_misses_nothing(segment: Segment) -> None:
     async def test(followed: Followed) -> None:
         (stream,) = followed.streams
         before = followed.feed.messages
         await followed.publish(back_pressure.CATCH_UP_FRAMES)
-        assert followed.feed.messages == before, "they are where they are until it asks"
+        assert followed.feed.messages == before, "frames are not read until the stream asks"
         expected = range(2, back_pressure.CATCH_UP_FRAMES + 2)
         assert [await followed.next(stream) for _ in expected] == list(expected)
         assert stream.dropped == 0
@@ -153,7 +153,7 @@ def test_one_that_is_not_far_behind_misses_nothing_for_having_been_busy(segment:
     follow(segment, test, False)
 
 
-def test_beside_one_that_keeps_up_every_frame_is_read(segment: Segment) -> None:
+def test_every_frame_is_read_if_one_stream_keeps_up(segment: Segment) -> None:
     async def test(followed: Followed) -> None:
         late, good = followed.streams
         for number in range(2, 40):
@@ -165,7 +165,7 @@ def test_beside_one_that_keeps_up_every_frame_is_read(segment: Segment) -> None:
     follow(segment, test, True, False)
 
 
-def test_what_waits_does_not_get_too_old(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_read_in_time_though_no_stream_asks(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(back_pressure, "LOOK_S", 0.0)
 
     async def test(followed: Followed) -> None:
@@ -177,7 +177,7 @@ def test_what_waits_does_not_get_too_old(segment: Segment, monkeypatch: pytest.M
     follow(segment, test, True)
 
 
-def test_a_stream_of_several_sources_is_given_what_is_newest_of_each_when_it_asks(instance: str) -> None:
+def test_a_stream_of_several_sources_gets_the_newest_of_each(instance: str) -> None:
     blocks = [BlockSpec(name, LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE)) for name in "ab"]
     processes = [*(ProcessSpec(name, "source") for name in "ab"), ProcessSpec("grpc", "grpc")]
 
@@ -194,9 +194,9 @@ def test_a_stream_of_several_sources_is_given_what_is_newest_of_each_when_it_ask
                 await b.publish(1)
                 await a.publish(1)
                 async with asyncio.timeout(TIMEOUT_S):
-                    while len(stream.refills) < 2:  # noqa: ASYNC110  another thread's doing
+                    while len(stream.refills) < 2:  # noqa: ASYNC110  another thread changes it
                         await asyncio.sleep(0)
-                assert [await a.next(stream) for _ in range(2)] == [number, number], "of both, one after the other"
+                assert [await a.next(stream) for _ in range(2)] == [number, number], "one value of each source"
         finally:
             a.stop()
             b.stop()
@@ -207,35 +207,35 @@ def test_a_stream_of_several_sources_is_given_what_is_newest_of_each_when_it_ask
         segment.unlink()
 
 
-def test_who_joins_while_a_feed_rests_asks_for_more_as_the_others_do(segment: Segment) -> None:
+def test_a_stream_that_joins_a_resting_feed_can_wake_it(segment: Segment) -> None:
     async def test(followed: Followed) -> None:
-        await followed.publish(1)  # passed over: the one that there is never reads
+        await followed.publish(1)  # skipped, as the existing stream does not ask
         async with asyncio.timeout(TIMEOUT_S):
-            while not followed.streams[0].refills:  # noqa: ASYNC110  another thread's doing
+            while not followed.streams[0].refills:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
         late = Outbox()
         StateLane(late).join(followed.feed, STEP)
         await followed.publish(2)
-        assert await followed.next(late) == 2, "as it was when it came"
+        assert await followed.next(late) == 2, "the value at the time of joining"
         assert [await followed.next(late) for _ in range(2)] == [3, 4]
 
     follow(segment, test, False)
 
 
-def test_who_has_left_asks_for_nothing_more(segment: Segment) -> None:
-    """What others have no time for is not read on its behalf."""
+def test_a_stream_that_has_left_no_longer_wakes_its_feed(segment: Segment) -> None:
+    """Frames that no other stream can take are not read for a stream that has left."""
 
     async def test(followed: Followed) -> None:
         feed, (stream,) = followed.feed, followed.streams
         gone = Outbox()
         leave = StateLane(gone).join(feed, STEP)
-        await followed.publish(1)  # passed over: neither asks
+        await followed.publish(1)  # skipped, as neither stream asks
         async with asyncio.timeout(TIMEOUT_S):
-            while not (gone.refills and stream.refills):  # noqa: ASYNC110  another thread's doing
+            while not (gone.refills and stream.refills):  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
         leave()
         before = feed.messages
-        assert await followed.next(gone) == 1, "what it was given"
+        assert await followed.next(gone) == 1, "the value that it was given before"
         asking = asyncio.ensure_future(followed.next(gone))
         await asyncio.sleep(0)
         assert feed.messages == before
@@ -245,7 +245,7 @@ def test_who_has_left_asks_for_nothing_more(segment: Segment) -> None:
     follow(segment, test, False)
 
 
-def test_bad_news_of_a_source_that_says_nothing_more_wait_for_no_ring(
+def test_a_resting_feed_notices_a_failed_source_without_a_ring(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(wakeups, "TURN_NS", 1_000_000_000_000)
@@ -262,18 +262,18 @@ def test_bad_news_of_a_source_that_says_nothing_more_wait_for_no_ring(
         await followed.fail()
         async with asyncio.timeout(TIMEOUT_S):
             await heard.wait()
-        assert followed.told == [True], "nobody has looked yet"
+        assert followed.told == [True], "the failure has not been noticed yet"
         monkeypatch.setattr(back_pressure, "LOOK_S", 0.0)
         followed.feed._back_pressure._until_s = 0.0
         async with asyncio.timeout(TIMEOUT_S):
-            while followed.told == [True]:  # noqa: ASYNC110  it has no bell of its own
+            while followed.told == [True]:  # noqa: ASYNC110  the stream has no doorbell of its own
                 await asyncio.sleep(0)
         assert followed.told == [True, False]
 
     follow(segment, test, False)
 
 
-def test_what_was_passed_over_was_no_silence(soon_stale: Segment) -> None:
+def test_skipped_frames_do_not_make_a_source_stale(soon_stale: Segment) -> None:
     async def test(followed: Followed) -> None:
         (stream,) = followed.streams
         begun_s = asyncio.get_running_loop().time()
@@ -286,8 +286,8 @@ def test_what_was_passed_over_was_no_silence(soon_stale: Segment) -> None:
     follow(soon_stale, test, True)
 
 
-def test_whoever_sees_two_frames_at_once_sees_that_nothing_came_between_them_for_too_long(segment: Segment) -> None:
-    """By the time of the next frame, not by that at which somebody was awake to look."""
+def test_a_gap_between_two_frames_read_at_once_counts_as_stale(segment: Segment) -> None:
+    """The time of the next frame counts, not the time at which the feed looked."""
 
     async def test(followed: Followed) -> None:
         (stream,), block = followed.streams, segment.blocks["cell"]
@@ -295,7 +295,7 @@ def test_whoever_sees_two_frames_at_once_sees_that_nothing_came_between_them_for
         await followed.pass_by()
         late = Stamp(block.now_ns() + 2 * STALE_NS, 0)
         followed.writer.publish(image(step=followed.count), cycle=followed.count + 1, at=late)
-        assert await asking == followed.count, "what has not changed, once more"
+        assert await asking == followed.count, "the unchanged value is sent again"
         assert followed.told == [True, False, True]
 
     follow(segment, test, False)
@@ -311,7 +311,7 @@ def far_behind(now_s: float) -> LossMonitor:
     return losses
 
 
-def test_all_who_are_far_behind_are_tried_again_together() -> None:
+def test_all_streams_far_behind_are_retried_together() -> None:
     together_s = 7 * BEHIND_S
     monitors = [far_behind(together_s - before_s) for before_s in (0.9 * BEHIND_S, 0.4 * BEHIND_S, 0.001)]
     for now_s, behind in ((together_s - 0.0005, True), (together_s, False)):

@@ -21,7 +21,7 @@ from tests.unit.endpoints.stepped import LAYOUT as MODEL_LAYOUT
 from tests.unit.endpoints.stepped import stepped_segment
 
 
-def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Segment, instance: str) -> None:
+def test_a_replaced_feed_is_dropped_when_its_streams_have_left(segment: Segment, instance: str) -> None:
     async def run(opened: Segment) -> None:
         wake_ups = WakeUps()
         feeds = Feeds(opened, WRITER, wake_ups, lambda source, good: None)
@@ -31,7 +31,7 @@ def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Seg
         old.listen(STEP, stream)
         segment.writer("cell").publish(image(step=1), cycle=1)
         async with asyncio.timeout(TIMEOUT_S):
-            while not feeds.messages:  # noqa: ASYNC110  another thread's doing
+            while not feeds.messages:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
         counted = feeds.messages
         spec = BlockSpec("cell", LAYOUT, 10_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
@@ -41,7 +41,7 @@ def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Seg
                 await feeds.follow()
                 await asyncio.sleep(0)
         await feeds.follow()
-        assert old in feeds._ended  # a stream has not gone over yet
+        assert old in feeds._ended  # a stream has not moved to the new feed yet
         old.leave(STEP, stream)
         gone = weakref.ref(old)
         del old
@@ -59,8 +59,8 @@ def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Seg
         asyncio.run(run(opened))
 
 
-def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance: str) -> None:
-    """Whatever is read of the segment is read by another thread than that of the streams."""
+def test_the_event_loop_runs_while_a_new_layout_is_read(segment: Segment, instance: str) -> None:
+    """Another thread than that of the streams reads the segment."""
 
     async def run(opened: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
         wake_ups = WakeUps()
@@ -95,7 +95,7 @@ def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance:
 COUNT = Subject("raw", "count", (MODEL_LAYOUT.registers[0],), lambda picture: bytes((picture.number, picture.image[3])))
 
 
-def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too(instance: str) -> None:
+def test_a_model_replaced_by_a_reload_in_virtual_time_is_shown_step_by_step(instance: str) -> None:
     async def run(opened: Segment) -> None:
         wake_ups, virtual_time = WakeUps(), VirtualTime()
         virtual_time.on, virtual_time.moment = True, Moment(6, 0)
@@ -111,9 +111,9 @@ def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too
         for count in (1, 2, 3):
             writer.publish(b"\0\0\0" + bytes([count]) + bytes(MODEL_LAYOUT.size - 4), cycle=count)
             async with asyncio.timeout(TIMEOUT_S):
-                while not stream.got:  # noqa: ASYNC110  another thread's doing
+                while not stream.got:  # noqa: ASYNC110  another thread changes it
                     await asyncio.sleep(0)
-        assert stream.got == [bytes((6, 1))], "the first image, and nothing more before a step"
+        assert stream.got == [bytes((6, 1))], "the first image only, until a step"
         for number in (7, 8):
             virtual_time.moment = Moment(number, 0)
             feeds["sim"].step()
@@ -126,8 +126,8 @@ def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too
         asyncio.run(run(segment))
 
 
-def test_a_feed_that_is_held_passes_nothing_over(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What it reads is not for its streams: they have nothing to be too slow for."""
+def test_a_held_feed_skips_no_frames(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It reads the frames for its streams later: they are not too slow for any."""
     monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
     monkeypatch.setattr(ringing, "REST_S", 0.001)
 
@@ -139,13 +139,13 @@ def test_a_feed_that_is_held_passes_nothing_over(instance: str, monkeypatch: pyt
         feed.listen(COUNT, stream)
         writer.publish(bytes(MODEL_LAYOUT.size), cycle=1)
         async with asyncio.timeout(TIMEOUT_S):
-            while told[-1:] != [True]:  # noqa: ASYNC110  another thread's doing
+            while told[-1:] != [True]:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
             feed.hold()
             for cycle in range(2, 2 * back_pressure.CATCH_UP_FRAMES):
                 writer.publish(bytes(MODEL_LAYOUT.size), cycle=cycle)
             writer.publish(bytes(MODEL_LAYOUT.size), cycle=2 * back_pressure.CATCH_UP_FRAMES, quality=Quality.BAD)
-            while told[-1]:  # noqa: ASYNC110  another thread's doing
+            while told[-1]:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
         assert stream.stream.dropped == 0
         feed.leave(COUNT, stream)

@@ -1,4 +1,4 @@
-"""What waits for a stream: of one topic, and of many."""
+"""Messages that wait for a stream: of one topic, and of many."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shmio.endpoints.grpc.streams.outbox import TOPIC_BOUND, EventLane, Outbox, 
 
 
 async def rest(outbox: Outbox) -> list[bytes]:
-    """All that still waits."""
+    """End the outbox and return all messages that still wait."""
     outbox.end()
     found = []
     while (message := await outbox.pop()) is not None:
@@ -42,7 +42,7 @@ def test_a_slow_reader_gets_the_newest_value_and_the_loss_is_counted() -> None:
     asyncio.run(test())
 
 
-def test_one_that_is_far_behind_is_given_no_value_that_has_waited_as_long_as_it_is(
+def test_a_stream_far_behind_gets_no_old_values(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def test() -> None:
@@ -51,7 +51,7 @@ def test_one_that_is_far_behind_is_given_no_value_that_has_waited_as_long_as_it_
         lane, other = StateLane(outbox), StateLane(outbox)
 
         async def offered() -> list[bytes]:
-            """What is left of four values, of which two come at once."""
+            """Offer four values, of which two come at once, and return those that are left."""
             nonlocal now_s
             for letter in (b"a", b"b", b"c"):
                 lane.deliver(letter)
@@ -66,14 +66,14 @@ def test_one_that_is_far_behind_is_given_no_value_that_has_waited_as_long_as_it_
         now_s += back_pressure.WINDOW_S
         assert await offered() == [b"b", b"c", b"d"]
         now_s += back_pressure.BEHIND_S
-        assert await offered() == [b"a", b"b", b"c", b"d"], "it is tried again"
+        assert await offered() == [b"a", b"b", b"c", b"d"], "it is retried"
         now_s += back_pressure.WINDOW_S
-        assert await offered() == [b"a", b"b", b"c", b"d"], "it has lost none"
+        assert await offered() == [b"a", b"b", b"c", b"d"], "it has lost none, so it is no longer behind"
 
     asyncio.run(test())
 
 
-def test_of_values_that_come_at_once_it_is_given_those_that_are_not_older_than_that() -> None:
+def test_of_values_that_come_at_once_a_stream_far_behind_gets_the_recent_ones() -> None:
     async def test() -> None:
         outbox = Outbox()
         lane = StateLane(outbox)
@@ -108,7 +108,7 @@ def test_topics_share_a_stream_in_the_order_of_their_values() -> None:
 
 
 @pytest.mark.parametrize(("bound", "count"), [("STATE_BOUND", 6), ("BOUND_BYTES", 60)])
-def test_when_too_much_waits_in_all_each_topic_has_its_newest_value(
+def test_beyond_the_streams_bound_each_topic_keeps_its_newest_value(
     monkeypatch: pytest.MonkeyPatch, bound: str, count: int
 ) -> None:
     monkeypatch.setattr(back_pressure if bound == "BOUND_BYTES" else module, bound, count)
@@ -130,7 +130,7 @@ def test_when_too_much_waits_in_all_each_topic_has_its_newest_value(
     asyncio.run(test())
 
 
-def test_events_wait_all_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_events_are_queued_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "EVENT_BOUND", 3)
     monkeypatch.setattr(back_pressure, "BOUND_BYTES", 10)
 
@@ -160,7 +160,7 @@ def test_events_wait_all_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> 
     asyncio.run(test())
 
 
-def test_what_was_dropped_is_counted_also_of_streams_that_are_over() -> None:
+def test_dropped_values_of_ended_streams_are_still_counted() -> None:
     outboxes = Outboxes()
     with outboxes.opened() as one:
         lane = StateLane(one)
@@ -170,7 +170,7 @@ def test_what_was_dropped_is_counted_also_of_streams_that_are_over() -> None:
     assert (len(outboxes), outboxes.dropped) == (0, 1)
 
 
-def test_when_all_streams_hold_too_much_those_with_more_than_their_part_give_way(
+def test_beyond_the_total_bound_streams_above_their_share_drop_values(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(back_pressure, "TOTAL_BYTES", 100)
@@ -191,7 +191,7 @@ def test_when_all_streams_hold_too_much_those_with_more_than_their_part_give_way
     assert outboxes.dropped == hog.dropped + slow.dropped
 
 
-def test_behind_its_end_it_begins_anew() -> None:
+def test_an_ended_outbox_can_be_used_again() -> None:
     async def test() -> None:
         outbox = Outbox()
         outbox.end()
@@ -200,7 +200,7 @@ def test_behind_its_end_it_begins_anew() -> None:
         popped = asyncio.ensure_future(outbox.pop())
         await asyncio.sleep(0)
         busy.append(outbox.busy)
-        assert busy == [True, False], "busy while nobody waits for a message"
+        assert busy == [True, False], "busy until a reader waits for a message"
         assert not popped.done()
         StateLane(outbox).deliver(b"x")
         assert await popped == b"x"
@@ -208,8 +208,8 @@ def test_behind_its_end_it_begins_anew() -> None:
     asyncio.run(test())
 
 
-def test_of_its_failure_is_told_once_and_not_at_once() -> None:
-    """Whoever is told may change what is just being gone through."""
+def test_a_failure_is_reported_once_in_a_later_turn() -> None:
+    """The callback may change collections that the caller is iterating over."""
 
     async def test() -> None:
         outbox, told = Outbox(), list[str]()
@@ -223,7 +223,7 @@ def test_of_its_failure_is_told_once_and_not_at_once() -> None:
     asyncio.run(test())
 
 
-def test_values_of_a_step_are_all_kept_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_values_of_a_step_are_queued_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "STEP_BOUND", TOPIC_BOUND + 5)
 
     async def test() -> None:
@@ -245,13 +245,13 @@ def test_values_of_a_step_are_all_kept_or_the_stream_ends(monkeypatch: pytest.Mo
     asyncio.run(test())
 
 
-def test_values_of_a_step_have_a_bound_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_of_a_step_are_limited_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "STEP_BOUND_BYTES", 100)
 
     async def test() -> None:
         outbox = Outbox()
         lane = StateLane(outbox)
-        lane.keep(bytes(101))  # a single one always has room
+        lane.keep(bytes(101))  # a single value always fits
         assert await rest(outbox) == [bytes(101)]
         lane.keep(bytes(60))
         lane.keep(bytes(40))
@@ -262,7 +262,7 @@ def test_values_of_a_step_have_a_bound_in_bytes_too(monkeypatch: pytest.MonkeyPa
     asyncio.run(test())
 
 
-def test_a_message_is_taken_when_the_reader_asks_for_the_next_one() -> None:
+def test_a_message_counts_as_taken_when_the_reader_asks_for_the_next() -> None:
     async def test() -> None:
         outbox = Outbox()
         lane = StateLane(outbox)
@@ -282,7 +282,7 @@ def test_a_message_is_taken_when_the_reader_asks_for_the_next_one() -> None:
     asyncio.run(test())
 
 
-def test_those_that_take_nothing_end_and_the_others_do_not() -> None:
+def test_streams_that_take_nothing_end_and_others_continue() -> None:
     async def test() -> None:
         outboxes = Outboxes()
         with ExitStack() as stack:
@@ -298,7 +298,7 @@ def test_those_that_take_nothing_end_and_the_others_do_not() -> None:
             await waiting
             assert idle.failure == "the client has not taken the values of a step within 0.05 s"
             assert (reader.failure, gone.failure, none.failure) == ("", "", "")
-            await outboxes.taken(60)  # nobody owes anything
+            await outboxes.taken(60)  # no outbox owes a value
             popping.cancel()
 
     asyncio.run(test())

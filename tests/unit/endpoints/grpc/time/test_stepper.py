@@ -1,4 +1,4 @@
-"""A step's waits in the event loop."""
+"""How a step waits in the event loop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DONE = Step(1, 50, 50)
 
 
 class Block:
-    """Its bell has rung again whenever one waits for it in the event loop's thread, and never when one only looks."""
+    """A block whose doorbell has always rung again when the event loop's thread waits for it."""
 
     @property
     def ring(self) -> Block:
@@ -29,7 +29,7 @@ class Block:
 
 
 class Bells:
-    """They ring at the loop's next turn."""
+    """Doorbells that ring at the next turn of the event loop."""
 
     def join(self, block: Any, ring: Callable[[], object]) -> None:
         asyncio.get_running_loop().call_soon(ring)
@@ -37,7 +37,7 @@ class Bells:
     def leave(self, block: Any, ring: Callable[[], object]) -> None: ...
 
 
-def test_a_source_that_rings_much_before_it_answers_does_not_hold_up_the_loop() -> None:
+def test_a_source_that_rings_often_before_it_answers_does_not_block_the_loop() -> None:
     turns: list[int] = []
     waits: list[int] = []
 
@@ -56,7 +56,7 @@ def test_a_source_that_rings_much_before_it_answers_does_not_hold_up_the_loop() 
 
     async def test() -> None:
         coordinator, clock, wake_ups = Coordinator(), None, Bells()
-        driver = StepDriver(coordinator, clock, wake_ups)  # type: ignore[arg-type]  # what it needs of them
+        driver = StepDriver(coordinator, clock, wake_ups)  # type: ignore[arg-type]  # only what the driver uses
         beside = asyncio.create_task(others())
         assert await driver.step(None) == DONE
         await beside

@@ -1,4 +1,4 @@
-"""Our own broker: mosquitto, and aMQTT; as their process runs them, and as clients see them."""
+"""The brokers that shmio starts, mosquitto and aMQTT: run as in their process, and seen by clients."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.unit.endpoints.mqtt.serving import segment as segment  # noqa: PLC041
 MOSQUITTO = pytest.mark.skipif(bool(missing()), reason=missing())
 
 
-def test_clients_see_what_the_bridge_publishes(segment: Segment, address: Address, program: str) -> None:
+def test_clients_receive_what_the_bridge_publishes(segment: Segment, address: Address, program: str) -> None:
     with serving(segment, address, program), bridged(segment) as running:
         assert running.bridge.connection.mqtt5 is (program == "mosquitto")
         with listening(address, protocol=MQTTv311) as listener:
@@ -39,7 +39,7 @@ def test_clients_see_what_the_bridge_publishes(segment: Segment, address: Addres
 
 
 @MOSQUITTO
-def test_a_client_hears_only_what_it_has_subscribed_to(segment: Segment, address: Address) -> None:
+def test_a_client_receives_only_its_subscriptions(segment: Segment, address: Address) -> None:
     with (
         serving(segment, address),
         bridged(segment),
@@ -52,9 +52,7 @@ def test_a_client_hears_only_what_it_has_subscribed_to(segment: Segment, address
             assert listener.heard == [(f"{PREFIX}/mine", b"last")]
 
 
-def test_a_retained_command_is_not_carried_out_by_either_version(
-    segment: Segment, address: Address, program: str
-) -> None:
+def test_a_retained_command_is_not_carried_out(segment: Segment, address: Address, program: str) -> None:
     with serving(segment, address, program):
         with listening(address, "none", protocol=MQTTv311) as before:
             before.publish("cell/step/in", "5", retain=True)
@@ -65,13 +63,11 @@ def test_a_retained_command_is_not_carried_out_by_either_version(
             assert "not writable" in told["reason"]
             assert (
                 running.bridge.counters[2] >= 1
-            )  # mosquitto says nothing of the retained one; aMQTT, which does, may repeat it
+            )  # mosquitto does not report the retained command; aMQTT does, perhaps twice
             assert not any(json.loads(one)["done"] for one in listener.values("cell/step/in/result"))
 
 
-def test_what_a_bridge_before_has_left_is_forgotten_by_either_version(
-    segment: Segment, address: Address, program: str
-) -> None:
+def test_retained_topics_of_an_earlier_bridge_are_cleared(segment: Segment, address: Address, program: str) -> None:
     with serving(segment, address, program), listening(address, protocol=MQTTv311) as listener:
         listener.publish("cell/nowhere/out", "1", retain=True)
         listener.until("cell/nowhere/out", b"1")
@@ -81,7 +77,7 @@ def test_what_a_bridge_before_has_left_is_forgotten_by_either_version(
 
 
 @MOSQUITTO
-def test_only_who_has_an_account_gets_in(segment: Segment, address: Address, tmp_path: Path) -> None:
+def test_only_accounts_can_connect(segment: Segment, address: Address, tmp_path: Path) -> None:
     accounts = tmp_path / "accounts"
     accounts.write_text("anna:secret\n")
     accounts.chmod(0o600)
@@ -94,7 +90,7 @@ def test_only_who_has_an_account_gets_in(segment: Segment, address: Address, tmp
 
 
 def answer(address: Address, protocol: Any, *account: str) -> str:
-    """What the broker says to a client that connects."""
+    """Return the broker's answer to a client that connects."""
     told: list[str] = []
     client = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
     if account:
@@ -108,7 +104,7 @@ def answer(address: Address, protocol: Any, *account: str) -> str:
     return told[0]
 
 
-def test_amqtt_says_what_it_does_not_speak(segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_amqtt_refuses_mqtt_5(segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SHMIO_MOSQUITTO", "")
     with serving(segment, address):
         assert answer(address, MQTTv5) == "Unsupported protocol version"
@@ -142,7 +138,7 @@ def test_tls_with_certificates_of_both_sides(segment: Segment, address: Address,
         running.until(lambda: "mqtt.tls.ca" in running.bridge.problem)
 
 
-def test_a_port_that_is_taken_ends_it_with_the_reason(segment: Segment, program: str) -> None:
+def test_an_occupied_port_ends_the_broker_with_the_reason(segment: Segment, program: str) -> None:
     with (
         Listening() as taken,
         pytest.raises(EndpointError, match=r"(?i)address already in use|address in use"),
@@ -153,7 +149,7 @@ def test_a_port_that_is_taken_ends_it_with_the_reason(segment: Segment, program:
 
 
 class Listening:
-    """Somebody else's server."""
+    """A server of another program."""
 
     def __enter__(self) -> Listening:
 
@@ -186,28 +182,28 @@ OPEN: dict[str, Any] = {"listen": "127.0.0.1:1883", "account": [EVERYBODY]}
         ({"account": [{"roles": ["read", "write"], "name": "anna"}]}, r"mqtt\.account: .*needs mosquitto"),
     ],
 )
-def test_what_needs_mosquitto_is_refused_without_it(
+def test_settings_that_need_mosquitto_are_refused_without_it(
     settings: dict[str, Any], told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mqtt = msgspec.convert(OPEN | settings, Mqtt)
-    monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # there is some program
+    monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # stands for any program
     assert choose_broker(mqtt) == sys.executable
     monkeypatch.setenv("SHMIO_MOSQUITTO", "")
     with pytest.raises(ConfigError, match=told):
         choose_broker(mqtt)
 
 
-def test_amqtt_is_chosen_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_amqtt_is_used_if_it_is_installed_and_mosquitto_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     mqtt = msgspec.convert(OPEN, Mqtt)
     monkeypatch.setenv("SHMIO_MOSQUITTO", "")
     assert choose_broker(mqtt) is None
     assert choose_broker(msgspec.structs.replace(mqtt, listen="[::1]:1883")) is None
-    monkeypatch.setitem(sys.modules, "amqtt", None)  # as if it were not installed
+    monkeypatch.setitem(sys.modules, "amqtt", None)  # as if not installed
     with pytest.raises(ConfigError, match=r"apt install mosquitto.*pip install 'shmio\[broker\]'"):
         choose_broker(mqtt)
 
 
-def test_the_process_of_the_broker_refuses_too(
+def test_the_broker_process_refuses_them_too(
     segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SHMIO_MOSQUITTO", "")
@@ -216,7 +212,7 @@ def test_the_process_of_the_broker_refuses_too(
     assert not folder(segment).exists()
 
 
-def test_what_mosquitto_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_configuration_of_mosquitto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LOGNAME", "nobody")  # as some ways to become root leave it
     tls = MqttTls(ca="/c/ca.pem", certificate="/c/c.pem", key="/c/k.pem")
     text = mosquitto.configuration(Mqtt(listen="[::1]:1883", password_file="/c/a", tls=tls), tmp_path, anonymous=False)

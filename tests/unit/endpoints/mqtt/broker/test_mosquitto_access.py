@@ -1,4 +1,4 @@
-"""Who may do what at our own broker, which is mosquitto then."""
+"""Access rights at the broker that shmio starts, which is mosquitto in these tests."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ COMMANDS = [f"{PREFIX}/cell/secret/in", "spBv1.0/plant/NCMD/a50", "spBv1.0/STATE
 
 
 class Cell:
-    """A broker with accounts, its bridge, and a client that has heard of everything."""
+    """A broker with accounts, its bridge, and a client that receives everything."""
 
     def __init__(self, running: Running, listener: Listener, address: Address) -> None:
         self.running, self.listener, self.address = running, listener, address
@@ -56,7 +56,7 @@ class Cell:
         return client
 
     def unforged(self, segment: Segment, connects: int = 1) -> None:
-        """What comes now is the bridge's, for who was there and for who comes later."""
+        """Assert that no forged message reaches an earlier or a later client, and that the bridge still publishes."""
         segment.writer("cell").publish(image(step=8), cycle=2)
         self.listener.until("cell/step/out", b"8")
         for topic in FORGED:
@@ -96,7 +96,7 @@ def _cell(segment: Segment, address: Address, folder: Path, **config: Any) -> It
 
 
 @pytest.mark.parametrize("account", [VIEWER, NEW])
-def test_who_may_read_publishes_nothing(cells: Cells, segment: Segment, account: tuple[str, str]) -> None:
+def test_an_account_that_may_read_cannot_publish(cells: Cells, segment: Segment, account: tuple[str, str]) -> None:
     with cells() as cell:
         with cell.client("me", account) as client:
             for topic in FORGED + COMMANDS:
@@ -109,7 +109,7 @@ def test_who_may_read_publishes_nothing(cells: Cells, segment: Segment, account:
         assert not cell.listener.values("cell/secret/in/result")
 
 
-def test_who_may_write_publishes_commands_and_no_values(cells: Cells, segment: Segment) -> None:
+def test_an_account_that_may_write_publishes_commands_but_no_values(cells: Cells, segment: Segment) -> None:
     with cells() as cell:
         with cell.client("me", WRITER) as client:
             for topic in FORGED:
@@ -136,7 +136,7 @@ def test_a_last_will_is_published_where_its_client_may_publish(cells: Cells, seg
 
 
 @pytest.mark.parametrize("topic", ["$SYS/broker/version", "$share/group/mine/own", f"$share/g/{PREFIX}/status"])
-def test_nobody_publishes_on_a_topic_of_the_brokers_own(cells: Cells, segment: Segment, topic: str) -> None:
+def test_no_client_can_publish_on_reserved_topics(cells: Cells, segment: Segment, topic: str) -> None:
     with (
         cells() as cell,
         cell.client("me", WRITER) as client,
@@ -149,7 +149,9 @@ def test_nobody_publishes_on_a_topic_of_the_brokers_own(cells: Cells, segment: S
         assert b"forged" not in [payload for _, payload in listener.heard]
 
 
-def test_nobody_else_connects_as_the_bridge(cells: Cells, segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+def test_no_other_client_can_connect_as_the_bridge(
+    cells: Cells, segment: Segment, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level("INFO")
     with cells() as cell:
         name = f"shmio-{segment.instance}"
@@ -160,7 +162,7 @@ def test_nobody_else_connects_as_the_bridge(cells: Cells, segment: Segment, capl
         place = folder(segment)
         secret = (place / SECRET).read_text()
         with Raw(cell.address, "me", account=("bridge", secret)) as client:
-            assert client.code == 5, "it comes by its socket alone"
+            assert client.code == 5, "the bridge's account works only on its own socket"
         assert f"connected to broker of this instance as {name}," in caplog.text
         assert secret_id(name, secret) not in caplog.text
         for file in place.iterdir():
@@ -168,7 +170,7 @@ def test_nobody_else_connects_as_the_bridge(cells: Cells, segment: Segment, capl
             assert stat.S_ISSOCK(mode) or stat.S_IMODE(mode) == 0o600, file
 
 
-def test_who_shows_no_account_reads(segment: Segment, address: Address) -> None:
+def test_without_accounts_every_client_may_read_only(segment: Segment, address: Address) -> None:
     with serving(segment, address, account=[]), bridged(segment):
         for account in ((), ("any", "body")):
             with Raw(address, "me", account=account) as client:
@@ -178,7 +180,7 @@ def test_who_shows_no_account_reads(segment: Segment, address: Address) -> None:
             assert listener.until("cell/step/out") == b"7"
 
 
-def test_a_guest_beside_accounts_may_what_is_said(cells: Cells) -> None:
+def test_a_client_without_an_account_has_the_roles_configured_for_it(cells: Cells) -> None:
     rules = [{"roles": ["read"]}, {"name": "new", "roles": ["write"]}]
     with cells(account=rules) as cell:
         with cell.client("guest", ()) as client:
@@ -207,7 +209,7 @@ def test_a_guest_beside_accounts_may_what_is_said(cells: Cells) -> None:
         ("minex", False),
     ],
 )
-def test_what_the_role_write_allows(topic: str, may: bool) -> None:
+def test_topics_that_the_role_write_allows(topic: str, may: bool) -> None:
     settings = Mqtt(prefix="a/b", account=[MqttAccount(roles=["write"], publish=["mine/#"])])
     filters = rights(settings, "i", None)[None].filters
     assert any(topic_matches_sub(one, topic) for one in filters) is may

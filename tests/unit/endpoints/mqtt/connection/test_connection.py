@@ -1,4 +1,4 @@
-"""The connection to the broker, by itself."""
+"""The connection to the broker, without a bridge."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from shmio.endpoints.mqtt.topics import Message
 TIMEOUT_S = 30
 
 
-def test_a_connection_that_comes_about_after_the_end_is_closed_and_wakes_nobody(
+def test_a_connection_made_after_the_end_is_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A name server may take longer than the bridge lives."""
+    """A name server may answer after the bridge has ended."""
     asked, answered, woken = threading.Event(), threading.Event(), threading.Event()
     look_up = socket.getaddrinfo
 
@@ -50,7 +50,7 @@ def test_a_connection_that_comes_about_after_the_end_is_closed_and_wakes_nobody(
 
 
 class Broker:
-    """The other end of a connection, as a test plays it byte by byte. (MQTT 5.0, section 3.)"""
+    """The broker's end of a connection, which a test plays byte by byte (MQTT 5.0, section 3)."""
 
     def __init__(self, server: socket.socket) -> None:
         self._server = server
@@ -61,7 +61,7 @@ class Broker:
         self.admit()
 
     def admit(self) -> None:
-        """Take a connection."""
+        """Accept a connection."""
         self.connection.turn()
         self._socket, _ = self._server.accept()
         self._socket.settimeout(TIMEOUT_S)
@@ -69,12 +69,12 @@ class Broker:
         self.say("20 03 00 00 00", lambda: self.connection.up)
 
     def hang_up(self) -> None:
-        """End it without a word."""
+        """Close the connection without a message."""
         self._socket.close()
         self.turn_until(lambda: not self.connection.up)
 
     def hear(self, kind: int, count: int = 1) -> None:
-        """Take so many packets of this kind, and no more."""
+        """Read this many packets of a kind, and no more."""
         for _ in range(count):
             assert self._socket.recv(1)[0] & 0xF0 == kind
             length = shift = 0
@@ -85,16 +85,16 @@ class Broker:
                 length -= len(self._socket.recv(length))
 
     def put(self, packet: str) -> None:
-        """Send one."""
+        """Send a packet."""
         self._socket.sendall(bytes.fromhex(packet))
 
     def say(self, packet: str, until: Callable[[], bool]) -> None:
-        """Send one, and turn the connection until it has brought something about."""
+        """Send a packet, and turn the connection until it takes effect."""
         self.put(packet)
         self.turn_until(until)
 
     def silent(self) -> None:
-        """Nothing has come."""
+        """Assert that no data has arrived."""
         self._socket.setblocking(False)
         with pytest.raises(BlockingIOError):
             self._socket.recv(1)
@@ -112,8 +112,8 @@ class Broker:
         self._selector.close()
 
 
-def test_who_is_thrown_out_again_and_again_is_told_what_may_be_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two clients of one id, and a broker that does not say so."""
+def test_repeated_disconnections_suggest_another_client_with_the_same_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two clients with one id, at a broker that does not give the reason."""
     monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.0, 0.0))
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
@@ -126,8 +126,8 @@ def test_who_is_thrown_out_again_and_again_is_told_what_may_be_behind_it(monkeyp
             broker.close()
 
 
-def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not only until it takes something else."""
+def test_a_brokers_refusal_is_reported_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report stays although the broker accepts other messages."""
 
     def publish(topic: str) -> None:
         connection.send(Message(topic, b"1", 1, retain=True))
@@ -161,7 +161,7 @@ def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.Mo
             broker.close()
 
 
-def test_what_is_sent_goes_when_it_is_pushed_and_is_not_lost_with_the_connection() -> None:
+def test_messages_are_sent_on_push_and_returned_when_the_connection_is_lost() -> None:
     lost: list[Message] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
@@ -177,13 +177,13 @@ def test_what_is_sent_goes_when_it_is_pushed_and_is_not_lost_with_the_connection
             broker.say("40 02 00 01", lambda: connection.in_flight == 2)
             for message in messages[3:]:
                 connection.send(message)
-            broker.say("e0 00", lambda: not connection.up)  # it ends the connection before they go
+            broker.say("e0 00", lambda: not connection.up)  # the connection ends before they are sent
             assert lost == messages[1:]
         finally:
             broker.close()
 
 
-def test_a_broker_that_does_not_read_is_sent_no_more_until_it_does() -> None:
+def test_sending_stops_while_the_broker_does_not_read() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
         connection = broker.connection
@@ -203,10 +203,12 @@ def test_a_broker_that_does_not_read_is_sent_no_more_until_it_does() -> None:
 
 
 @pytest.mark.parametrize("leave", [BrokerConnection.close, lambda connection: connection.drop("enough", politely=True)])
-def test_a_broker_hears_that_we_leave_though_what_it_sent_last_is_not_read(
+def test_the_disconnect_is_sent_though_the_brokers_last_data_is_unread(
     leave: Callable[[BrokerConnection], None],
 ) -> None:
-    """Else it would publish the will: who closes a socket with something to read takes back what has not gone."""
+    """Otherwise the broker would publish the will.
+
+    Closing a socket with unread data discards what has not been sent yet."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
         try:
@@ -217,7 +219,7 @@ def test_a_broker_hears_that_we_leave_though_what_it_sent_last_is_not_read(
             broker.close()
 
 
-def test_our_own_broker_is_tried_again_soon_however_long_it_is_away() -> None:
+def test_the_instances_own_broker_is_retried_without_a_long_back_off() -> None:
     own = Mqtt(listen="127.0.0.1:1883")
     policy = ReconnectPolicy(own, "test", targets(own, "/run/own"))
     assert max(policy.wait_s() for _ in range(50)) <= 0.75

@@ -1,4 +1,4 @@
-"""The way in of commands is apart from the way out of values: what happens to the one is not felt on the other."""
+"""Commands have their own connection: trouble on it does not affect values, and vice versa."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def flood(address: Address, qos: int) -> None:
-    """Send commands faster than any bridge takes them; the broker has all of them at the end."""
+    """Send commands faster than a bridge can take them; return when the broker has them all."""
     topic = f"{PREFIX}/cell/axis/speed/in".encode()
     packets = []
     for number in range(1, FLOOD + 1):
@@ -43,12 +43,12 @@ def flood(address: Address, qos: int) -> None:
     with socket.create_connection((address.host, address.port), timeout=TIMEOUT_S) as client:
         client.sendall(b"\x10\x10\0\x04MQTT\x04\x02\0\0\0\x04rude" + b"".join(packets) + b"\xc0\0")
         answer = b""
-        while not answer.endswith(b"\xd0\0"):  # the answer to the ping behind them
+        while not answer.endswith(b"\xd0\0"):  # the answer to the ping that follows them
             answer += client.recv(1 << 16)
 
 
 class Narrow:
-    """A broker that has room for one client, and acknowledges nothing. ``lets_in``: others, too."""
+    """A broker that serves one client and acknowledges nothing. ``lets_in``: it accepts others, too."""
 
     def __init__(self, *, lets_in: bool = False) -> None:
         self.heard = b""
@@ -74,7 +74,7 @@ class Narrow:
             another, _ = self._server.accept()
             with another:
                 data = another.recv(1000)
-                with suppress(ConnectionError):  # the client may give up before it has read its CONNACK
+                with suppress(ConnectionError):  # the client may leave before it reads its CONNACK
                     if data and self._lets_in:
                         another.sendall(CONNACK)
                         while another.recv(1000):
@@ -89,10 +89,8 @@ class Narrow:
 
 
 @pytest.mark.parametrize("qos", [0, 1])
-def test_a_flood_of_commands_keeps_no_value_from_those_who_listen(
-    segment: Segment, make_broker: Callable[..., Mosquitto], qos: int
-) -> None:
-    """What waits in the broker are commands, and neither values nor their acknowledgements."""
+def test_a_flood_of_commands_delays_no_value(segment: Segment, make_broker: Callable[..., Mosquitto], qos: int) -> None:
+    """Only commands queue in the broker, neither values nor their acknowledgements."""
     broker = make_broker("allow_anonymous true", f"max_inflight_messages {IN_FLIGHT}", "max_queued_messages 0")
     plant = Plant(segment.writer("cell"))
     plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)
@@ -116,7 +114,7 @@ def test_a_flood_of_commands_keeps_no_value_from_those_who_listen(
     assert plant.written
 
 
-def test_values_come_though_the_broker_takes_no_second_connection(segment: Segment) -> None:
+def test_values_are_published_though_the_broker_accepts_no_second_connection(segment: Segment) -> None:
     segment.writer("cell").publish(image(step=1), cycle=1)
     broker = Narrow()
     with bridge(segment, broker.address) as running:
@@ -126,7 +124,7 @@ def test_values_come_though_the_broker_takes_no_second_connection(segment: Segme
     broker.close()
 
 
-def test_values_come_though_the_broker_never_answers_to_subscribe(
+def test_values_are_published_though_the_broker_never_answers_subscribe(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shmio.endpoints.mqtt.connection.connection.SUBSCRIBE_S", 0.1)
@@ -138,7 +136,7 @@ def test_values_come_though_the_broker_never_answers_to_subscribe(
     broker.close()
 
 
-def test_a_way_in_that_is_lost_is_made_anew_and_values_go_on(segment: Segment, broker: Mosquitto) -> None:
+def test_a_lost_command_connection_is_reopened_and_values_continue(segment: Segment, broker: Mosquitto) -> None:
     plant = Plant(segment.writer("cell"))
     plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)
     plant.run()
@@ -151,7 +149,7 @@ def test_a_way_in_that_is_lost_is_made_anew_and_values_go_on(segment: Segment, b
             listener.until("cell/secret/out")
             rival.connect(broker.address.host, broker.address.port)
             rival.loop_start()
-            assert gone.wait(TIMEOUT_S)  # as it has thrown the bridge out, so the bridge throws it out
+            assert gone.wait(TIMEOUT_S)  # the rival replaces the bridge's client, which then replaces the rival
             running.until(lambda: running.bridge.command_connection.connection.subscribed)
             listener.publish("cell/step/in", "5")
             assert listener.json("cell/step/in/result")["done"]

@@ -1,4 +1,4 @@
-"""An edge node of Sparkplug B, by its rules, and as another implementation reads and commands it."""
+"""An edge node of Sparkplug B: its protocol rules, and its messages with another implementation."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def bd_seq(message: Message) -> int:
     return next(metric.long_value for metric in payload(message).metrics if metric.name == "bdSeq")
 
 
-def test_a_session_has_a_will_of_its_number_and_a_birth_first() -> None:
+def test_a_session_starts_with_a_will_and_a_birth_of_its_number() -> None:
     edge = node()
     first = edge.will()
     assert (first.topic, first.qos) == ("spBv1.0/plant/NDEATH/a50", 1)
@@ -82,18 +82,18 @@ def test_a_session_has_a_will_of_its_number_and_a_birth_first() -> None:
     assert bd_seq(birth) == bd_seq(first)
     (rebirth,) = [metric for metric in payload(birth).metrics if metric.name == REBIRTH]
     assert (rebirth.boolean_value, rebirth.HasField("alias")) == (False, False)
-    assert bd_seq(edge.birth()) == bd_seq(first), "one that is asked for is of the same session"
+    assert bd_seq(edge.birth()) == bd_seq(first), "a requested birth belongs to the same session"
     assert bd_seq(edge.will()) == (bd_seq(first) + 1) % 256
     assert bd_seq(edge.death()) == (bd_seq(first) + 1) % 256
 
 
-def test_a_process_that_is_restarted_soon_has_a_session_of_its_own() -> None:
+def test_a_process_that_restarts_soon_starts_a_new_session() -> None:
     first = EdgeNode("plant", "a50", lambda: NOW_MS)
     second = EdgeNode("plant", "a50", lambda: NOW_MS + 250)
     assert bd_seq(first.will()) != bd_seq(second.will())
 
 
-def test_numbers_go_on_through_all_devices_and_begin_anew_at_a_birth() -> None:
+def test_sequence_numbers_span_all_devices_and_restart_at_a_birth() -> None:
     edge = node()
     edge.will()
     (position,) = edge.metrics["axis"].values()
@@ -105,7 +105,7 @@ def test_numbers_go_on_through_all_devices_and_begin_anew_at_a_birth() -> None:
     assert payload(edge.birth()).seq == 0
 
 
-def test_a_device_lives_from_its_birth_to_its_death_or_the_next_session() -> None:
+def test_a_device_is_born_until_its_death_or_the_next_session() -> None:
     edge = node()
     edge.will()
     edge.birth()
@@ -124,7 +124,7 @@ def test_a_device_lives_from_its_birth_to_its_death_or_the_next_session() -> Non
     assert not edge.is_born("axis")
 
 
-def test_aliases_are_of_one_metric_each_in_the_whole_node_and_stand_for_names_in_data() -> None:
+def test_aliases_are_unique_in_the_node_and_replace_names_in_data() -> None:
     edge = node(datatypes=False)
     edge.will()
     edge.birth()
@@ -139,7 +139,7 @@ def test_aliases_are_of_one_metric_each_in_the_whole_node_and_stand_for_names_in
     assert not metric.HasField("datatype")
 
 
-def test_what_is_not_good_says_so() -> None:
+def test_quality_and_reason_are_properties_of_a_metric() -> None:
     edge = node()
     (position,) = edge.metrics["axis"].values()
     doubtful = Sample(position, 2.0, AT_MS, Quality.UNCERTAIN, "the CPU is in STOP")
@@ -148,7 +148,7 @@ def test_what_is_not_good_says_so() -> None:
     assert (quality.type, quality.int_value, reason.string_value) == (3, 500, "the CPU is in STOP")
 
 
-def test_each_value_comes_back_as_it_went() -> None:
+def test_values_survive_a_round_trip() -> None:
     edge = node()
     rows: dict[str, Any] = {
         "row/BOOL": [[True, False, True, True], [False] * 4, [True] * 4],
@@ -164,7 +164,7 @@ def test_each_value_comes_back_as_it_went() -> None:
         codec(metric.register).encode_into(value, bytearray(LAYOUT.size))
 
 
-def test_an_array_with_an_element_that_is_no_value_is_null() -> None:
+def test_an_array_with_an_invalid_element_is_null() -> None:
     row = Layout("ROW", None, 8, False, (Register("at", "TIME_OF_DAY", ((0, 1),), 0, None, 8, 2),))
     edge = EdgeNode("plant", "a50", lambda: NOW_MS)
     edge.define({"cell": row.registers})
@@ -190,7 +190,7 @@ def commanded(edge: EdgeNode, device: str = "axis", **fields: Any) -> Command:
     return edge.command(f"spBv1.0/plant/DCMD/a50/{device}", given.SerializeToString())
 
 
-def test_commands_are_by_name_or_by_alias() -> None:
+def test_commands_use_names_or_aliases() -> None:
     edge = node()
     (position,) = edge.metrics["axis"].values()
     assert edge.commands == ["spBv1.0/plant/NCMD/a50", "spBv1.0/plant/DCMD/a50/+"]
@@ -208,7 +208,7 @@ def test_commands_are_by_name_or_by_alias() -> None:
     ("device", "fields", "error", "message"),
     [
         ("axis", {"name": "positron", "float_value": 1}, PathError, "no metric 'positron'"),
-        ("axis", {"alias": 1, "float_value": 1}, PathError, "no metric alias 1"),  # another device's
+        ("axis", {"alias": 1, "float_value": 1}, PathError, "no metric alias 1"),  # an alias of another device
         ("axis", {"float_value": 1}, PathError, "no metric alias 0"),
         ("axle", {"name": "position", "float_value": 1}, PathError, "no such device; there are: cell, axis"),
         ("axis", {"name": "position"}, ValueRangeError, "there is no value"),
@@ -219,14 +219,14 @@ def test_commands_are_by_name_or_by_alias() -> None:
         ("cell", {"name": "row/BOOL", "bytes_value": b"\x0d\0\0\0\0\0"}, ValueRangeError, "12 bits"),
     ],
 )
-def test_what_is_no_command_is_refused(
+def test_invalid_commands_are_refused(
     device: str, fields: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):
         commanded(node(), device, **fields)
 
 
-def test_a_command_has_something_once_and_not_too_much_of_it() -> None:
+def test_a_command_needs_metrics_without_repeats_and_within_the_limits() -> None:
     edge = node()
     topic = "spBv1.0/plant/DCMD/a50/axis"
     one = wire.Metric(name="position", float_value=1)
@@ -264,7 +264,7 @@ FIELDS: st.SearchStrategy[dict[str, Any]] = st.fixed_dictionaries(
 
 
 @given(METRICS, st.lists(FIELDS, max_size=5))
-def test_whatever_is_commanded_is_a_value_of_its_register_or_refused(
+def test_any_command_gives_values_of_its_registers_or_is_refused(
     metrics: list[wire.Metric], fields: list[dict[str, Any]]
 ) -> None:
     edge = node()
@@ -292,18 +292,18 @@ def _length(size: int) -> bytes:
 def _nested() -> bytes:
     data = b""
     for _ in range(2000):
-        data = b"\x12" + _length(len(data)) + data  # metrics, of a template
+        data = b"\x12" + _length(len(data)) + data  # metrics of a template
         data = b"\x92\x01" + _length(len(data)) + data  # template_value of a metric
     return b"\x12" + _length(len(data)) + data
 
 
 @pytest.mark.parametrize("data", [_nested(), b"\x1b" * 100_000], ids=["templates", "groups"])
-def test_what_is_in_each_other_is_refused_however_deep_it_is(data: bytes) -> None:
+def test_deeply_nested_payloads_are_refused(data: bytes) -> None:
     with pytest.raises((ValueRangeError, PathError)):
         node().command("spBv1.0/plant/DCMD/a50/cell", data)
 
 
-def test_what_is_not_writable_is_told_before_what_its_value_is_not() -> None:
+def test_a_register_that_is_not_writable_is_reported_before_its_invalid_value() -> None:
     def check(device: str, register: Register) -> None:
         raise CommandError(f"{device}/{register.path} is not writable")
 
@@ -319,7 +319,7 @@ def test_garbage_is_refused(data: bytes) -> None:
             node().command(topic, data)
 
 
-def test_elements_of_arrays_are_metrics_of_their_own_if_wanted() -> None:
+def test_elements_of_arrays_can_be_separate_metrics() -> None:
     edge = EdgeNode("plant", "a50", lambda: NOW_MS)
     edge.define({"cell": parts_of(LAYOUT, LAYOUT.registers, single=True)})
     assert len(edge.metrics["cell"]) == len(REGISTERS) + 4 * (12 - 1)
@@ -331,15 +331,15 @@ def test_elements_of_arrays_are_metrics_of_their_own_if_wanted() -> None:
     assert commanded(edge, "cell", name="row/BOOL/2/1", boolean_value=True).values == {"row/BOOL/2/1": True}
 
 
-def test_texts_of_an_array_are_metrics_of_their_own() -> None:
+def test_texts_of_an_array_are_separate_metrics() -> None:
     found = [register.path for register in parts_of(LAYOUT, LAYOUT.registers)]
     assert len(found) == len(REGISTERS) + 12 - 1
     assert found[-2:] == ["row/STRING[10]/3/2", "row/STRING[10]/3/3"]
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
-def test_another_implementation_reads_it_and_commands_it() -> None:
-    assert (NODE / "node_modules").exists(), f"its packages are not installed: npm ci --prefix {NODE}"
+def test_another_implementation_reads_and_commands_the_node() -> None:
+    assert (NODE / "node_modules").exists(), f"packages for Node are not installed: run npm ci --prefix {NODE}"
     edge = node()
     edge.will()
     scalars = [sample for sample in samples(edge) if "row" not in sample.metric.name]

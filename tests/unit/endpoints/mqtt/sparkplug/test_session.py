@@ -1,4 +1,4 @@
-"""An instance as an edge node, at a real broker, as a host application sees it."""
+"""An instance as an edge node at a real broker, with a host application."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Heard(NamedTuple):
 
 
 class Host:
-    """A host application: it knows metrics by the aliases of their births."""
+    """A host application: it maps aliases to metrics by the births that it receives."""
 
     def __init__(self, listener: Listener) -> None:
         self._listener = listener
@@ -43,9 +43,12 @@ class Host:
         self.seqs: list[int] = []
 
     def next(self) -> Heard:
-        """The next message of the node."""
+        """Return the node's next message."""
         message = self._listener.message()
-        while message.topic.split("/")[1] == "STATE" or message.topic.split("/")[2] in ("NCMD", "DCMD"):  # our own
+        while message.topic.split("/")[1] == "STATE" or message.topic.split("/")[2] in (
+            "NCMD",
+            "DCMD",
+        ):  # sent by this host
             message = self._listener.message()
         assert not message.retain
         kind = message.topic.split("/")[2]
@@ -61,18 +64,18 @@ class Host:
         return Heard(kind, payload, {one.name or self._names[one.alias]: one for one in payload.metrics})
 
     def until(self, kind: str) -> Heard:
-        """The next message of a kind."""
+        """Return the next message of a kind."""
         while (found := self.next()).kind != kind:
             pass
         return found
 
     def command(self, kind: str, *metrics: wire.Metric, device: str = "") -> None:
-        """Send one."""
+        """Send a command."""
         topic = NODE.format(kind) + (f"/{device}" if device else "")
         self.send(topic, wire.Payload(timestamp=1, metrics=metrics).SerializeToString())
 
     def send(self, topic: str, data: bytes, *, retain: bool = False) -> None:
-        """Send whatever."""
+        """Send any payload."""
         self._listener.client.publish(topic, data, 0, retain).wait_for_publish(30)
 
 
@@ -100,7 +103,7 @@ def bd_seq(heard: Heard) -> int:
     return heard.metrics["bdSeq"].long_value
 
 
-def test_a_node_is_born_tells_what_changes_and_dies(segment: Segment, broker: Mosquitto) -> None:
+def test_a_node_sends_birth_changes_and_death(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(position=1.5, step=7), cycle=1)
     with hosting(broker.address) as host:
@@ -122,8 +125,8 @@ def test_a_node_is_born_tells_what_changes_and_dies(segment: Segment, broker: Mo
         assert bd_seq(death) == bd_seq(birth)
 
 
-def test_a_polite_end_is_told_by_the_node_and_with_mqtt_5_by_its_will(segment: Segment, broker: Mosquitto) -> None:
-    """Both are demanded, and hosts ignore the second, which has the same bdSeq (Sparkplug 3.0.0, 5.5 and 6.4.25)."""
+def test_an_orderly_end_sends_the_death_and_with_mqtt_5_the_will(segment: Segment, broker: Mosquitto) -> None:
+    """Both messages are required, and have the same bdSeq; hosts ignore the second (Sparkplug 3.0.0, 5.5, 6.4.25)."""
     segment.writer("cell").publish(image(), cycle=1)
     with hosting(broker.address) as host:
         with node(segment, broker.address):
@@ -136,7 +139,7 @@ def test_a_polite_end_is_told_by_the_node_and_with_mqtt_5_by_its_will(segment: S
         assert deaths == [session, session]
 
 
-def test_a_source_that_is_bad_is_a_device_that_is_dead(segment: Segment, broker: Mosquitto) -> None:
+def test_a_bad_source_is_a_dead_device(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(), cycle=1, quality=Quality.BAD, reason="cable out")
     with hosting(broker.address) as host, node(segment, broker.address):
@@ -153,7 +156,7 @@ def test_a_source_that_is_bad_is_a_device_that_is_dead(segment: Segment, broker:
         assert (again.kind, again.metrics["axis/position"].float_value) == ("DBIRTH", 2.5)
 
 
-def test_a_node_is_born_again_when_it_is_asked_to(segment: Segment, broker: Mosquitto) -> None:
+def test_a_node_sends_a_new_birth_on_request(segment: Segment, broker: Mosquitto) -> None:
     segment.writer("cell").publish(image(position=1.5), cycle=1)
     with hosting(broker.address) as host, node(segment, broker.address):
         first = host.next()
@@ -164,7 +167,7 @@ def test_a_node_is_born_again_when_it_is_asked_to(segment: Segment, broker: Mosq
         assert host.next().kind == "DBIRTH"
 
 
-def test_commands_reach_the_device_and_garbage_nothing(segment: Segment, broker: Mosquitto) -> None:
+def test_commands_reach_the_device_and_garbage_is_ignored(segment: Segment, broker: Mosquitto) -> None:
     plant = Plant(segment.writer("cell"))
     plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)
     plant.run()
@@ -186,9 +189,7 @@ def test_commands_reach_the_device_and_garbage_nothing(segment: Segment, broker:
         plant.stop()
 
 
-def test_an_element_of_an_array_is_written_by_itself_and_garbage_leaves_the_node_as_it_is(
-    segment: Segment, broker: Mosquitto
-) -> None:
+def test_one_element_of_an_array_is_written_and_garbage_is_ignored(segment: Segment, broker: Mosquitto) -> None:
     plant = Plant(segment.writer("cell"))
     plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)
     plant.run()
@@ -221,7 +222,7 @@ def test_an_element_of_an_array_is_written_by_itself_and_garbage_leaves_the_node
         plant.stop()
 
 
-def test_what_changed_while_the_broker_was_away_comes_as_history(segment: Segment, broker: Mosquitto) -> None:
+def test_changes_while_the_broker_is_away_are_sent_as_historical(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(step=1), cycle=1)
     with (
@@ -232,14 +233,14 @@ def test_what_changed_while_the_broker_was_away_comes_as_history(segment: Segmen
         first = host.until("NBIRTH")
         host.until("DBIRTH")
         proxy.refuse()
-        assert bd_seq(host.until("NDEATH")) == bd_seq(first), "its last will"
+        assert bd_seq(host.until("NDEATH")) == bd_seq(first), "the broker sends the last will"
         running.until(lambda: "Sparkplug" in running.bridge.problem or "nothing listens" in running.bridge.problem)
         for step in range(2, 12):
             writer.publish(image(step=step), cycle=step)
-        running.until(lambda: running.bridge.counters[4] >= 20)  # as topics, and as metrics
+        running.until(lambda: running.bridge.counters[4] >= 20)  # changes count once as topics and once as metrics
         proxy.admit()
         again = host.until("NBIRTH")
-        assert bd_seq(again) == (bd_seq(first) + 1) % 256, "whatever was tried meanwhile"
+        assert bd_seq(again) == (bd_seq(first) + 1) % 256, "failed attempts do not count"
         assert host.next().metrics["step"].int_value == 11
         told = [host.next() for _ in range(10)]
         assert [one.metrics["step"].int_value for one in told] == list(range(2, 12))
@@ -248,7 +249,7 @@ def test_what_changed_while_the_broker_was_away_comes_as_history(segment: Segmen
         assert times_ms == sorted(times_ms)
 
 
-def test_a_rate_merges_what_is_between_also_while_the_broker_is_away_and_never_leaves_out_the_last(
+def test_a_rate_limit_conflates_changes_even_without_the_broker_and_sends_the_last(
     segment: Segment, broker: Mosquitto
 ) -> None:
     writer = segment.writer("cell")
@@ -279,8 +280,8 @@ def test_a_rate_merges_what_is_between_also_while_the_broker_is_away_and_never_l
         assert host.until("DBIRTH").metrics["step"].int_value == 101
 
 
-def test_a_flood_of_requests_for_births_is_answered_by_few(segment: Segment, broker: Mosquitto) -> None:
-    """Each may be megabytes, and who asks need not read them."""
+def test_a_flood_of_rebirth_requests_is_answered_by_few_births(segment: Segment, broker: Mosquitto) -> None:
+    """A birth may have megabytes, and the client that requests them need not read them."""
     segment.writer("cell").publish(image(step=1), cycle=1)
     with FaultProxy(broker.address, framing=None) as proxy, hosting(broker.address) as host:
         with node(segment, proxy.address):
@@ -296,10 +297,10 @@ def test_a_flood_of_requests_for_births_is_answered_by_few(segment: Segment, bro
     assert births < 50
 
 
-def test_what_was_kept_is_sent_a_little_at_a_time(
+def test_the_backlog_is_sent_in_small_portions(
     segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else a large backlog would hold up commands and the heartbeat."""
+    """Otherwise a large backlog would delay commands and the heartbeat."""
     monkeypatch.setattr("shmio.endpoints.mqtt.sparkplug.session.TURN_SAMPLES", 2)
     writer, slot = segment.writer("cell"), segment.processes.find("mqtt")
     writer.publish(image(step=1), cycle=1)

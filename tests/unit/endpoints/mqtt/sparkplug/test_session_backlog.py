@@ -1,4 +1,4 @@
-"""What is kept of devices: within its bound, whatever their values are, and the oldest goes first."""
+"""The backlog of changes of devices: bounded in bytes, and the oldest are dropped first."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROW = Metric(Register("row", "REAL", ((0, 999),), 0, None, 4000, 1000), 2)
 MOST_BYTES = 100_000
 
 
-def test_arrays_count_as_large_as_they_are() -> None:
+def test_arrays_count_with_their_size() -> None:
     backlog = DeviceBacklog(MOST_BYTES)
     kept = []
     for at_ms in range(100):
@@ -24,7 +24,7 @@ def test_arrays_count_as_large_as_they_are() -> None:
     assert backlog.count + backlog.dropped == 100
 
 
-def test_the_oldest_goes_of_whatever_device_it_is() -> None:
+def test_the_oldest_change_of_all_devices_is_dropped() -> None:
     backlog = DeviceBacklog(MOST_BYTES)
     for at_ms in range(1000):
         backlog.keep("first", [Sample(NUMBER, 0.5, at_ms)])

@@ -39,9 +39,7 @@ def offline(at_ms: int) -> dict[str, Any]:
     return {"online": False, "timestamp": at_ms}
 
 
-def test_a_node_is_born_when_its_primary_host_is_there_dies_with_it_and_keeps_what_changes(
-    segment: Segment, broker: Mosquitto
-) -> None:
+def test_a_node_is_born_and_dies_with_its_primary_host_and_keeps_changes(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(step=1), cycle=1)
     with listening(broker.address, NODES) as listener, bridge(segment, broker.address, sparkplug=WAITING) as running:
@@ -69,7 +67,7 @@ def test_a_node_is_born_when_its_primary_host_is_there_dies_with_it_and_keeps_wh
         assert (history.kind, history.metrics["step"].is_historical) == ("DDATA", True)
         running.until(lambda: not running.bridge.problem)
 
-        say(listener, offline(9))  # the will of a session before, that comes late
+        say(listener, offline(9))  # the late will of an earlier session
         writer.publish(image(step=3), cycle=3)
         assert host.next().metrics["step"].int_value == 3
 
@@ -90,7 +88,7 @@ def test_a_node_is_born_when_its_primary_host_is_there_dies_with_it_and_keeps_wh
     assert host.next().kind == "NDEATH"
 
 
-def test_a_host_that_is_back_at_once_is_told_everything_anew(segment: Segment, broker: Mosquitto) -> None:
+def test_a_host_that_returns_at_once_gets_a_new_birth(segment: Segment, broker: Mosquitto) -> None:
     segment.writer("cell").publish(image(step=1), cycle=1)
     with listening(broker.address, NODES) as listener, bridge(segment, broker.address, sparkplug=WAITING):
         host = Host(listener)
@@ -99,7 +97,7 @@ def test_a_host_that_is_back_at_once_is_told_everything_anew(segment: Segment, b
         for at_ms in range(2, 12):
             for state in (offline(at_ms), online(at_ms)):
                 listener.client.publish(STATE, json.dumps(state), 1, retain=True)
-            died = born = False  # its death may come as the broker's will, which does not wait for the next birth
+            died = born = False  # its death may come as the broker's will, in any order with the next birth
             while not (died and born):
                 heard = host.next()
                 died |= heard.kind == "NDEATH" and bd_seq(heard) == session
@@ -108,10 +106,10 @@ def test_a_host_that_is_back_at_once_is_told_everything_anew(segment: Segment, b
             session = newest
 
 
-def test_of_several_brokers_the_one_is_chosen_at_which_the_host_is(
+def test_of_several_brokers_the_node_uses_the_one_with_its_host(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And it goes on to the next one when the host has gone from there, or says nothing."""
+    """The node moves to the next broker when the host has left the current one, or sends nothing."""
     monkeypatch.setattr("shmio.endpoints.mqtt.sparkplug.session.HOST_S", 0.05)
     segment.writer("cell").publish(image(step=1), cycle=1)
     first, second = make_broker(), make_broker()
