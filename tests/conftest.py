@@ -1,4 +1,7 @@
-"""Fixtures and hooks for all tests: each instance has its own name, and no test leaves anything behind."""
+"""Fixtures and hooks for all tests.
+
+Each instance has its own name, and no test may leave anything behind.
+"""
 
 from __future__ import annotations
 
@@ -90,10 +93,10 @@ SLOW = (
     "tests/unit/layout/test_compiler.py::test_bounds_on_files",
     "tests/unit/layout/test_instances.py::test_many_",
     "tests/unit/layout/test_simlog_structures.py::test_a_table_cannot_hide_more_registers",
-    "tests/unit/recorder/test_housekeeping_closing.py::test_it_may_end_anywhere",
+    "tests/unit/recorder/test_housekeeping_closing.py::test_a_file_cut_anywhere",
     "tests/unit/recording/reading/test_reader.py::test_changed_bytes",
     "tests/unit/recording/test_check.py::test_no_",
-    "tests/unit/recording/test_dump.py::test_whatever_the_order",
+    "tests/unit/recording/test_dump.py::test_batches_equal_frames",
     "tests/unit/segment/test_segment.py::test_a_damaged_segment",
 )
 """Beginnings of the names of tests that start no process but take seconds. The fast tier leaves them out."""
@@ -122,7 +125,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 class StarterFinder:
-    """Finds the tests that start a process, from the names in the code of tests, helpers and fixtures."""
+    """Finds the tests that start a process, by the names in their code, helpers and fixtures."""
 
     def __init__(self) -> None:
         self._known: dict[object, bool] = {}
@@ -232,7 +235,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude what exists by now from garbage collection, so that collecting after each test is fast."""
+    """Exclude existing objects from garbage collection, so that collecting after a test is fast."""
     gc.collect()
     gc.freeze()
 
@@ -305,7 +308,8 @@ def instance() -> Iterator[str]:
 def runtime() -> Iterator[Path]:
     """Yield a folder for ``XDG_RUNTIME_DIR``.
 
-    A socket's path has at most 107 bytes, and ``tmp_path`` may be longer."""
+    A socket's path has at most 107 bytes, and ``tmp_path`` may be longer.
+    """
     with tempfile.TemporaryDirectory(prefix="shmio-run-") as folder:
         yield Path(folder)
 
@@ -318,7 +322,7 @@ def shared_instance() -> Iterator[str]:
 
 @pytest.fixture(params=["mosquitto", "embedded"])
 def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Run the test with both brokers: mosquitto, and the embedded one as if mosquitto were missing."""
+    """Run the test with both brokers: mosquitto, and the embedded one as if that were missing."""
     if request.param == "mosquitto":
         if reason := missing():
             pytest.skip(reason)

@@ -1,4 +1,4 @@
-"""A program can use a local and a remote cell alike: each test runs on both, with one running cell."""
+"""Local and remote cells behave alike: each test runs on both, with one running cell."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """The common conformance suites, run with the S7 connector against the emulated PLC.
 
-Frames are read in one PDU, in several, and in several at once."""
+Frames are read in one PDU, in several, and in several at once.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ TAIL = SPARE + 2
 class Shared:
     """PLC program: counts in the flag bytes, and leaves a few bytes to clients.
 
-    It continues the count from the flag bytes that it finds."""
+    It continues the count from the flag bytes that it finds.
+    """
 
     period_ms = 1
 
@@ -65,7 +67,8 @@ class S7Rig:
     def generation(self, raw: bytes) -> int:
         """Return the cycle that the frame was read in.
 
-        A read of one PDU is of one cycle of the PLC; one of several PDUs may span a few cycles."""
+        A read of one PDU is of one cycle of the PLC; one of several PDUs may span a few cycles.
+        """
         found = generations(raw[:-TAIL])
         assert len(found) == 1 or not self.one_pdu, f"mixed cycles {found}"
         assert found[-1] - found[0] < 10_000, f"bytes that the PLC never had: {found}"
@@ -117,7 +120,10 @@ class TestS7(WriteConformance):
         run.good()
 
     def test_stop_makes_values_uncertain(self, run: Run, rig: S7Rig) -> None:
-        """The image is correct but no longer changes: uncertain, with the remedy, until the PLC runs again."""
+        """The image is correct but no longer changes.
+
+        It is uncertain, with the remedy as reason, until the PLC runs again.
+        """
         run.good()
         peer = snap7.Client()
         peer.connect(rig.plc.address.host, 0, 1, rig.plc.address.port)

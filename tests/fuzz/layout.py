@@ -1,10 +1,11 @@
 """Fuzzes the layout compiler, the layout document and the codec.
 
-A finding is an unexpected exception, more than ``--cpu-s`` seconds of processor time, or more memory
-than ``--memory-mb``. The script saves its input to a file; name the file on the command line to repeat it.
+A finding is an unexpected exception, more than ``--cpu-s`` seconds of processor time, or more
+memory than ``--memory-mb``. The script saves its input to a file; to repeat it, name that file on
+the command line.
 
-The inputs are mutations of the golden files. With ``--guided``, atheris makes them, which watches what code
-each input reaches.
+The inputs are mutations of the golden files. With ``--guided``, atheris makes them, and watches
+what code each input reaches.
 """
 
 from __future__ import annotations
@@ -33,7 +34,10 @@ class TooSlow(BaseException):
 
 
 def guarded(check: Callable[[bytes], None], cpu_s: float) -> Callable[[bytes], None]:
-    """Return the check with a limit of processor time; it saves the input of a finding and exits."""
+    """Return the check with a limit of processor time.
+
+    The new check saves the input of a finding, and exits.
+    """
 
     def expire(_signal: int, _frame: FrameType | None) -> None:
         raise TooSlow

@@ -1,6 +1,6 @@
 """Invariants of the layout compiler, the layout document and the codec, for any input.
 
-An input gives a layout, and then its values must survive encoding and decoding, or it raises LayoutError or
+An input gives a layout whose values survive encoding and decoding, or it raises LayoutError or
 ValueRangeError.
 """
 
@@ -65,7 +65,7 @@ def check_document(data: bytes) -> None:
 
 
 def check_values(data: bytes) -> None:
-    """Decode raw bytes and parse user text, for the two registers that byte 0 chooses: a scalar and an array."""
+    """Decode raw bytes and parse user text as a scalar and as an array; byte 0 chooses the type."""
     layout = _every_type()
     which, body = (data[0] if data else 0), data[1:] or b"\0"
     frame = (body * (layout.size // len(body) + 1))[: layout.size]

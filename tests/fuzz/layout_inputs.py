@@ -1,4 +1,4 @@
-"""Inputs for fuzzing layouts: random changes of the golden files, and random combinations of source text."""
+"""Inputs for fuzzing layouts: changed golden files, and random combinations of source text."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def seeds() -> list[bytes]:
 
 
 class Mutator:
-    """Yields inputs, the same ones for the same seed: some valid, some nearly valid, some garbage."""
+    """Yields inputs, equal for equal seeds: some valid, some nearly valid, some garbage."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
@@ -170,7 +170,7 @@ class Mutator:
         return f'\0{KNOWN}FUNCTION_BLOCK "f" {sections} END_FUNCTION_BLOCK DATA_BLOCK "b" "f" {begin}'.encode()
 
     def _nested(self) -> bytes:
-        """Types that each use the next one several times, up to the limit of depth; the last is often empty."""
+        """Types that each use the next one several times, up to the depth limit."""
         rng = self._random
         count = rng.randrange(1, 34)
         text = ""

@@ -1,4 +1,4 @@
-"""The C reader of examples/, built plainly and with sanitizers, on live segments and on corrupted ones."""
+"""The C reader of examples/, with and without sanitizers, on live and on corrupted segments."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_values_of_all_types(reader: Path, instance: str, path: str) -> None:
 
 
 def test_every_frame_once_and_losses_counted(reader: Path, instance: str) -> None:
-    """A reader that is stopped while its ring wraps several times counts the frames that it lost."""
+    """A reader that is stopped while its ring wraps several times counts the lost frames."""
     with segment(instance, ring_bytes=16 << 10) as made:
         writer = made.writer("device")
         slots = made.blocks["device"].ring.slot_count
@@ -280,7 +280,7 @@ def places(whole: bytes) -> list[int]:
 
 
 def test_hostile_bytes_never_crash_it(reader: Path, instance: str) -> None:
-    """Random words in header, section table and ring headers cause an error or an answer, but no crash."""
+    """Random words in the header, section table and ring headers never crash the reader."""
     with segment(instance, ring_bytes=1 << 12) as made:
         writer = made.writer("device")
         for cycle in range(20):
@@ -334,7 +334,7 @@ def test_hostile_bytes_never_crash_it(reader: Path, instance: str) -> None:
 
 
 def test_hostile_rings_never_crash_it(reader: Path, instance: str) -> None:
-    """Write heads, sequences, sizes and texts that no writer produces, while a reader follows the ring."""
+    """Write heads, sequences, sizes and texts that no writer produces, while a reader follows."""
     chance = random.Random(2)
     with segment(instance, ring_bytes=1 << 12) as made:
         writer = made.writer("device")

@@ -1,4 +1,4 @@
-"""A campaign with models in virtual time: it writes, injects, steps, and collects what its streams deliver."""
+"""A campaign with models in virtual time: it writes, injects, steps and collects all streams."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ class Campaign:
             assert (await self._old.step(v1.StepRequest(), timeout=PATIENCE_S)).code == 0
 
     def _step_here(self) -> None:
-        """Step as another program on the host does, after the endpoint has released control of the clock."""
+        """Step as another program on the host, after the endpoint has released the clock."""
         with shmio.attach(self._instance, writable=True) as program:
             program.step()
 
@@ -226,7 +226,8 @@ def _published(path: str, value: str) -> v1.PubRequest:
 def _updates(message: bytes) -> list[bytes]:
     """Return the updates of a message, without the fields that differ between processes.
 
-    A message has all updates that were due when it was sent."""
+    A message has all updates that were due when it was sent.
+    """
     updates = ours.SubscribeResponse.FromString(message).updates
     for update in updates:
         for name in ("table", "frame", "incarnation"):
@@ -241,7 +242,8 @@ def _step_ms(number: int) -> int:
 async def run(instance: str, address: str, *, pause_s: float = 0.0) -> Streams:
     """Run the campaign; return the messages of each stream.
 
-    One subscriber pauses for ``pause_s`` after each message."""
+    One subscriber pauses for ``pause_s`` after each message.
+    """
     async with AsyncExitStack() as stack:
         channel = await stack.enter_async_context(grpc.aio.insecure_channel(address))
         slow = await stack.enter_async_context(grpc.aio.insecure_channel(address, options=_SMALL_WINDOW))

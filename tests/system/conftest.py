@@ -44,7 +44,7 @@ def make_cell(tmp_path: Path, instance: str) -> Iterator[Callable[..., Cell]]:
 
 @pytest.fixture(scope="module")
 def make_shared_cell(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Iterator[Callable[..., Cell]]:
-    """Return a function that writes a cell's folder, for tests that leave the cell as they find it."""
+    """Return a function that writes a cell's folder, for tests that leave it unchanged."""
     with _cells(tmp_path_factory.mktemp("cell"), shared_instance) as make:
         yield make
 

@@ -1,4 +1,4 @@
-"""A cell that requires tokens: on loopback, on a UNIX socket, and across reloads and deaths of its endpoint."""
+"""A cell that requires tokens: on loopback, on a UNIX socket, through reloads and kills."""
 
 from __future__ import annotations
 

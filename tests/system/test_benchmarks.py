@@ -1,4 +1,4 @@
-"""The benchmarks of single mechanisms run, check what they time, and print ratios. No speed is asserted."""
+"""The benchmarks of single mechanisms run and print ratios; no speed is asserted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bits and slices of a cell's bytes, by every interface: read, written without neighbours, injected."""
+"""Bits and slices of a cell's bytes: read, written and injected by every interface."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.system.armed import ARMED
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell; each test uses other bytes from 100 on, which the controller's program ignores."""
+    """The A50 cell; each test uses other bytes, from 100 on, which the PLC's program ignores."""
     cell = make_shared_cell(config=ARMED.replace('["Outputs"]', '["Outputs[*]"]'))
     cell.up()
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")

@@ -1,4 +1,4 @@
-"""Injection campaigns in the A50 cell: from a file, repeated with a seed, recorded, and from the configuration."""
+"""Injection campaigns in the A50 cell: by a file or the configuration, repeatable, recorded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A campaign repeats exactly: the same steps, writes, injections and seeds give the same bytes on every stream."""
+"""Equal steps, writes, injections and seeds give the same bytes on every stream."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The how-to page on emulated controllers, followed step by step: its files, commands and shown output."""
+"""The page on emulated controllers, followed step by step: files, commands and output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Injections in the A50 cell, by command and by program: every consumer sees them until their client ends."""
+"""Injections in the A50 cell, by command and by program, until their client ends."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ POSITION = "cell/Robot_800/Axs1_Pos"
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell, armed; a second source, not armed; and a memory. Each test lifts its injections."""
+    """The A50 cell, armed; a second source, not armed; and a memory.
+
+    Each test lifts its injections.
+    """
     cell = make_shared_cell(config=ARMED + UNARMED + MEMORY)
     (cell.folder / "panel.toml").write_text('[registers]\nspeed = { type = "REAL", initial = 0.5 }\n')
     cell.up()

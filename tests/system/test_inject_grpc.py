@@ -1,4 +1,4 @@
-"""Inject of both SimlogAPI versions in whole cells: as specified, and when clients or endpoints are killed."""
+"""Inject of both SimlogAPI versions in whole cells, also when clients or endpoints are killed."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ PLACE = "cell/Outputs/100"  # the controller's program ignores it
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell, armed; another source, not armed; and a memory with the joints of existing clients.
+    """The A50 cell, armed; another source, not armed; and a memory with existing clients' joints.
 
-    Each test lifts its injections."""
+    Each test lifts its injections.
+    """
     cell = make_shared_cell(config=(ARMED + UNARMED + MEMORY).replace("[grpc]\n", '[grpc]\ndefault_source = "sim"\n'))
     (cell.folder / "joints.toml").write_text(JOINTS)
     cell.up()

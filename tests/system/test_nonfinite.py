@@ -1,4 +1,4 @@
-"""NaN and infinities: refused by every interface until a reload of the configuration allows them."""
+"""NaN and infinities: every interface refuses them until the configuration allows them."""
 
 from __future__ import annotations
 

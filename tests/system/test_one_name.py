@@ -1,4 +1,4 @@
-"""Two configurations with the same instance name, of which one runs: the other file cannot reach that plant."""
+"""Two configurations with one instance name: the other's file cannot reach the running plant."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def write_folder(folder: Path, instance: str, writable: str) -> Path:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Iterator[tuple[Path, Path]]:
-    """Return the running instance's file, with all writable, and the other file, with nothing writable."""
+    """Return the running instance's file (all writable) and the other file (nothing writable)."""
     folder = tmp_path_factory.mktemp("cells").resolve()
     running = write_folder(folder / "a", shared_instance, '["**"]')
     other = write_folder(folder / "b", shared_instance, "[]")

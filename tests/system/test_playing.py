@@ -1,4 +1,4 @@
-"""Time that an instance's endpoint plays, and what happens to it when the endpoint's process ends."""
+"""Time that an instance's endpoint plays, also when the endpoint's process ends."""
 
 from __future__ import annotations
 

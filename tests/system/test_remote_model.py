@@ -1,4 +1,4 @@
-"""A drive model computed by a client program: as the page shows it, repeated, killed and rejoined."""
+"""A drive model computed by a client: as the page shows it, repeated, killed and rejoined."""
 
 from __future__ import annotations
 

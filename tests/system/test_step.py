@@ -1,4 +1,4 @@
-"""Virtual time in an instance with a user's models: stepped by commands and programs, and killed."""
+"""Virtual time in an instance with a user's models: stepped by commands and by programs."""
 
 from __future__ import annotations
 

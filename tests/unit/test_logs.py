@@ -58,7 +58,7 @@ def test_a_traceback_follows_indented(tmp_path: Path) -> None:
     assert all(line.startswith("    ") for line in lines[1:])
 
 
-def test_files_rotate_and_old_ones_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_rotate_and_old_ones_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(logs, "MAX_FILE_BYTES", 1000)
     log = logs.setup(tmp_path / "x.log", "cell")
     for number in range(100):
@@ -74,7 +74,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         logs.setup(tmp_path / "file" / "x.log", "cell")
 
 
-def test_a_file_that_cannot_be_written_yet_is_begun_when_it_can(tmp_path: Path) -> None:
+def test_a_log_file_is_started_as_soon_as_it_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "logs").touch()
     log = logs.setup(tmp_path / "logs" / "x.log", "cell", patient=True)
     log.info("lost")
@@ -106,13 +106,13 @@ print("stray", flush=True)
 """
 
 
-def test_what_a_process_prints_follows_the_rotation(tmp_path: Path) -> None:
+def test_a_processs_output_follows_the_rotation(tmp_path: Path) -> None:
     file = tmp_path / "x.log"
     subprocess.run([sys.executable, "-c", STRAY, str(file)], check=True)
     assert "stray" in file.read_text()
 
 
-def test_a_removed_file_is_made_anew_with_its_folder(tmp_path: Path) -> None:
+def test_a_removed_file_is_created_again_with_its_folder(tmp_path: Path) -> None:
     file = tmp_path / "logs" / "x.log"
     log = logs.setup(file, "cell")
     log.info("before")

@@ -1,4 +1,4 @@
-"""Clients cannot fill the log by causing the same line again and again."""
+"""Clients cannot fill the log by causing the same line repeatedly."""
 
 from __future__ import annotations
 

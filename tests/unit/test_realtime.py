@@ -1,4 +1,4 @@
-"""A real-time priority: taken where it is allowed, refused with the remedy where it is not."""
+"""Real-time priority: taken where allowed, refused with the remedy elsewhere."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def refuse(*_: object) -> None:
 
 
 @pytest.mark.skipif(not may_be_realtime(), reason="this user may have no real-time priority")
-def test_it_is_the_calling_threads_and_of_those_it_starts() -> None:
+def test_the_priority_is_of_the_calling_thread_and_its_new_threads() -> None:
     policies: list[int] = []
 
     def work() -> None:
@@ -33,10 +33,10 @@ def test_it_is_the_calling_threads_and_of_those_it_starts() -> None:
     thread.join()
     assert policies == [os.SCHED_FIFO, os.SCHED_FIFO]
     realtime.check(3)
-    assert os.sched_getscheduler(0) != os.SCHED_FIFO, "who only asks goes on as before"
+    assert os.sched_getscheduler(0) != os.SCHED_FIFO, "a check changes nothing"
 
 
-def test_where_it_is_not_allowed_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_permission_the_error_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     for ask in (realtime.prioritise, realtime.check):
         with pytest.raises(

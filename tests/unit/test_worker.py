@@ -1,4 +1,4 @@
-"""What every child process does, as its supervisor sees it: a real process, a real segment."""
+"""What every child process does, as its supervisor sees it, with a real process and segment."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 class Started:
-    """A worker process; killed at the end of the test, if it still runs."""
+    """A worker process; it is killed at the end of the test."""
 
     def __init__(self, segment: Segment, folder: Path, do: str, **changes: Any) -> None:
         self.log = folder / "cell.log"
@@ -88,7 +88,7 @@ class Started:
         return self.process.wait(20), errors
 
 
-def test_it_takes_its_role_reports_beats_and_stops_when_told(segment: Segment, tmp_path: Path) -> None:
+def test_it_takes_its_role_reports_sends_heartbeats_and_stops(segment: Segment, tmp_path: Path) -> None:
     slot = segment.processes.find("cell")
     with Started(segment, tmp_path, "work") as worker:
         until(lambda: slot.report.note == "at work", "a report")
@@ -97,7 +97,7 @@ def test_it_takes_its_role_reports_beats_and_stops_when_told(segment: Segment, t
         assert slot.alive()
         beat = slot.heartbeat_ns
         until(lambda: slot.heartbeat_ns > beat, "a beat")
-        worker.process.send_signal(signal.SIGINT)  # Ctrl-C is the supervisor's business
+        worker.process.send_signal(signal.SIGINT)  # the supervisor handles Ctrl-C
         beat = slot.heartbeat_ns
         until(lambda: slot.heartbeat_ns > beat, "a beat after SIGINT")
         worker.process.terminate()
@@ -106,7 +106,7 @@ def test_it_takes_its_role_reports_beats_and_stops_when_told(segment: Segment, t
     assert "stopped" in worker.log.read_text().splitlines()[-1]
 
 
-def test_it_reads_anew_as_often_as_it_is_told(segment: Segment, tmp_path: Path) -> None:
+def test_it_reads_its_files_again_at_each_sighup(segment: Segment, tmp_path: Path) -> None:
     slot = segment.processes.find("cell")
     with Started(segment, tmp_path, "reread") as worker:
         for note in ("at work", "at work anew", "at work anew anew"):
@@ -114,7 +114,7 @@ def test_it_reads_anew_as_often_as_it_is_told(segment: Segment, tmp_path: Path) 
             worker.process.send_signal(signal.SIGHUP)
         worker.process.terminate()
         assert worker.end() == (0, "")
-    with Started(segment, tmp_path, "work") as worker:  # one that has nothing to read lives on
+    with Started(segment, tmp_path, "work") as worker:  # a worker that has nothing to read again ignores the signal
         until(lambda: slot.report.pid == worker.process.pid and slot.report.note == "at work", "work")
         worker.process.send_signal(signal.SIGHUP)
         beat = slot.heartbeat_ns
@@ -123,7 +123,7 @@ def test_it_reads_anew_as_often_as_it_is_told(segment: Segment, tmp_path: Path) 
         assert worker.end() == (0, "")
 
 
-def test_what_it_was_told_before_it_could_read_anew_is_not_lost(segment: Segment, tmp_path: Path) -> None:
+def test_a_sighup_before_it_can_read_again_is_not_lost(segment: Segment, tmp_path: Path) -> None:
     slot = segment.processes.find("cell")
     with Started(segment, tmp_path, "reread late") as worker:
         until(lambda: slot.report.note.startswith("at work anew"), "it reads anew")
@@ -135,7 +135,7 @@ def test_what_it_was_told_before_it_could_read_anew_is_not_lost(segment: Segment
     ("do", "status", "note"),
     [("refuse", 2, "host: this key is needed"), ("fail", 1, "the device is on fire"), ("crash", 1, "")],
 )
-def test_the_exit_status_says_whether_another_start_could_help(
+def test_the_exit_status_says_whether_a_restart_can_help(
     segment: Segment, tmp_path: Path, do: str, status: int, note: str
 ) -> None:
     with Started(segment, tmp_path, do) as worker:
@@ -146,7 +146,7 @@ def test_the_exit_status_says_whether_another_start_could_help(
     assert (note or "ZeroDivisionError") in worker.log.read_text()
 
 
-def test_a_role_is_waited_for_until_its_holder_is_gone(segment: Segment, tmp_path: Path) -> None:
+def test_it_waits_for_its_role_until_the_holder_has_ended(segment: Segment, tmp_path: Path) -> None:
     slot = segment.processes.find("cell")
     with Started(segment, tmp_path, "work") as first:
         until(lambda: slot.report.note == "at work", "the first at work")
@@ -162,14 +162,14 @@ def test_a_worker_works_without_a_log(segment: Segment, tmp_path: Path) -> None:
         until(lambda: slot.report.note == "at work", "work")
 
 
-def test_a_worker_of_another_run_of_the_instance_ends(segment: Segment, tmp_path: Path) -> None:
+def test_a_worker_of_another_run_of_the_instance_exits(segment: Segment, tmp_path: Path) -> None:
     with Started(segment, tmp_path, "work", epoch=1) as worker:
         returned, errors = worker.end()
     assert returned == 1
     assert "another run" in errors
 
 
-def test_a_worker_that_gets_its_role_in_a_removed_segment_ends(segment: Segment, tmp_path: Path) -> None:
+def test_a_worker_that_gets_its_role_in_a_removed_segment_exits(segment: Segment, tmp_path: Path) -> None:
     with Segment.open(segment.instance, writable=True) as holder:
         assert holder.processes.find("cell").take()
         with Started(segment, tmp_path, "work") as worker:
@@ -182,7 +182,7 @@ def test_a_worker_that_gets_its_role_in_a_removed_segment_ends(segment: Segment,
     assert "was removed" in errors
 
 
-def test_without_a_description_it_says_who_starts_it(segment: Segment, tmp_path: Path) -> None:
+def test_without_a_description_it_explains_how_it_is_started(segment: Segment, tmp_path: Path) -> None:
     for standard_input in ("", "nonsense", "[]", '{"name": "cell"}'):
         with Started.__new__(Started) as worker:
             worker.start(standard_input)

@@ -127,7 +127,8 @@ async def endpoint(
 
     Args:
         before: Process id of the previous endpoint.
-        port: Port of the previous endpoint, to reuse it."""
+        port: Port of the previous endpoint, to reuse it.
+    """
     tasks: set[asyncio.Task[None]] = set()
 
     def on_quality(source: str, good: bool) -> None:

@@ -57,7 +57,8 @@ class Connection:
     async def open(cls, port: int, *, deaf: bool = False) -> Self:
         """Connect, and wait until the server speaks HTTP/2.
 
-        ``deaf``: keep the flow-control windows closed, so that no data can arrive."""
+        ``deaf``: keep the flow-control windows closed, so that no data can arrive.
+        """
         connection = cls(*await asyncio.open_connection("127.0.0.1", port))
         await connection.send(PREFACE + frame(SETTINGS, 0, 0, b"\0\4\0\0\0\0" if deaf else b""))
         async with asyncio.timeout(TIMEOUT_S):

@@ -18,7 +18,10 @@ GUEST = 0
 
 
 class Plant:
-    """A command processor in its thread, and a device that accepts writes unless ``refusal`` gives a reason."""
+    """A command processor in its thread, and a device.
+
+    The device accepts every write unless ``refusal`` gives a reason.
+    """
 
     def __init__(self, writer: BlockWriter, *, armed: bool = True) -> None:
         self.writer = writer

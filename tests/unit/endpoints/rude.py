@@ -1,4 +1,4 @@
-"""Every call that clients can make, a well-behaved client, and checks that misbehaving ones leave nothing."""
+"""Every call that clients can make, and a check that misbehaving clients leave nothing."""
 
 from __future__ import annotations
 
@@ -145,9 +145,12 @@ class Polite:
         assert got == number
 
     async def alone(self, *, connected: bool = False) -> None:
-        """Wait until nothing is left of other clients: calls, streams, topics, commands, bytes, injections.
+        """Wait until nothing is left of other clients.
 
-        ``connected``: the other client is still connected, so the injection of version 2 may remain.
+        That is calls, streams, topics, commands, bytes and injections.
+
+        ``connected``: the other client is still connected, so the injection of version 2 may
+        remain.
         """
         served, feed = self._served, self._served.feeds["cell"]
 
@@ -181,7 +184,7 @@ async def polite(served: Endpoint, device: Plant) -> AsyncIterator[Polite]:
 
 
 def beside_a_polite_client(segment: Segment, test: Callable[[Endpoint, Polite], Awaitable[None]]) -> None:
-    """Run a test with a running device and a well-behaved client; nothing may be left of the test's clients."""
+    """Run a test with a device and a well-behaved client; check that nothing is left of others."""
 
     async def run() -> None:
         async with endpoint(segment) as served, plant(served) as device, polite(served, device) as beside:

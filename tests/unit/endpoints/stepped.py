@@ -1,4 +1,4 @@
-"""Sources on the instance's clock: threads that publish a frame for each step, as model processes do."""
+"""Sources on the instance's clock: threads that publish a frame for each step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An instance without a supervisor, whose sources the tests play."""
+"""An instance without a supervisor; the tests publish for its sources."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.unit.recorder.harness import publish, recorder, spec
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """Two sources, with rings of 512 frames, and the recorder's place."""
+    """Two sources, with rings of 512 frames, and a process slot for the recorder."""
     processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
     with Segment.create(instance, [spec("cell"), spec("press")], processes) as segment:
         yield segment

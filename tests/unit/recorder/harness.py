@@ -1,4 +1,4 @@
-"""What the tests of recordings share."""
+"""Helpers for the tests of recordings."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ RING = 512
 
 
 def spec(source: str, layout: Layout = LAYOUT) -> BlockSpec:
-    """A block with a ring of RING frames."""
+    """Return a block with a ring of RING frames."""
     return BlockSpec(source, layout, 20_000_000, 60_000_000_000, 1 << 22)
 
 
 def publish(writer: BlockWriter, count: int, first: int = 0) -> None:
-    """Publish frames whose register counts, with it as cycle."""
+    """Publish frames whose register and cycle count up."""
     size = writer.block.layout.size
     for cycle in range(first, first + count):
         writer.publish((cycle & 0x7FFF).to_bytes(size, "big"), cycle=cycle)
@@ -44,7 +44,7 @@ def recorder(
     selection: Selection | None = None,
     **options: Any,
 ) -> Recorder:
-    """A recorder in this process."""
+    """Return a recorder that runs in this process."""
     path, fd = create(folder, segment.instance)
     return Recorder(
         InstanceFollower(segment, start, selection), Output(path, fd, limit_bytes=1 << 24), by="test", **options
@@ -52,23 +52,23 @@ def recorder(
 
 
 def read(file: Path) -> list[Message]:
-    """All messages but those about processes."""
+    """Return all messages but those about processes."""
     return [message for message in everything(file) if not isinstance(message.item, ProcessChange)]
 
 
 def everything(file: Path) -> list[Message]:
-    """All messages."""
+    """Return all messages."""
     with Reader(file) as reader:
         return list(reader.messages())
 
 
 def changes(file: Path) -> list[ProcessChange]:
-    """What happened to processes."""
+    """Return the process changes in a file."""
     return [message.item for message in everything(file) if isinstance(message.item, ProcessChange)]
 
 
 def numbers(file: Path, source: str = "cell", kind: type[Frame] | type[Event] = Frame) -> list[int]:
-    """Numbers of a source's frames or events, as the file has them."""
+    """Return the numbers of a source's frames or events, in the order of the file."""
     found = []
     for message in read(file):
         if message.channel.source == source and isinstance(message.item, kind):
@@ -78,16 +78,16 @@ def numbers(file: Path, source: str = "cell", kind: type[Frame] | type[Event] = 
 
 
 def gaps(file: Path) -> list[Gap]:
-    """What was missed."""
+    """Return the gaps in a file."""
     with Reader(file) as reader:
         return survey(reader).gaps
 
 
 class Process:
-    """The recorder's process; killed at the end of the test, if it still runs."""
+    """The recorder's process; it is killed at the end of the test."""
 
     def __init__(self, segment: Segment, folder: Path, *, before: str = "", **config: object) -> None:
-        """``before``: Python that its interpreter runs first."""
+        """Start it. ``before``: Python code that its interpreter runs first."""
         self.slot = segment.processes.find("recorder")
         self.folder = folder / "dumps"
         self.log = folder / "recorder.log"
@@ -113,18 +113,18 @@ class Process:
 
     @property
     def file(self) -> Path:
-        """Its file, as it last told while it was well."""
+        """Path of its file, from its last report without a problem."""
         report = self.slot.report
         if report.pid == self.popen.pid and report.note.startswith("to "):
             self._file = self.folder / report.note.removeprefix("to ")
         return self._file
 
     def counts(self, name: str) -> int:
-        """One of its counters, as it last told."""
+        """Return one of its counters, from its last report."""
         return self.slot.counters[name] if self.slot.report.pid == self.popen.pid else 0
 
     def stop(self) -> int:
-        """Stop it in good order; its exit status."""
+        """Stop it; return its exit status."""
         self.popen.terminate()
         return self.popen.wait(30)
 

@@ -30,16 +30,16 @@ def test_a_file_is_named_after_instance_and_time_and_never_overwritten(tmp_path:
     names = ["a50-20261121T083005Z.mem", "a50-20261121T083005Z_2.mem", "a50-20261121T083005Z_3.mem"]
     assert [output.path.name for output in outputs] == names
     assert [output.path.read_bytes() for output in outputs] == [b"0", b"1", b"2"]
-    assert sorted(names) == names, "their order is that of time"
+    assert sorted(names) == names, "names sort by time"
 
 
-def test_where_no_file_can_be_made_that_is_told(tmp_path: Path) -> None:
+def test_a_folder_where_no_file_can_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match=r"cannot make a recording in .*/file: (File exists|Not a directory)"):
         create(tmp_path / "file", "a50")
 
 
-def test_pieces_arrive_whole_and_in_order(tmp_path: Path) -> None:
+def test_pieces_are_written_whole_and_in_order(tmp_path: Path) -> None:
     output = made(tmp_path)
     for number in range(100):
         output.write(b"%02d" % number)
@@ -51,7 +51,7 @@ def test_pieces_arrive_whole_and_in_order(tmp_path: Path) -> None:
     assert output.written == 200
 
 
-def test_it_is_full_until_half_of_what_may_wait_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_full_until_half_of_the_limit_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         broken.setattr(Output, "_put", lambda *_: False)
         output = made(tmp_path)
@@ -66,7 +66,7 @@ def test_it_is_full_until_half_of_what_may_wait_is_written(tmp_path: Path, monke
     output.close(30)
 
 
-def test_a_disk_that_never_takes_it_does_not_hold_up_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_never_accepts_data_does_not_block_close(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(output: Output, _: bytes) -> bool:
         output.error = "Input/output error"
         return False
@@ -79,7 +79,7 @@ def test_a_disk_that_never_takes_it_does_not_hold_up_the_end(tmp_path: Path, mon
 
 
 def test_a_failed_fsync_is_not_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kernel has given up what it could not write: that the next fsync succeeds means nothing."""
+    """The kernel drops data that it could not write, so a later successful fsync proves nothing."""
     calls = queue.SimpleQueue[bool]()
     done = threading.Semaphore(0)
 
@@ -103,7 +103,7 @@ def test_a_failed_fsync_is_not_forgotten(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("call", ["pwrite", "fsync"])
-def test_a_disk_that_does_not_answer_is_named_until_it_does(
+def test_a_disk_that_does_not_answer_is_reported_until_it_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
 ) -> None:
     answered, really = threading.Event(), getattr(os, call)

@@ -1,4 +1,4 @@
-"""Files that a killed recorder has left: closed by the next, whatever they end with."""
+"""Files that a killed recorder left: the next recorder closes them, however they end."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def whole(segment: Segment, tmp_path: Path) -> Path:
 
 
 def records(file: Path, opcode: int) -> list[tuple[int, int]]:
-    """Where records of a kind begin and end."""
+    """Return where records of a kind begin and end."""
     with Reader(file) as reader:
         return [(found.start, found.at + found.size) for found in reader.records.walk() if found.opcode == opcode]
 
 
 def messages(file: Path) -> list[tuple[str, int, bytes]]:
-    """By another reader than ours, with the index and every checksum."""
+    """Return the messages that the mcap library reads, with the index and every checksum."""
     with file.open("rb") as stream:
         reader = mcap.reader.make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
@@ -66,7 +66,7 @@ def messages(file: Path) -> list[tuple[str, int, bytes]]:
 
 
 def expected(content: bytes, folder: Path, size: int) -> list[tuple[str, int, bytes]]:
-    """What of a file is whole if it ends there, by a reader from front to back."""
+    """Return the messages that are whole if the file ends at ``size``, read from front to back."""
     part = folder / "part"
     part.write_bytes(content[:size])
     with part.open("rb") as stream:
@@ -75,27 +75,27 @@ def expected(content: bytes, folder: Path, size: int) -> list[tuple[str, int, by
         try:
             for _, channel, message in found:
                 kept.append((channel.topic, message.log_time, message.data))
-        except Exception:  # noqa: BLE001  it ends within a record
+        except Exception:  # noqa: BLE001  the file ends within a record
             pass
     return sorted(kept)
 
 
-def test_what_it_makes_is_what_the_recorder_would_have_written(whole: Path, tmp_path: Path) -> None:
+def test_the_closed_file_equals_the_recorders_own(whole: Path, tmp_path: Path) -> None:
     content = whole.read_bytes()
     [(end, _)] = records(whole, Opcode.DATA_END)
     whole.write_bytes(content[:end])
     os.utime(whole, (1, 1))
     assert finalise(whole)
     assert whole.read_bytes() == content
-    assert whole.stat().st_mtime == 1, "nothing was recorded since"
+    assert whole.stat().st_mtime == 1, "the time of the last recording is kept"
     assert len(messages(whole)) > CHUNKS
 
 
-def test_it_may_end_anywhere_within_its_last_chunk_and_what_follows_that(
+def test_a_file_cut_anywhere_after_its_last_chunk_began_is_closed(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Or within an end that somebody has begun to make, who was killed too."""
-    monkeypatch.setattr(os, "fsync", lambda _: None)  # of a thousand files
+    """The file may also end within a summary whose writer was killed, too."""
+    monkeypatch.setattr(os, "fsync", lambda _: None)  # too slow for a thousand files
     content = whole.read_bytes()
     last, end = records(whole, Opcode.CHUNK)[-1]
     file = tmp_path / "cut.mem"
@@ -109,7 +109,7 @@ def test_it_may_end_anywhere_within_its_last_chunk_and_what_follows_that(
             assert check(reader).whole
 
 
-def test_zeros_at_the_end_as_a_power_cut_leaves_them(whole: Path, tmp_path: Path) -> None:
+def test_zeros_at_the_end_after_a_power_failure(whole: Path, tmp_path: Path) -> None:
     content = whole.read_bytes()
     begin, end = records(whole, Opcode.CHUNK)[-1]
     for size, zeros in ((begin, 5000), (begin, 3 << 20), (end, 4096)):
@@ -129,7 +129,7 @@ def test_a_last_chunk_of_zeros_is_not_in_the_index(whole: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("what", ["garbage", "more behind the end", "no recording"])
-def test_what_no_recorder_leaves_is_left_as_it_is(whole: Path, what: str) -> None:
+def test_files_that_no_recorder_leaves_are_not_changed(whole: Path, what: str) -> None:
     content = whole.read_bytes()
     begin, end = records(whole, Opcode.CHUNK)[-1]
     [(over, _)] = records(whole, Opcode.DATA_END)
@@ -144,7 +144,7 @@ def test_what_no_recorder_leaves_is_left_as_it_is(whole: Path, what: str) -> Non
     assert whole.read_bytes() == strange
 
 
-def test_without_room_it_stays_as_it_is(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_room_the_file_is_not_changed(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = whole.read_bytes()
     [(end, _)] = records(whole, Opcode.DATA_END)
     whole.write_bytes(content[:end])
@@ -167,7 +167,7 @@ def test_without_room_it_stays_as_it_is(whole: Path, monkeypatch: pytest.MonkeyP
     assert whole.read_bytes() == content
 
 
-def test_one_that_is_being_written_is_not_touched(whole: Path) -> None:
+def test_a_file_in_use_is_not_changed(whole: Path) -> None:
     [(end, _)] = records(whole, Opcode.DATA_END)
     os.truncate(whole, end)
     with whole.open("rb+") as stream:
@@ -177,7 +177,7 @@ def test_one_that_is_being_written_is_not_touched(whole: Path) -> None:
     assert finalise(whole)
 
 
-def test_the_successor_closes_what_a_killed_recorder_has_left(segment: Segment, tmp_path: Path) -> None:
+def test_the_successor_closes_the_file_of_a_killed_recorder(segment: Segment, tmp_path: Path) -> None:
     (tmp_path / "supervisor.toml").write_text(f'[instance]\nname = "{segment.instance}"\n')
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
@@ -187,7 +187,7 @@ def test_the_successor_closes_what_a_killed_recorder_has_left(segment: Segment, 
         first.popen.wait()
     old = first.file
     with old.open("ab") as stream:
-        stream.write(b"\x06\xff\xff")  # a part of the next chunk
+        stream.write(b"\x06\xff\xff")  # part of the next chunk
     with Process(segment, tmp_path) as second:
         until(lambda: closed(old), "the predecessor's file closed")
         publish(writer, 5, first=20)
@@ -199,8 +199,8 @@ def test_the_successor_closes_what_a_killed_recorder_has_left(segment: Segment, 
     assert gaps(second.file) == []
 
 
-def test_a_full_disk_leaves_it_as_it_is_and_says_so(segment: Segment, tmp_path: Path) -> None:
-    """The limit is that of a file's size; the index of this one needs more than its frames leave."""
+def test_a_full_disk_leaves_the_file_unchanged_with_a_log_line(segment: Segment, tmp_path: Path) -> None:
+    """The limit is that of a file's size; the file's index needs more than is left."""
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 20)

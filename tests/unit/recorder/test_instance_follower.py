@@ -18,7 +18,7 @@ from tests.unit.recorder.harness import changes, publish, recorder
 
 
 def to(slot: ProcessSlot, phase: Phase, pid: int, restarts: int = 0, why: str = "") -> None:
-    """As supervisor and process would tell."""
+    """Set the slot as the supervisor and the process would."""
     slot.report = Report(pid, Activity.RUNNING)
     slot.supervised = Supervised(phase, restarts, 0, why)
 
@@ -27,7 +27,7 @@ def told(watch: ProcessWatch) -> list[tuple[str, str, int, str]]:
     return [(change.name, change.what, change.pid, change.why) for change in watch.look()]
 
 
-def test_a_life_is_told(segment: Segment) -> None:
+def test_each_start_and_end_of_a_process_is_reported(segment: Segment) -> None:
     slot = segment.processes.find("cell")
     watch = ProcessWatch(segment)
     to(slot, Phase.STARTING, 7)
@@ -49,7 +49,7 @@ def test_a_life_is_told(segment: Segment) -> None:
     assert told(watch) == [("cell", "ended", 9, "")]
 
 
-def test_one_whose_end_was_over_between_two_looks_is_told(segment: Segment) -> None:
+def test_a_restart_between_two_looks_is_reported(segment: Segment) -> None:
     slot = segment.processes.find("cell")
     to(slot, Phase.RUNNING, 7)
     watch = ProcessWatch(segment)
@@ -65,7 +65,7 @@ def test_one_whose_end_was_over_between_two_looks_is_told(segment: Segment) -> N
     assert told(watch) == [("cell", "ended", 9, ""), ("cell", "started", 10, "")]
 
 
-def test_a_process_that_a_reload_takes_out_or_adds_is_told(segment: Segment) -> None:
+def test_a_process_added_or_removed_by_a_reload_is_reported(segment: Segment) -> None:
     slot = segment.processes.find("cell")
     to(slot, Phase.RUNNING, 7)
     watch = ProcessWatch(segment)
@@ -74,7 +74,7 @@ def test_a_process_that_a_reload_takes_out_or_adds_is_told(segment: Segment) -> 
     assert told(watch) == [("cell", "removed", 7, ""), ("press", "started", 9, "")]
 
 
-def test_a_recording_says_how_processes_are_and_what_happens_to_them(
+def test_a_recording_has_the_state_and_changes_of_processes(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(instance_follower, "TURN_S", 0.0)
@@ -93,7 +93,7 @@ def test_a_recording_says_how_processes_are_and_what_happens_to_them(
     ]
 
 
-def test_what_there_was_no_room_for_is_how_things_stand_afterwards(
+def test_changes_without_room_are_recorded_as_the_state_afterwards(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(instance_follower, "TURN_S", 0.0)
@@ -159,7 +159,7 @@ def test_a_configuration_that_became_invalid_is_named_once(tmp_path: Path, caplo
     assert str(file) in line
 
 
-def test_behind_many_entries_the_next_turn_comes_sooner(segment: Segment) -> None:
+def test_after_many_entries_the_next_turn_comes_sooner(segment: Segment) -> None:
     tap = InstanceFollower(segment)
     tap.take()
     calm_s = tap.pause_s
@@ -172,11 +172,11 @@ def test_behind_many_entries_the_next_turn_comes_sooner(segment: Segment) -> Non
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", b'{"name": 1}', b"[" * 5000])
-def test_what_is_no_change_is_refused(data: bytes) -> None:
+def test_invalid_process_changes_are_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"."):
         decode_process(data)
 
 
-def test_a_change_comes_out_as_it_went_in() -> None:
+def test_a_change_survives_a_round_trip() -> None:
     change = ProcessChange("cell", "source", 7, ProcessEvent.DIED, "grün", 3)
     assert decode_process(encode_json(change)) == change

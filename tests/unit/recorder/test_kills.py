@@ -1,4 +1,4 @@
-"""The recorder is killed again and again at any moment, beside a source that goes on."""
+"""The recorder is killed repeatedly at random moments, while a source publishes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SEED = 20
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """With a ring that is made for a far faster source, and so lasts minutes."""
+    """A segment with a ring sized for a far faster source, so that it lasts for minutes."""
     processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
     with Segment.create(instance, [BlockSpec("cell", LAYOUT, 500_000, 10**9, 1 << 27)], processes) as segment:
         yield segment
@@ -32,15 +32,15 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 def frames(file: Path) -> list[int]:
-    """Numbers of the frames, by another reader than ours that needs the index, with every checksum."""
+    """Return the frame numbers that the mcap library reads, with the index and every checksum."""
     with file.open("rb") as stream:
         messages = mcap.reader.make_reader(stream, validate_crcs=True).iter_messages(topics=["cell/frames"])
         return [message.sequence for _, _, message in messages]
 
 
 @pytest.mark.timeout(600)
-def test_a_kill_at_any_moment_costs_nothing_and_leaves_whole_files(segment: Segment, tmp_path: Path) -> None:
-    """What one has not written its successor takes from the ring, which lasts longer than any start of a process."""
+def test_a_kill_at_any_moment_loses_no_frame_and_leaves_intact_files(segment: Segment, tmp_path: Path) -> None:
+    """The successor takes from the ring what the killed recorder had not written."""
     writer, over, chance = segment.writer("cell"), threading.Event(), random.Random(SEED)
 
     def source() -> None:
@@ -74,7 +74,7 @@ def test_a_kill_at_any_moment_costs_nothing_and_leaves_whole_files(segment: Segm
         assert gaps(file) == []
         with Reader(file) as reader:
             assert check(reader).whole
-    assert sorted(found) == list(range(1, writer.block.ring.head() + 1)), "each once"
+    assert sorted(found) == list(range(1, writer.block.ring.head() + 1)), "each frame once"
 
 
 def closed(file: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Where the recorder before ended, looked up in files that are damaged or large."""
+"""Finding where the previous recorder ended, in files that are damaged or large."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MB = 1 << 20
 
 @pytest.fixture
 def file(segment: Segment, tmp_path: Path) -> Path:
-    """What a recorder has left: two chunks with 10 frames of each source, and one with 10 of press."""
+    """A previous recorder's file: two chunks with 10 frames of each source, and one of press."""
     work = recorder(segment, tmp_path)
     for turn, sources in enumerate((("cell", "press"), ("cell", "press"), ("press",))):
         for source in sources:
@@ -34,7 +34,7 @@ def file(segment: Segment, tmp_path: Path) -> Path:
 
 
 def look(segment: Segment, folder: Path) -> tuple[dict[str, BlockPosition], int]:
-    """What is known by source; how often it was told that the search goes on."""
+    """Return the known positions by source, and the number of heartbeats during the search."""
     beats: list[None] = []
     found = last_positions(folder, segment, "test", lambda: beats.append(None))
     return {name: found[block.section] for name, block in segment.blocks.items() if block.section in found}, len(beats)
@@ -45,7 +45,7 @@ def chunks(file: Path) -> list[Record]:
         return [record for record in reader.records.walk() if record.opcode == Opcode.CHUNK]
 
 
-def test_a_large_file_that_is_no_recording_is_not_searched_to_its_end(segment: Segment, tmp_path: Path) -> None:
+def test_a_large_file_that_is_not_a_recording_is_not_searched_to_its_end(segment: Segment, tmp_path: Path) -> None:
     with (tmp_path / f"{segment.instance}-20990101T000000Z.mem").open("wb") as stream:
         stream.write(MAGIC)
         stream.truncate(256 * MB)
@@ -54,7 +54,7 @@ def test_a_large_file_that_is_no_recording_is_not_searched_to_its_end(segment: S
     assert 1 <= beats < 10
 
 
-def test_of_many_files_those_are_looked_into_that_are_named_last(
+def test_of_many_files_the_last_by_name_are_searched(
     segment: Segment, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file.rename(tmp_path / f"{segment.instance}-20000101T000000Z.mem")
@@ -66,8 +66,8 @@ def test_of_many_files_those_are_looked_into_that_are_named_last(
     assert found["cell"].frame == 25
 
 
-def test_a_search_behind_damage_beats(segment: Segment, file: Path) -> None:
-    """As a power failure leaves a file: the rest are zeros."""
+def test_the_heartbeat_continues_during_a_search_past_damage(segment: Segment, file: Path) -> None:
+    """A power failure leaves such a file: the rest is zeros."""
     end = chunks(file)[0]
     with file.open("rb+") as stream:
         stream.truncate(end.at + end.size)
@@ -78,8 +78,8 @@ def test_a_search_behind_damage_beats(segment: Segment, file: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["many small records", "chunks that unpack to much"])
-def test_whatever_a_file_consists_of_the_search_beats(segment: Segment, file: Path, what: str) -> None:
-    """Two such files: one may be short, the other small."""
+def test_the_heartbeat_continues_whatever_the_file_contains(segment: Segment, file: Path, what: str) -> None:
+    """Such files may have few messages, or few bytes."""
     begin = chunks(file)[0].start
     content = file.read_bytes()
     strange = struct.pack("<BQ", 0x80, 0) * 20_000
@@ -94,8 +94,8 @@ def test_whatever_a_file_consists_of_the_search_beats(segment: Segment, file: Pa
     assert beats >= 20
 
 
-def test_a_damaged_beginning_costs_nothing_of_where_it_ended(segment: Segment, file: Path) -> None:
-    """Of one channel both descriptions are damaged, too: its frames cannot be read any more."""
+def test_a_damaged_beginning_does_not_hide_where_it_ended(segment: Segment, file: Path) -> None:
+    """Both descriptions of one channel are damaged, too, so its frames cannot be read any more."""
     expected, _ = look(segment, file.parent)
     content = bytearray(file.read_bytes())
     with Reader(file) as reader:
@@ -112,8 +112,8 @@ def test_a_damaged_beginning_costs_nothing_of_where_it_ended(segment: Segment, f
     assert (found["cell"].frame, found["cell"].event) == (0, expected["cell"].event)
 
 
-def test_a_damaged_end_costs_only_the_blocks_that_are_in_it(segment: Segment, file: Path) -> None:
-    """What cannot be read any more is recorded again, as far as the ring has it."""
+def test_a_damaged_end_affects_only_the_blocks_in_it(segment: Segment, file: Path) -> None:
+    """Frames that cannot be read any more are recorded again, as far as the ring has them."""
     expected, _ = look(segment, file.parent)
     last = chunks(file)[-1]
     content = bytearray(file.read_bytes())

@@ -1,4 +1,4 @@
-"""The recorder's process: killed, restarted, without room. The file is what counts."""
+"""The recorder's process: killed, restarted, on a full disk. The files are checked."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.unit.recorder.harness import OTHER, RING, Process, gaps, numbers, pub
 
 
 def written(process: Process) -> list[int]:
-    """Numbers of the frames in its file as of now."""
+    """Return the numbers of the frames in its file so far."""
     return numbers(process.file) if process.file.is_file() and process.file.stat().st_size else []
 
 
@@ -31,7 +31,7 @@ def ready(process: Process) -> bool:
     return process.slot.report.pid == process.popen.pid and process.slot.report.note.startswith("to ")
 
 
-def test_it_records_tells_its_counters_and_closes_its_file(
+def test_it_records_reports_counters_and_closes_its_file(
     segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "supervisor.toml").write_text(
@@ -57,9 +57,7 @@ def test_it_records_tells_its_counters_and_closes_its_file(
     assert "5 frames, 1 events, 0 missed" in process.log.read_text()
 
 
-def test_a_killed_recorder_leaves_a_file_that_is_read_and_its_successor_goes_on(
-    segment: Segment, tmp_path: Path
-) -> None:
+def test_a_killed_recorders_file_is_readable_and_its_successor_continues(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 20)
@@ -84,7 +82,7 @@ def test_a_killed_recorder_leaves_a_file_that_is_read_and_its_successor_goes_on(
     assert numbers(second.file, kind=Event) == []
 
 
-def test_what_the_ring_no_longer_has_is_a_gap_to_the_predecessor(segment: Segment, tmp_path: Path) -> None:
+def test_frames_that_the_ring_no_longer_has_are_a_gap_after_the_predecessor(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 10)
@@ -104,7 +102,7 @@ def test_what_the_ring_no_longer_has_is_a_gap_to_the_predecessor(segment: Segmen
     assert second.counts("missed") == gap.count
 
 
-def test_what_a_recorder_with_another_folder_has_is_said_to_be_elsewhere(segment: Segment, tmp_path: Path) -> None:
+def test_frames_recorded_in_another_folder_are_a_gap_marked_as_elsewhere(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 10)
@@ -121,7 +119,7 @@ def test_what_a_recorder_with_another_folder_has_is_said_to_be_elsewhere(segment
     assert (gap.what, gap.first, gap.reason) == ("frames", 1, Reason.ELSEWHERE)
 
 
-def test_a_clock_set_back_does_not_change_who_came_last(segment: Segment, tmp_path: Path) -> None:
+def test_the_previous_file_is_found_though_the_clock_was_set_back(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     files = []
     for turn, year in enumerate((2040, 2030, 2035)):
@@ -146,7 +144,7 @@ def test_events_are_not_recorded_again_by_later_recorders_of_a_quiet_cell(segmen
     assert events == [[1], [], []]
 
 
-def test_a_block_made_anew_is_not_taken_for_the_one_before(segment: Segment, tmp_path: Path) -> None:
+def test_a_replaced_block_is_not_mistaken_for_the_earlier_one(segment: Segment, tmp_path: Path) -> None:
     publish(segment.writer("cell"), 20)
     with Process(segment, tmp_path) as process:
         until(lambda: process.counts("frames") == 20, "the old block's")
@@ -162,7 +160,7 @@ def test_a_block_made_anew_is_not_taken_for_the_one_before(segment: Segment, tmp
 
 
 def by_section(file: Path) -> dict[int, list[int]]:
-    """Numbers of the frames of cell in a file, block by block."""
+    """Return the numbers of the frames of cell in a file, by block."""
     found: dict[int, list[int]] = {}
     for channel, _, item in read(file):
         if isinstance(item, Frame) and channel.source == "cell":
@@ -170,7 +168,7 @@ def by_section(file: Path) -> dict[int, list[int]]:
     return found
 
 
-def test_what_a_reload_ended_while_no_recorder_ran_is_recorded_by_the_next(segment: Segment, tmp_path: Path) -> None:
+def test_a_block_that_ended_while_no_recorder_ran_is_recorded_by_the_next(segment: Segment, tmp_path: Path) -> None:
     sections = [segment.blocks["cell"].section]
     with Process(segment, tmp_path) as process:
         publish(segment.writer("cell"), 10)
@@ -184,10 +182,10 @@ def test_what_a_reload_ended_while_no_recorder_ran_is_recorded_by_the_next(segme
     segment.change(add=[spec("cell")], retire=["cell"])
     sections.append(segment.blocks["cell"].section)
     publish(segment.writer("cell"), 5)
-    for published in (0, 2):  # the second one finds in the first one's file what is over
+    for published in (0, 2):  # the second run finds in the first one's file that the old blocks are done
         publish(segment.writer("cell"), published, first=5)
         with Process(segment, tmp_path) as process:
-            until(lambda: ready(process), "its file")  # at its end it takes what is there
+            until(lambda: ready(process), "its file")  # it records the waiting frames when it stops
             process.stop()
             files.append(process.file)
     first, second, third = map(by_section, files)
@@ -205,7 +203,7 @@ def test_what_a_reload_ended_while_no_recorder_ran_is_recorded_by_the_next(segme
             assert check(reader).whole
 
 
-def test_the_recordings_of_an_instance_with_a_longer_name_are_not_its_own(segment: Segment, tmp_path: Path) -> None:
+def test_recordings_of_an_instance_with_a_longer_name_are_ignored(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     files = []
     for turn in range(2):
@@ -219,7 +217,7 @@ def test_the_recordings_of_an_instance_with_a_longer_name_are_not_its_own(segmen
     assert numbers(files[1]) == list(range(11, 21))
 
 
-def test_a_recording_of_another_run_or_by_another_is_no_predecessor(segment: Segment, tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_recording_is_ignored(segment: Segment, tmp_path: Path) -> None:
     (tmp_path / "dumps").mkdir()
     (tmp_path / "dumps" / f"{segment.instance}-20990101T000000Z.mem").write_bytes(b"nonsense")
     publish(segment.writer("cell"), 3)
@@ -229,8 +227,8 @@ def test_a_recording_of_another_run_or_by_another_is_no_predecessor(segment: Seg
     assert "is not a recording" in process.log.read_text()
 
 
-def test_what_others_put_into_its_folder_is_no_predecessor(segment: Segment, tmp_path: Path) -> None:
-    """A recording that says of itself that it has all frames up to the tenth, but is not this user's file."""
+def test_files_of_other_users_are_ignored(segment: Segment, tmp_path: Path) -> None:
+    """A recording that claims all frames up to the tenth, but is not this user's file."""
     if os.geteuid() != 0:
         pytest.skip("only root can give a file away")
     writer = segment.writer("cell")
@@ -245,7 +243,7 @@ def test_what_others_put_into_its_folder_is_no_predecessor(segment: Segment, tmp
     (folder / f"{segment.instance}-20980101T000001Z.mem").symlink_to(strange)
     os.mkfifo(folder / f"{segment.instance}-20980101T000002Z.mem")
     (folder / f"{segment.instance}-20980101T000003Z.mem").mkdir()
-    for number in range(300):  # more than are looked at
+    for number in range(300):  # more than are searched
         os.link(strange, folder / f"{segment.instance}-20990101T{number:06}Z.mem")
     with Process(segment, tmp_path) as process:
         until(lambda: process.counts("frames") == 10, "the frames from the first on")
@@ -261,7 +259,7 @@ def test_what_others_put_into_its_folder_is_no_predecessor(segment: Segment, tmp
     assert numbers(own) + numbers(process.file) == list(range(1, 12))
 
 
-def test_a_file_that_is_another_users_by_the_time_it_is_opened(tmp_path: Path) -> None:
+def test_a_file_of_another_user_is_refused_when_it_is_opened(tmp_path: Path) -> None:
     file = tmp_path / "x.mem"
     file.write_bytes(MAGIC)
     Reader(file, own=True).close()
@@ -277,8 +275,8 @@ def test_a_file_that_is_another_users_by_the_time_it_is_opened(tmp_path: Path) -
             Reader(file, own=True)
 
 
-def test_without_room_it_says_so_and_goes_on_by_itself(segment: Segment, tmp_path: Path) -> None:
-    """The limit is that of a file's size, which anybody can set on a process of theirs."""
+def test_without_room_it_reports_that_and_continues_once_there_is_room(segment: Segment, tmp_path: Path) -> None:
+    """The limit is the file size, which any user can set for a process of theirs."""
     writer = segment.writer("cell")
     with Process(segment, tmp_path, buffer_mb=0.02) as process:
         publish(writer, 10)
@@ -321,10 +319,10 @@ os.fsync = broken
 
 
 @pytest.mark.parametrize("more", [5, 3 * RING])
-def test_after_a_failed_fsync_it_goes_on_in_a_new_file_from_what_the_disk_has(
+def test_after_a_failed_fsync_it_continues_in_a_new_file(
     segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: int
 ) -> None:
-    """The disk is the process's own fsync, which fails once."""
+    """The process's fsync stands for the disk; it fails once."""
     writer = segment.writer("cell")
     synced = tmp_path / "synced"
     with Process(segment, tmp_path, before=BROKEN_DISK.format(folder=str(tmp_path)), fsync_s=0.001) as process:
@@ -352,19 +350,19 @@ def test_after_a_failed_fsync_it_goes_on_in_a_new_file_from_what_the_disk_has(
         assert gap.reason is Reason.UNSURE
         assert (gap.what, gap.last) == ("frames", begin - 1)
         begin = gap.first
-    assert 10 < begin <= 22, "from where the disk had it for certain"
+    assert 10 < begin <= 22, "from the last position that fsync confirmed"
     assert (more > RING) == bool(gaps(new))
     assert main(["info", str(new)]) == 0
     assert f" of {old.name} may be lost: the disk failed at its fsync" in capsys.readouterr().out
 
 
-def test_until_there_is_a_new_file_the_status_says_that_an_fsync_failed(segment: Segment, tmp_path: Path) -> None:
+def test_a_failed_fsync_is_reported_until_a_new_file_is_started(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     with Process(segment, tmp_path, before=BROKEN_DISK.format(folder=str(tmp_path)), fsync_s=0.001) as process:
         publish(writer, 5)
         until(lambda: ready(process) and len(written(process)) == 5, "frames in the file")
         old = process.folder.rename(tmp_path / "moved") / process.file.name
-        process.folder.touch()  # no new file can be made in it
+        process.folder.touch()  # prevents a new file in it
         (tmp_path / "broken").touch()
         publish(writer, 1, first=5)
         until(lambda: "may be lost" in process.slot.report.note, "the doubt in the status")
@@ -396,7 +394,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", folder], check=True)
 
 
-def test_a_full_disk_is_named_and_its_end_is_seen(segment: Segment, tmp_path: Path, small_disk: Path) -> None:
+def test_a_full_disk_is_reported_until_there_is_room(segment: Segment, tmp_path: Path, small_disk: Path) -> None:
     ballast = small_disk / "ballast"
     writer = segment.writer("cell")
     with Process(segment, tmp_path, directory=str(small_disk / "dumps"), buffer_mb=0.02) as process:

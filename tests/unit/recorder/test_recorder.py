@@ -1,4 +1,4 @@
-"""What is recorded of what was published: all of it, in its order, or an exact gap."""
+"""Everything published is recorded in order, or is in an exact gap."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from shmio.segment import Event, EventKind, Frame, Provenance, Quality, Record, 
 from tests.unit.recorder.harness import OTHER, RING, gaps, numbers, publish, read, recorder, spec
 
 
-def test_frames_and_events_come_out_as_they_went_in(segment: Segment, tmp_path: Path) -> None:
+def test_frames_and_events_survive_a_round_trip(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     writer.publish(b"\0\1", cycle=1, source_ns=1_700_000_000 * 10**9, effective=b"\0\7", provenance=Provenance.INJECTED)
     writer.event(Record(EventKind.ACCEPTED, "grün", 4, 99, 3, 1, 12, 0, 2, b"ab"))
@@ -36,8 +36,8 @@ def test_frames_and_events_come_out_as_they_went_in(segment: Segment, tmp_path: 
     ]  # fmt: skip
 
 
-def test_frames_and_events_of_busy_sources_are_in_their_true_order(segment: Segment, tmp_path: Path) -> None:
-    """Threads publish while it records; within a block the order is the one that numbers and references give."""
+def test_frames_and_events_of_busy_sources_are_in_order(segment: Segment, tmp_path: Path) -> None:
+    """Threads publish while it records; numbers and references give the true order."""
     recording = recorder(segment, tmp_path)
     writers = [segment.writer(source) for source in ("cell", "press")]
 
@@ -67,7 +67,7 @@ def test_frames_and_events_of_busy_sources_are_in_their_true_order(segment: Segm
         assert event == count
 
 
-def test_a_recorder_slower_than_the_ring_tells_exactly_what_it_missed(segment: Segment, tmp_path: Path) -> None:
+def test_a_recorder_slower_than_the_ring_counts_missed_frames_exactly(segment: Segment, tmp_path: Path) -> None:
     recording = recorder(segment, tmp_path)
     writer = segment.writer("cell")
     publish(writer, 10)
@@ -85,7 +85,7 @@ def test_a_recorder_slower_than_the_ring_tells_exactly_what_it_missed(segment: S
     assert (gap.after_ns, gap.before_ns) == (times[10], times[gap.last + 1])
 
 
-def test_events_are_missed_exactly_too(segment: Segment, tmp_path: Path) -> None:
+def test_missed_events_are_counted_exactly(segment: Segment, tmp_path: Path) -> None:
     recording = recorder(segment, tmp_path)
     writer = segment.writer("press")
     recording.turn()
@@ -97,7 +97,7 @@ def test_events_are_missed_exactly_too(segment: Segment, tmp_path: Path) -> None
     assert numbers(recording.output.path, "press", Event) == [1, *range(gap.last + 1, 3002)]
 
 
-def test_from_outside_it_begins_with_the_present(segment: Segment, tmp_path: Path) -> None:
+def test_a_recorder_outside_the_instance_starts_with_the_current_frames(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     publish(writer, 10)
     recording = recorder(segment, tmp_path, start=StartPositions(first=False))
@@ -107,7 +107,7 @@ def test_from_outside_it_begins_with_the_present(segment: Segment, tmp_path: Pat
     assert gaps(recording.output.path) == []
 
 
-def test_only_the_sources_asked_for(segment: Segment, tmp_path: Path) -> None:
+def test_only_chosen_sources_are_recorded(segment: Segment, tmp_path: Path) -> None:
     recording = recorder(segment, tmp_path, selection=Selection(["press"]))
     for source in ("cell", "press"):
         publish(segment.writer(source), 2)
@@ -115,14 +115,12 @@ def test_only_the_sources_asked_for(segment: Segment, tmp_path: Path) -> None:
     assert {message.channel.source for message in read(recording.output.path)} == {"press"}
 
 
-def test_a_changed_layout_and_a_new_source_are_recorded_as_blocks_of_their_own(
-    segment: Segment, tmp_path: Path
-) -> None:
+def test_a_changed_layout_and_a_new_source_are_separate_blocks(segment: Segment, tmp_path: Path) -> None:
     recording = recorder(segment, tmp_path)
     publish(segment.writer("cell"), 3)
     recording.turn()
     old = segment.blocks["cell"]
-    publish_late = segment.writer("cell")  # what it publishes just before its end is recorded too
+    publish_late = segment.writer("cell")  # keeps the old block's writer, whose last frames are recorded too
     publish(publish_late, 2)
     segment.change(add=[spec("cell", OTHER), spec("robot")], retire=["cell", "press"])
     publish(segment.writer("cell"), 4)
@@ -137,12 +135,12 @@ def test_a_changed_layout_and_a_new_source_are_recorded_as_blocks_of_their_own(
                 assert reader.layout(channel) == layout
         blocks = {channel.block: channel.source for channel in reader.channels.values() if channel.source}
         layouts = [name for name in reader.attachments if name.startswith("layouts/")]
-    assert blocks == {1: "cell", 3: "cell", 4: "robot"}, "press published nothing"
+    assert blocks == {1: "cell", 3: "cell", 4: "robot"}, "press has no block, as it published nothing"
     assert found == {1: [1, 2, 3, 4, 5], 3: [1, 2, 3, 4], 4: [1]}
     assert len(layouts) == 2
 
 
-def test_a_block_that_came_and_went_between_two_looks_is_recorded(segment: Segment, tmp_path: Path) -> None:
+def test_a_block_added_and_removed_between_two_looks_is_recorded(segment: Segment, tmp_path: Path) -> None:
     recording = recorder(segment, tmp_path)
     publish(segment.writer("cell"), 3)
     with Segment.open(segment.instance, writable=True) as other:
@@ -157,7 +155,7 @@ def test_a_block_that_came_and_went_between_two_looks_is_recorded(segment: Segme
     assert list(found.values()) == [[1, 2, 3], [1, 2, 3, 4], [1, 2, 3, 4]]
 
 
-def test_from_outside_what_was_over_before_is_not_recorded(segment: Segment, tmp_path: Path) -> None:
+def test_a_recorder_outside_the_instance_skips_ended_blocks(segment: Segment, tmp_path: Path) -> None:
     publish(segment.writer("cell"), 3)
     segment.change(add=[spec("cell", OTHER)], retire=["cell"])
     recording = recorder(segment, tmp_path, start=StartPositions(first=False))
@@ -166,10 +164,10 @@ def test_from_outside_what_was_over_before_is_not_recorded(segment: Segment, tmp
     assert numbers(recording.output.path) == [1]
 
 
-def test_a_chunk_is_in_the_file_within_the_second(
+def test_a_frame_is_in_the_file_within_a_second(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the recorder's own clock, which stands still here but for what the test lets pass."""
+    """The recorder's clock advances only when the test moves it."""
     clock = SimpleNamespace(s=1000.0)
     monkeypatch.setattr(
         module,
@@ -221,13 +219,13 @@ def test_the_file_is_plain_mcap(segment: Segment, tmp_path: Path) -> None:
         assert metadata.metadata["epoch"] == f"{segment.header.epoch:016x}"
 
 
-def test_what_a_full_disk_costs_is_a_gap_and_it_goes_on(
+def test_frames_lost_to_a_full_disk_are_gaps_and_it_continues(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, fd = create(tmp_path, segment.instance)
     output = Output(path, fd, limit_bytes=2000)
     recording = Recorder(InstanceFollower(segment), output, by="test")
-    monkeypatch.setattr(module, "CHUNK_S", 0.0)  # a chunk each turn
+    monkeypatch.setattr(module, "CHUNK_S", 0.0)  # a chunk in each turn
     writer = segment.writer("cell")
 
     def turns(until: Callable[[], object]) -> None:
@@ -252,7 +250,7 @@ def test_what_a_full_disk_costs_is_a_gap_and_it_goes_on(
     assert sorted(numbers(path) + lost) == list(range(1, writer.block.ring.head() + 1))
 
 
-def test_a_removed_file_is_told(segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_removed_file_is_reported(segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CHECK_S", 0.0)
     recording = recorder(segment, tmp_path)
     recording.turn()

@@ -1,4 +1,4 @@
-"""Files that follow each other, and what becomes of old ones."""
+"""Rotation of files, and the retention of old ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DAY_S = 86_400
 
 
 def tend(work: RotatingRecorder) -> None:
-    """With no file before this one that waits for the disk."""
+    """Wait until the previous file is written, then rotate."""
     work.recorder._writer.flush()
     until(lambda: all(old.output.ended for old in work._ending), "the file before")
     work.tend()
@@ -45,7 +45,7 @@ def series(segment: Segment, folder: Path, **settings: Any) -> RotatingRecorder:
 
 
 def files(folder: Path) -> list[Path]:
-    """In the order in which they were begun."""
+    """Return the files in the order in which they were started."""
     found = []
     for file in folder.glob("*.mem"):
         with Reader(file) as reader:
@@ -54,7 +54,7 @@ def files(folder: Path) -> list[Path]:
     return [file for _, file in sorted(found)]
 
 
-def test_files_follow_each_other_without_a_frame_twice_or_missing(segment: Segment, tmp_path: Path) -> None:
+def test_rotation_neither_loses_nor_repeats_a_frame(segment: Segment, tmp_path: Path) -> None:
     work = series(segment, tmp_path, rotate_mb=0.004, rotate_min=0)
     writer = segment.writer("cell")
     for turn in range(60):
@@ -68,7 +68,7 @@ def test_files_follow_each_other_without_a_frame_twice_or_missing(segment: Segme
     assert [number for file in found for number in numbers(file)] == list(range(1, 601))
     assert [number for file in found for number in numbers(file, kind=Event)] == list(range(1, 62))
     assert [gap for file in found for gap in gaps(file)] == []
-    for before, file in pairwise(found[:-1]):  # the last one may have been begun for nothing
+    for before, file in pairwise(found[:-1]):  # the last file may be empty
         with Reader(before) as reader:
             assert check(reader).whole
             assert reader.records.footer()
@@ -80,8 +80,8 @@ def test_files_follow_each_other_without_a_frame_twice_or_missing(segment: Segme
             assert begin.after == (numbers(before)[-1] if begin.topic == "cell/frames" else begin.after)
 
 
-def test_a_gap_at_the_end_of_a_file_belongs_to_it(segment: Segment, tmp_path: Path) -> None:
-    """The writer died, say, and nothing later has shown what the ring lost."""
+def test_a_gap_at_the_end_of_a_file_is_in_that_file(segment: Segment, tmp_path: Path) -> None:
+    """For example, the writer died, and no later frame has shown what the ring lost."""
     work = series(segment, tmp_path, rotate_mb=0.001)
     publish(segment.writer("cell"), 100)
     work.turn()
@@ -99,7 +99,7 @@ def test_a_gap_at_the_end_of_a_file_belongs_to_it(segment: Segment, tmp_path: Pa
         assert reader.places[cell.block.section] == BlockPosition(110, 1, now_ns)
 
 
-def test_what_the_ring_lost_between_two_files_is_one_gap_in_the_second(segment: Segment, tmp_path: Path) -> None:
+def test_frames_lost_between_two_files_are_one_gap_in_the_second(segment: Segment, tmp_path: Path) -> None:
     work = series(segment, tmp_path, rotate_mb=0.001)
     writer = segment.writer("cell")
     publish(writer, 100)
@@ -115,12 +115,12 @@ def test_what_the_ring_lost_between_two_files_is_one_gap_in_the_second(segment: 
     assert (gap.first, numbers(second)) == (101, list(range(gap.last + 1, 3 * RING + 101)))
 
 
-def test_by_time(segment: Segment, tmp_path: Path) -> None:
+def test_rotation_by_time(segment: Segment, tmp_path: Path) -> None:
     with Process(segment, tmp_path, rotate_min=0.01) as process:
         writer = segment.writer("cell")
 
         def enough() -> bool:
-            if process.counts("frames") == writer.block.ring.head():  # a busy host must not have the ring run over
+            if process.counts("frames") == writer.block.ring.head():  # on a busy host the ring must not overflow
                 publish(writer, 1, first=writer.block.ring.head())
             return len(list(process.folder.glob("*.mem"))) >= 3
 
@@ -130,7 +130,7 @@ def test_by_time(segment: Segment, tmp_path: Path) -> None:
     assert [number for file in found for number in numbers(file)] == list(range(1, writer.block.ring.head() + 1))
 
 
-def test_a_step_at_the_seam_is_told_once(segment: Segment, tmp_path: Path) -> None:
+def test_a_step_at_a_rotation_is_recorded_once(segment: Segment, tmp_path: Path) -> None:
     coordinator = Coordinator(segment)
     work = series(segment, tmp_path, rotate_mb=0.0001)
     for _ in range(6):
@@ -145,7 +145,7 @@ def test_a_step_at_the_seam_is_told_once(segment: Segment, tmp_path: Path) -> No
     assert [mark.step for file in found for mark in marks(file)] == list(range(done - 5, done + 1))
 
 
-def test_while_the_disk_has_trouble_there_is_no_new_file(
+def test_no_new_file_is_started_while_the_disk_fails(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(output_module, "RETRY_S", 0.01)
@@ -169,7 +169,7 @@ def test_while_the_disk_has_trouble_there_is_no_new_file(
     assert len(files(tmp_path)) == 2
 
 
-def test_nothing_of_a_file_is_written_before_the_one_before_it_is_whole(tmp_path: Path) -> None:
+def test_a_file_is_written_only_after_the_previous_one(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ("one", "two")]
     outputs: list[Output] = []
     for path in paths:
@@ -188,10 +188,10 @@ def test_nothing_of_a_file_is_written_before_the_one_before_it_is_whole(tmp_path
     assert first.close(0)
 
 
-def test_a_file_whose_predecessor_could_not_be_written_stays_empty(
+def test_a_file_stays_empty_if_the_previous_one_could_not_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its frames would be in no file and in no gap, had the second one been written alone."""
+    """With the second file alone, the first one's frames would be in no file and in no gap."""
     monkeypatch.setattr(Output, "_put", lambda *_: False)
     outputs: list[Output] = []
     for name in ("one", "two"):
@@ -204,10 +204,10 @@ def test_a_file_whose_predecessor_could_not_be_written_stays_empty(
     assert (tmp_path / "two").read_bytes() == b""
 
 
-def test_a_series_does_not_write_on_where_the_file_before_was_not_written(
+def test_rotation_writes_no_file_after_one_that_could_not_be_written(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk is slow when the new file is begun, and then takes no more of the old one."""
+    """The disk is slow when the new file is started, and then accepts no more of the old one."""
     answered, put = threading.Event(), Output._put
     work = series(segment, tmp_path, rotate_mb=0.001)
     first = work.recorder.output
@@ -236,7 +236,7 @@ def test_a_series_does_not_write_on_where_the_file_before_was_not_written(
 
 
 def recorded(segment: Segment, folder: Path, age_days: float, by: str = "supervised") -> Path:
-    """A closed recording of this age."""
+    """Make a closed recording of this age."""
     work = RotatingRecorder(InstanceFollower(segment), Settings(directory=str(folder)), by, no_attachments)
     publish(segment.writer("cell"), 100)
     assert work.close() == []
@@ -247,34 +247,34 @@ def recorded(segment: Segment, folder: Path, age_days: float, by: str = "supervi
 
 
 def keep(segment: Segment, folder: Path, present: Path | None = None, **settings: Any) -> set[Path]:
-    """What is left after a look."""
+    """Clean up the folder; return the remaining files."""
     writing = {present} if present else set()
     keeper = Housekeeper(segment.instance, Settings(directory=str(folder), **settings), "supervised", lambda: writing)
     keeper.look()
     return set(folder.iterdir())
 
 
-def test_nothing_is_deleted_unless_told(segment: Segment, tmp_path: Path) -> None:
+def test_nothing_is_deleted_by_default(segment: Segment, tmp_path: Path) -> None:
     old = recorded(segment, tmp_path, 4000)
     assert keep(segment, tmp_path) == {old}
 
 
-def test_by_age(segment: Segment, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_retention_by_age(segment: Segment, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     old, young, present = (recorded(segment, tmp_path, days) for days in (8, 6, 9))
     assert keep(segment, tmp_path, present, keep_days=7) == {young, present}
     assert f"{old} is deleted: it is 8.0 days old, recorder.keep_days is 7" in caplog.text
 
 
-def test_by_size_the_oldest_first(segment: Segment, tmp_path: Path) -> None:
+def test_retention_by_size_deletes_the_oldest_first(segment: Segment, tmp_path: Path) -> None:
     files = [recorded(segment, tmp_path, days) for days in (1, 3, 2, 0)]
     size = sum(file.stat().st_size for file in files) - files[1].stat().st_size
     assert keep(segment, tmp_path, keep_mb=(size + 0.5) / 1e6) == {files[0], files[2], files[3]}
     assert keep(segment, tmp_path, files[3], keep_mb=1e-6) == {files[3]}
 
 
-def test_what_is_being_played_is_not_deleted(segment: Segment, tmp_path: Path) -> None:
-    """A source that plays it would find nothing when its process is started anew."""
+def test_a_file_that_is_being_played_is_not_deleted(segment: Segment, tmp_path: Path) -> None:
+    """A source that plays it would not find it after a restart."""
     old, older = recorded(segment, tmp_path, 8), recorded(segment, tmp_path, 9)
     with Recording([old]):
         assert keep(segment, tmp_path, keep_days=7) == {old}
@@ -282,7 +282,7 @@ def test_what_is_being_played_is_not_deleted(segment: Segment, tmp_path: Path) -
     assert keep(segment, tmp_path, keep_days=7) == set()
 
 
-def test_one_that_could_not_be_closed_while_it_was_held_is_closed_later(segment: Segment, tmp_path: Path) -> None:
+def test_a_file_that_was_in_use_is_closed_later(segment: Segment, tmp_path: Path) -> None:
     whole = recorded(segment, tmp_path, 0)
     killed = tmp_path / f"{segment.instance}-20200101T000000Z.mem"
     killed.write_bytes(whole.read_bytes()[:-100])
@@ -296,12 +296,12 @@ def test_one_that_could_not_be_closed_while_it_was_held_is_closed_later(segment:
         assert reader.records.footer() is not None
 
 
-def test_what_is_not_its_own_is_never_deleted(segment: Segment, tmp_path: Path) -> None:
+def test_files_that_are_not_the_recorders_are_never_deleted(segment: Segment, tmp_path: Path) -> None:
     name = segment.instance
     strange = {recorded(segment, tmp_path, 9, by="shmio-dump")}
     own = recorded(segment, tmp_path, 9)
     other = tmp_path / f"{name}-20200101T000000Z.mem"
-    other.write_bytes(own.read_bytes().replace(name.encode(), b"x" * len(name)))  # by its name alone
+    other.write_bytes(own.read_bytes().replace(name.encode(), b"x" * len(name)))  # only its name is the instance's
     link = tmp_path / f"{name}-20200101T000001Z.mem"
     link.symlink_to(other)
     nonsense = tmp_path / f"{name}-20200101T000002Z.mem"
@@ -323,7 +323,7 @@ def test_what_is_not_its_own_is_never_deleted(segment: Segment, tmp_path: Path) 
     assert keep(segment, tmp_path, keep_days=7, keep_mb=1e-6) == strange
 
 
-def test_what_cannot_be_deleted_is_told_once(
+def test_a_file_that_cannot_be_deleted_is_reported_once(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     old = recorded(segment, tmp_path, 9)
@@ -341,7 +341,7 @@ def test_what_cannot_be_deleted_is_told_once(
     assert not old.exists()
 
 
-def test_the_process_deletes_what_it_is_told_to(segment: Segment, tmp_path: Path) -> None:
+def test_the_process_deletes_by_its_configuration(segment: Segment, tmp_path: Path) -> None:
     old = recorded(segment, tmp_path / "dumps", 9)
     with Process(segment, tmp_path, keep_days=7) as process:
         until(lambda: not old.exists(), "the old one deleted")

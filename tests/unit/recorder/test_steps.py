@@ -1,4 +1,4 @@
-"""Virtual time in recordings: whole steps, however fast they come."""
+"""Virtual time in recordings: steps are recorded whole, however fast they come."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEPS = 3 * RING
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """One whose time is stepped, with a source that answers each step."""
+    """A segment with stepped time and a source that answers each step."""
     block = BlockSpec("sim", LAYOUT, 20 * MS, 60_000 * MS, 1 << 22, Attributes("simulation", stepped=True))
     processes = [ProcessSpec("sim", "source"), ProcessSpec("recorder", "recorder")]
     with Segment.create(instance, [block], processes, stepped=True) as segment:
@@ -54,12 +54,12 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 def cycles(file: Path) -> list[int]:
-    """Of the frames in a file."""
+    """Return the cycles of the frames in a file."""
     return [message.item.cycle for message in read(file) if isinstance(message.item, Frame)]
 
 
 def marks(file: Path) -> list[StepMark]:
-    """The ends of steps in a file."""
+    """Return the ends of steps in a file."""
     return [message.item for message in read(file) if isinstance(message.item, StepMark)]
 
 
@@ -68,7 +68,7 @@ def ready(process: Process) -> bool:
 
 
 def test_a_fast_run_is_recorded_whole(segment: Segment, tmp_path: Path) -> None:
-    """Its rings turn several times between two looks of a recorder that no step waits for."""
+    """Without waiting, the rings would wrap several times between two looks of the recorder."""
     with Process(segment, tmp_path) as process:
         until(lambda: ready(process), "it records")
         coordinator = Coordinator(segment)
@@ -83,7 +83,7 @@ def test_a_fast_run_is_recorded_whole(segment: Segment, tmp_path: Path) -> None:
     coordinator.close()
 
 
-def test_a_step_is_told_behind_all_its_frames(segment: Segment, tmp_path: Path) -> None:
+def test_a_steps_mark_follows_all_its_frames(segment: Segment, tmp_path: Path) -> None:
     recording = recorder(segment, tmp_path)
     coordinator = Coordinator(segment)
     for _ in range(3):
@@ -99,8 +99,8 @@ def test_a_step_is_told_behind_all_its_frames(segment: Segment, tmp_path: Path) 
     coordinator.close()
 
 
-def test_steps_that_nobody_waited_with_have_gaps_and_no_marks(segment: Segment, tmp_path: Path) -> None:
-    """As of a recorder from outside the instance, which looks when it looks."""
+def test_steps_that_did_not_wait_for_the_recorder_have_gaps_and_no_marks(segment: Segment, tmp_path: Path) -> None:
+    """A recorder outside the instance does not delay steps."""
     recording: Recorder = recorder(segment, tmp_path)
     coordinator = Coordinator(segment)
     for _ in range(STEPS):
@@ -114,9 +114,7 @@ def test_steps_that_nobody_waited_with_have_gaps_and_no_marks(segment: Segment, 
     coordinator.close()
 
 
-def test_time_goes_on_without_a_recorder_that_was_killed_and_its_successor_is_waited_for(
-    segment: Segment, tmp_path: Path
-) -> None:
+def test_steps_do_not_wait_for_a_killed_recorder_but_for_its_successor(segment: Segment, tmp_path: Path) -> None:
     coordinator = Coordinator(segment)
     with Process(segment, tmp_path) as first:
         until(lambda: ready(first), "it records")
@@ -154,11 +152,11 @@ def test_cat_prints_steps_unless_registers_are_chosen(
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", b'{"step": -1, "time_ns": 0, "dt_ns": 0}', b"[" * 5000])
-def test_what_is_no_step_is_refused(data: bytes) -> None:
+def test_invalid_steps_are_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"."):
         decode_step(data)
 
 
-def test_a_step_comes_out_as_it_went_in() -> None:
+def test_a_step_survives_a_round_trip() -> None:
     mark = StepMark(7, 140 * MS, 20 * MS)
     assert decode_step(encode_json(mark)) == mark

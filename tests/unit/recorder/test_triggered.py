@@ -1,4 +1,4 @@
-"""Recordings of what happens around a trigger."""
+"""Recordings of the time around a trigger."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ S = 1_000_000_000
 
 
 class Bench:
-    """A triggered recording of the cell, whose frames come a second apart: the tenth holds a 10, and so on."""
+    """A triggered recording of the cell.
+
+    It has one frame a second, and the tenth has the value 10.
+    """
 
     def __init__(
         self,
@@ -42,7 +45,10 @@ class Bench:
         buffer_mb: float = 16,
         **trigger: object,
     ) -> None:
-        """``begin_s``: when the frames are, on the host's clock since the instance's start."""
+        """Set it up.
+
+        ``begin_s``: time of the frames' start, in seconds after the instance's start.
+        """
         self.folder = folder
         self._begin_ns = segment.header.started_ns + begin_s * S
         self.writer: BlockWriter = segment.writer("cell", Stamp(self._begin_ns, begin_s * S))
@@ -65,11 +71,11 @@ class Bench:
         self.work.tend()
 
     def writes(self) -> bool:
-        """Whether it is at a file."""
+        """Return whether it is writing a file."""
         return self.work.file is not None
 
     def close(self) -> list[list[int]]:
-        """The numbers of the frames in each file."""
+        """Close it; return the numbers of the frames in each file."""
         assert self.work.close() == []
         found = files(self.folder)
         for file in found:
@@ -79,7 +85,7 @@ class Bench:
         return [numbers(file) for file in found]
 
 
-def test_a_file_holds_the_seconds_before_and_after(segment: Segment, tmp_path: Path) -> None:
+def test_a_file_has_the_seconds_before_and_after_the_trigger(segment: Segment, tmp_path: Path) -> None:
     bench = Bench(segment, tmp_path, when="cell/count = 20", before_s=5, after_s=3)
     bench.publish(19)
     assert (bench.work.file, list(tmp_path.iterdir())) == (None, [])
@@ -94,20 +100,20 @@ def test_a_file_holds_the_seconds_before_and_after(segment: Segment, tmp_path: P
         assert int(reader.about["triggered_ns"]) > 0
 
 
-def test_what_comes_in_one_turn_is_cut_exactly(segment: Segment, tmp_path: Path) -> None:
+def test_frames_of_one_turn_are_cut_exactly(segment: Segment, tmp_path: Path) -> None:
     bench = Bench(segment, tmp_path, when="cell/count = 20 or cell/count = 40", before_s=5, after_s=3)
     bench.publish(60)
     assert bench.close() == [list(range(15, 24)), list(range(35, 44))]
 
 
-def test_one_that_comes_meanwhile_prolongs_the_file(segment: Segment, tmp_path: Path) -> None:
+def test_another_trigger_prolongs_the_file(segment: Segment, tmp_path: Path) -> None:
     bench = Bench(segment, tmp_path, when="cell/count mod 20 < 3 and cell/count > 18", before_s=2, after_s=4)
     bench.publish(35)
     assert bench.close() == [list(range(18, 27))]
 
 
-def test_the_times_of_frames_need_not_be_the_hosts(instance: str, tmp_path: Path) -> None:
-    """A replay that stood, or plays slowly, is behind by as much."""
+def test_the_times_of_frames_may_differ_from_the_hosts_clock(instance: str, tmp_path: Path) -> None:
+    """The frames of a paused or slow replay lag behind the host's clock."""
     with Segment.create(instance, [spec("cell")], [], origin=Origin(3_600 * S, 0)) as segment:
         bench = Bench(segment, tmp_path, when="cell/count = 20", before_s=5, after_s=3, begin_s=0)
         for _ in range(40):
@@ -116,14 +122,14 @@ def test_the_times_of_frames_need_not_be_the_hosts(instance: str, tmp_path: Path
         segment.unlink()
 
 
-def test_it_may_be_of_a_source_that_is_not_recorded(segment: Segment, tmp_path: Path) -> None:
+def test_the_trigger_may_be_on_a_source_that_is_not_recorded(segment: Segment, tmp_path: Path) -> None:
     segment.change(add=[spec("press")], retire=[])
     bench = Bench(
         segment, tmp_path, when="press/count = 1 and cell/count = 20", before_s=5, after_s=3,
         selection=Selection(["cell"]),
     )  # fmt: skip
     press = segment.writer("press", Stamp(segment.header.started_ns + 100_000 * S, 100_000 * S))
-    for count in (10, 8, 12):  # what it publishes beside the 18 is within the file's time
+    for count in (10, 8, 12):  # press publishes the 18 within the file's time
         bench.publish(count)
         press.at_ns = bench.writer.at_ns
         publish(press, 1, first=1)
@@ -139,8 +145,8 @@ def test_two_files_do_not_overlap(segment: Segment, tmp_path: Path) -> None:
     assert bench.close() == [list(range(2, 13)), [13, 14, 15, 16]]
 
 
-def test_an_edge_and_a_bad_frame(segment: Segment, tmp_path: Path) -> None:
-    """A frame of bad quality is not known to be anything."""
+def test_a_rising_edge_and_a_bad_frame(segment: Segment, tmp_path: Path) -> None:
+    """A condition on a frame of bad quality is never true."""
     bench = Bench(segment, tmp_path, when="rising(cell/count >= 5) or cell/count = 9", before_s=0, after_s=0)
     bench.publish(8)
     bench.publish(1, quality=Quality.BAD)
@@ -148,32 +154,34 @@ def test_an_edge_and_a_bad_frame(segment: Segment, tmp_path: Path) -> None:
     assert bench.close() == [[5]]
 
 
-def test_events_stand_where_they_were_and_other_sources_are_recorded_too(segment: Segment, tmp_path: Path) -> None:
+def test_only_events_within_the_files_time_are_recorded(segment: Segment, tmp_path: Path) -> None:
     bench = Bench(segment, tmp_path, when="cell/count = 6", before_s=2, after_s=1)
     bench.publish(4)
     bench.writer.event(Record(EventKind.QUALITY, "within"))
     bench.publish(20)
     bench.close()
     [file] = files(tmp_path)
-    assert numbers(file, kind=Event) == [2], "the first one, of the start, was long before"
+    assert numbers(file, kind=Event) == [2], "the start event was before the file's time"
     assert numbers(file) == [4, 5, 6, 7]
 
 
-def test_memory_is_bounded(segment: Segment, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_memory_for_the_time_before_is_bounded(
+    segment: Segment, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     bench = Bench(segment, tmp_path, when="cell/count = 90", before_s=50, after_s=0, before_mb=802 * 10 / 1e6)
     bench.publish(91)
-    assert bench.close() == [list(range(80, 91))], "ten, and the one that fires"
+    assert bench.close() == [list(range(80, 91))], "ten frames, and the one that triggers"
     assert caplog.text.count("recorder.trigger.before_mb has no room for more") == 1
 
 
-def test_what_ran_over_before_is_no_gap_of_a_file(segment: Segment, tmp_path: Path) -> None:
+def test_frames_lost_before_the_files_time_are_not_a_gap(segment: Segment, tmp_path: Path) -> None:
     publish(segment.writer("cell"), 2 * RING)
     bench = Bench(segment, tmp_path, when="cell/count = 3", before_s=1, after_s=0)
     bench.publish(4)
     assert len(bench.close()) == 1
 
 
-def test_a_reload_that_takes_the_register_away_and_brings_it_back(segment: Segment, tmp_path: Path) -> None:
+def test_a_reload_removes_the_triggers_register_and_restores_it(segment: Segment, tmp_path: Path) -> None:
     bench = Bench(segment, tmp_path, when="cell/count = 7", before_s=0, after_s=0)
     segment.change(add=[spec("cell2")], retire=["cell"])
     bench.work.turn()
@@ -185,13 +193,13 @@ def test_a_reload_that_takes_the_register_away_and_brings_it_back(segment: Segme
     assert bench.work.close() == []
 
 
-def test_what_is_no_condition_is_refused(segment: Segment, tmp_path: Path) -> None:
+def test_an_invalid_condition_is_refused(segment: Segment, tmp_path: Path) -> None:
     for when in ("cell/nothing > 5", "cell/count >"):
         with pytest.raises(ConfigError, match="when: "):
             Bench(segment, tmp_path, when=when)
 
 
-def test_without_a_folder_it_says_so_and_goes_on_waiting(segment: Segment, tmp_path: Path) -> None:
+def test_without_a_folder_it_reports_that_and_keeps_waiting(segment: Segment, tmp_path: Path) -> None:
     folder = tmp_path / "file"
     folder.touch()
     bench = Bench(segment, folder, when="cell/count = 5 or cell/count = 7", before_s=9, after_s=0)
@@ -203,10 +211,10 @@ def test_without_a_folder_it_says_so_and_goes_on_waiting(segment: Segment, tmp_p
     assert bench.close() == [[1, 2, 3, 4, 5, 6, 7]]
 
 
-def test_while_the_disk_takes_nothing_no_more_waits_than_may(
+def test_the_waiting_data_are_bounded_while_the_disk_fails(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Each time has a file of its own; what waits for the disk is of all of them."""
+    """Each trigger starts a file; the data that wait for the disk are limited in total."""
     full = True
 
     def pwrite(fd: int, data: bytes, offset: int, write: Callable[[int, bytes, int], int] = os.pwrite) -> int:
@@ -228,7 +236,7 @@ def test_while_the_disk_takes_nothing_no_more_waits_than_may(
     assert bench.close()[-1] == [208, 209, 210]
 
 
-def test_the_process_says_what_it_waits_for_and_ends_by_itself(segment: Segment, tmp_path: Path) -> None:
+def test_the_process_reports_that_it_waits_and_closes_the_file_by_itself(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     trigger = {"when": "cell/count = 5", "before_s": 60, "after_s": 0.2}
     with Process(segment, tmp_path, trigger=trigger) as process:
@@ -241,7 +249,7 @@ def test_the_process_says_what_it_waits_for_and_ends_by_itself(segment: Segment,
     assert numbers(file) == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_recorder_that_was_killed_within_one_goes_on(segment: Segment, tmp_path: Path) -> None:
+def test_a_recorder_killed_during_a_triggered_file_continues_it(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     trigger = {"when": "cell/count = 5", "before_s": 60, "after_s": 60}
     with Process(segment, tmp_path, trigger=trigger) as first:
@@ -257,7 +265,7 @@ def test_a_recorder_that_was_killed_within_one_goes_on(segment: Segment, tmp_pat
     assert [number for file in files(first.folder) for number in numbers(file)] == list(range(1, 16))
 
 
-def test_from_outside(segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shmio_dump_record_with_a_trigger(segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record = ["record", "--instance", segment.instance, "-o", str(tmp_path), "--for", "0.01"]
     assert main([*record, "--when", "cell/count > 5"]) == 0
     assert f"to {tmp_path} whenever cell/count > 5" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Recordings whose every byte and time is the test's own, written as the recorder writes them."""
+"""Builds recordings with the recorder's own writer; the test sets every byte and time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LAYOUT = Layout(
 
 
 def image(count: int, speed: float = 0.0, *, on: bool = False) -> bytes:
-    """An image of LAYOUT."""
+    """Return an image of LAYOUT."""
     from shmio.layout.values.codec import codec
 
     data = bytearray(LAYOUT.size)
@@ -43,7 +43,7 @@ def image(count: int, speed: float = 0.0, *, on: bool = False) -> bytes:
 
 
 class Build:
-    """One file. Time is the cycle's."""
+    """Builds one file. A message's time follows from its cycle."""
 
     def __init__(self, file: Path, *, epoch: str = "00" * 8, first: int = 1) -> None:
         fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
@@ -66,7 +66,7 @@ class Build:
         self.blocks[source] = self.writer.open_block(cast("Block", block), number, self.first - 1, after_event)
 
     def frame(self, at: int, data: bytes, source: str = "cell", *, late_ns: int = 0, **other: Any) -> None:
-        """A frame, at its number's time or so much later."""
+        """Add a frame at its number's time, or ``late_ns`` later."""
         clock_ns = at * PERIOD_NS
         fields: dict[str, Any] = {
             "number": at,
@@ -86,7 +86,7 @@ class Build:
         self.writer.frame(self.blocks[source], Frame(**(fields | other)), START_NS + clock_ns + late_ns)
 
     def event(self, number: int, after: int, text: str = "", source: str = "cell", *, cycle: int | None = None) -> None:
-        """An event behind a frame, in the cycle of its number or another."""
+        """Add an event after a frame, with its number as cycle, or another cycle."""
         self.events[source] = number
         cycle = after if cycle is None else cycle
         clock_ns = cycle * PERIOD_NS
@@ -98,7 +98,7 @@ class Build:
         self.writer.event(self.blocks[source], event, utc_ns)
 
     def tell(self, record: Record, after: int = 1, source: str = "cell") -> None:
-        """Whatever happened, behind a frame."""
+        """Add an event of any kind after a frame."""
         self.events[source] += 1
         clock_ns = after * PERIOD_NS
         utc_ns = START_NS + clock_ns
@@ -110,7 +110,7 @@ class Build:
         self.writer.event(self.blocks[source], event, utc_ns)
 
     def gap(self, first: int, last: int, source: str = "cell", what: str = "frames") -> None:
-        """What was missed."""
+        """Add a gap."""
         number = list(self.blocks).index(source) + 1
         before_ns = START_NS + (last + 1) * PERIOD_NS
         after_ns = START_NS + (first - 1) * PERIOD_NS
@@ -118,11 +118,11 @@ class Build:
         self.writer.gap(gap, before_ns)
 
     def step(self, step: int) -> None:
-        """A step is done."""
+        """Add the end of a step."""
         self.writer.step(StepMark(step, step * PERIOD_NS, PERIOD_NS), START_NS + step * PERIOD_NS)
 
     def process(self, what: ProcessEvent, at: int) -> None:
-        """Something happened to the source's process."""
+        """Add a change of the source's process."""
         self.writer.process(ProcessChange("cell", "source", 4711, what, "", 0), START_NS + at * PERIOD_NS)
 
     def chunk(self) -> None:
@@ -133,7 +133,7 @@ class Build:
 
 @contextmanager
 def build(file: Path, **options: Any) -> Iterator[Build]:
-    """A file, closed in the end."""
+    """Build a file, and close it at the end."""
     work = Build(file, **options)
     try:
         yield work
@@ -143,7 +143,7 @@ def build(file: Path, **options: Any) -> Iterator[Build]:
 
 
 def plain(file: Path, first: int = 1, last: int = 100, chunk: int = 10) -> Path:
-    """Frames of one source that count, in chunks of so many."""
+    """Build a file with counting frames of one source, with this many in a chunk."""
     with build(file, first=first) as work:
         work.block("cell")
         for number in range(first, last + 1):
@@ -154,7 +154,7 @@ def plain(file: Path, first: int = 1, last: int = 100, chunk: int = 10) -> Path:
 
 
 def varied(file: Path, first: int = 1) -> Path:
-    """Two sources, gaps, events, steps, frames with reasons and injections, or of these the last ones."""
+    """Build a file with two sources and every kind of message; ``first``: begin later."""
     with build(file, first=first) as work:
         work.block("cell", after_event=(first - 1) // 15)
         work.block("press", section=2)

@@ -1,4 +1,4 @@
-"""Recordings are made as the recorder makes them."""
+"""Fixtures of the recorder's tests: recordings are made by the recorder."""
 
 from tests.unit.recorder.conftest import recording, segment
 

@@ -1,4 +1,4 @@
-"""Recordings whose bytes were changed: it is found, it is told where, and all the rest is read."""
+"""The check of recordings with changed bytes: it reports the damage, and the rest is read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def found_in(file: Path) -> Findings:
 
 
 def read_on(file: Path) -> tuple[list[Message], list[Damage]]:
-    """All messages that can be read, and where others are lost."""
+    """Return all messages that can be read, and the damage."""
     damage: list[Damage] = []
     with Reader(file) as reader:
         return list(reader.messages(damaged=damage.append)), damage
@@ -49,37 +49,37 @@ def by_chunk(file: Path) -> list[list[Message]]:
 
 @pytest.fixture
 def file(recording: bytes, tmp_path: Path) -> Path:
-    """A recording of several chunks with a gap, as it was written."""
+    """A recording of several chunks with a gap, undamaged."""
     path = tmp_path / "x.mem"
     path.write_bytes(recording)
     return path
 
 
-def test_what_was_written_is_whole(file: Path, recording: bytes) -> None:
+def test_an_unchanged_file_is_whole(file: Path, recording: bytes) -> None:
     found = found_in(file)
     assert found.whole, (found.damage, found.problems)
     assert found.chunks == len(records(file, Opcode.CHUNK)) > 4
     assert found.messages == len(read_on(file)[0])
     file.write_bytes(recording[: records(file, Opcode.CHUNK)[-1].start])
-    assert found_in(file).whole, "what a killed recorder leaves is not damaged"
+    assert found_in(file).whole, "a file without its end is not damaged"
 
 
 @any_change
 @given(data=st.data())
-def test_no_byte_changes_unseen(file: Path, recording: bytes, data: st.DataObject) -> None:
+def test_no_changed_byte_goes_unnoticed(file: Path, recording: bytes, data: st.DataObject) -> None:
     changed = bytearray(recording)
     changed[data.draw(st.integers(0, len(changed) - 1))] ^= data.draw(st.integers(1, 255))
     file.write_bytes(changed)
     try:
         with Reader(file) as reader:
             assert not check(reader).whole or not reader.records.closed
-    except RecordingError:  # no recording any more
+    except RecordingError:  # it is not a recording any more
         pass
 
 
 @any_change
 @given(data=st.data())
-def test_no_piece_is_taken_out_unseen(file: Path, recording: bytes, data: st.DataObject) -> None:
+def test_no_removed_piece_goes_unnoticed(file: Path, recording: bytes, data: st.DataObject) -> None:
     begin = data.draw(st.integers(0, len(recording) - 1))
     end = data.draw(st.integers(begin + 1, len(recording)))
     file.write_bytes(recording[:begin] + recording[end:])
@@ -90,7 +90,7 @@ def test_no_piece_is_taken_out_unseen(file: Path, recording: bytes, data: st.Dat
         pass
 
 
-def test_of_each_damaged_chunk_it_is_told_where_it_is_and_the_rest_is_read(file: Path, recording: bytes) -> None:
+def test_the_place_of_each_damaged_chunk_is_reported_and_the_rest_is_read(file: Path, recording: bytes) -> None:
     chunks, walk = by_chunk(file), records(file, Opcode.CHUNK)
     for turn, record in enumerate(walk):
         changed = bytearray(recording)
@@ -113,7 +113,7 @@ def test_of_each_damaged_chunk_it_is_told_where_it_is_and_the_rest_is_read(file:
 
 @pytest.mark.parametrize("opcode", [Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.METADATA])
 @pytest.mark.parametrize("size", [0, 1, 5000, 1 << 40])
-def test_a_wrong_length_costs_no_chunk_but_its_own(file: Path, recording: bytes, opcode: Opcode, size: int) -> None:
+def test_a_wrong_length_affects_only_its_own_chunk(file: Path, recording: bytes, opcode: Opcode, size: int) -> None:
     whole = by_chunk(file)
     chunks = records(file, Opcode.CHUNK)
     for record in records(file, opcode)[:3]:
@@ -131,8 +131,8 @@ def test_a_wrong_length_costs_no_chunk_but_its_own(file: Path, recording: bytes,
 
 
 @pytest.mark.parametrize("field", [0, 8])
-def test_times_of_a_chunk_that_are_not_its_messages_are_told(file: Path, recording: bytes, field: int) -> None:
-    """The start and the end that its header tells; no CRC of its own covers them."""
+def test_times_of_a_chunk_that_differ_from_its_messages_are_reported(file: Path, recording: bytes, field: int) -> None:
+    """The times in the chunk's header are not covered by a CRC."""
     chunk = records(file, Opcode.CHUNK)[1]
     changed = bytearray(recording)
     changed[chunk.at + field] ^= 1
@@ -142,18 +142,18 @@ def test_times_of_a_chunk_that_are_not_its_messages_are_told(file: Path, recordi
     assert found.damage == []
 
 
-def test_without_its_layout_a_block_is_checked_as_far_as_can_be(file: Path, recording: bytes) -> None:
+def test_a_block_without_its_layout_is_still_checked_for_missing_numbers(file: Path, recording: bytes) -> None:
     record = records(file, Opcode.ATTACHMENT)[-1]
     changed = bytearray(recording)
     changed[record.at + record.size - 9] ^= 1
     file.write_bytes(changed)
     found = found_in(file)
     assert f"the attachment at byte {record.at} is damaged" in found.damage[0].why
-    assert found.problems == [], "the numbers are all there"
+    assert found.problems == [], "no number is missing"
 
 
-def test_a_hole_over_the_end_of_a_chunk_is_one_damage(file: Path, recording: bytes) -> None:
-    """As a bad sector leaves it."""
+def test_a_hole_across_two_chunks_is_reported_once(file: Path, recording: bytes) -> None:
+    """A bad sector leaves such a file."""
     first, second = records(file, Opcode.CHUNK)[2:4]
     whole = by_chunk(file)
     changed = bytearray(recording)
@@ -165,10 +165,10 @@ def test_a_hole_over_the_end_of_a_chunk_is_one_damage(file: Path, recording: byt
     assert damage.last >= second.at + 59
 
 
-def test_only_what_is_lost_of_the_time_asked_for_is_told(file: Path, recording: bytes) -> None:
+def test_only_damage_within_the_requested_time_is_reported(file: Path, recording: bytes) -> None:
     chunks, record = by_chunk(file), records(file, Opcode.CHUNK)[2]
     changed = bytearray(recording)
-    changed[record.at - 5] ^= 1  # its length, which is seen wherever it is
+    changed[record.at - 5] ^= 1  # changes its length, which every reader notices
     file.write_bytes(changed)
     damage: list[Damage] = []
     times = {"early": (0, chunks[0][-1].log_ns), "late": (chunks[-1][0].log_ns, 1 << 63), "there": (0, 1 << 63)}
@@ -180,8 +180,8 @@ def test_only_what_is_lost_of_the_time_asked_for_is_told(file: Path, recording: 
     assert told == {"early": 0, "late": 0, "there": 1}
 
 
-def test_without_the_end_what_its_first_chunk_described_is_lost_and_told(file: Path, recording: bytes) -> None:
-    """The summary of a file that was closed describes its channels once more."""
+def test_without_a_summary_a_damaged_first_chunk_loses_its_channels(file: Path, recording: bytes) -> None:
+    """The summary of a closed file repeats the descriptions of its channels."""
     chunks, expected = records(file, Opcode.CHUNK), [message for some in by_chunk(file)[1:] for message in some]
     changed = bytearray(recording)
     changed[chunks[0].at + chunks[0].size - 1] ^= 1
@@ -195,7 +195,7 @@ def test_without_the_end_what_its_first_chunk_described_is_lost_and_told(file: P
     assert damage
 
 
-def test_pieces_that_look_like_chunks_are_not_searched_for_ever(file: Path, recording: bytes) -> None:
+def test_the_search_among_false_chunks_is_bounded(file: Path, recording: bytes) -> None:
     record = records(file, Opcode.CHUNK)[0]
     bad = bytearray(recording[record.start : record.at + record.size])
     bad[-1] ^= 1
@@ -210,10 +210,10 @@ def test_pieces_that_look_like_chunks_are_not_searched_for_ever(file: Path, reco
         assert "ends within a record" in reader.records.damage or reader.records.closed
 
 
-def test_numbers_that_nobody_accounts_for_are_told(
+def test_missing_numbers_outside_of_gaps_are_reported(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A recorder that lost frames without a word."""
+    """The recorder of this test loses frames without recording a gap."""
     work = recorder(segment, tmp_path)
     writer = segment.writer("cell")
     publish(writer, 5)
@@ -233,7 +233,7 @@ def _dropped(side: instance_follower._Stream[Frame]) -> list[instance_follower.B
     return []
 
 
-def test_what_is_no_recording_of_ours_is_refused(tmp_path: Path) -> None:
+def test_files_that_are_not_shmio_recordings_are_refused(tmp_path: Path) -> None:
     (tmp_path / "x.mem").write_bytes(MAGIC + struct.pack("<BQ", Opcode.HEADER, 8) + bytes(8))
     with pytest.raises(RecordingError, match="not a recording of shmio"):
         found_in(tmp_path / "x.mem")

@@ -1,4 +1,4 @@
-"""A dump as a program reads it."""
+"""Reading recordings by ``shmio.open_dump``."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from tests.unit.recording.build import PERIOD_NS, START_NS, build, image, plain,
 
 
 def at(number: int) -> int:
-    """Log time of a frame."""
+    """Return the log time of a frame."""
     return START_NS + number * PERIOD_NS
 
 
 def cut_off(file: Path, to: Path) -> Path:
-    """A copy without index and footer, and without the end of its last chunk."""
+    """Copy a file without its index, its footer and the end of its last chunk."""
     data = file.read_bytes()
     with Part(file, None) as part:
         [*_, (chunk, _, _)] = part.found.chunks.between(0, at(10**6))
@@ -65,7 +65,7 @@ def test_a_seek_reads_one_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
         monkeypatch.setattr(records, "read", read)
         assert next(dump.frames("cell", at(1234))).item.number == 1234
-        assert len(reads) <= 3  # a chunk, its times, and the layout
+        assert len(reads) <= 3  # a chunk, its times and the layout
         reads.clear()
         latest = dump.latest("cell", at(777) + 5)
         assert latest is not None
@@ -73,7 +73,7 @@ def test_a_seek_reads_one_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         assert len(reads) <= 2
 
 
-def test_everything_of_a_source_in_recorded_order(tmp_path: Path) -> None:
+def test_items_of_a_source_come_in_recorded_order(tmp_path: Path) -> None:
     with shmio.open_dump(varied(tmp_path / "a.mem")) as dump:
         entries = list(dump.items("cell"))
         assert {e.block.source for e in entries if e.block} == {"cell"}
@@ -92,10 +92,10 @@ def test_everything_of_a_source_in_recorded_order(tmp_path: Path) -> None:
         assert len(list(dump.items())) == len(entries) + 60
         later = list(dump.items("cell", at(34)))
         assert later == entries[-len(later) :]
-        assert later[0].item == gap  # it has the time of what follows
+        assert later[0].item == gap  # a gap has the time of the next message
 
 
-def test_what_stood_at_a_time(tmp_path: Path) -> None:
+def test_latest_returns_the_frame_at_a_time(tmp_path: Path) -> None:
     with shmio.open_dump(varied(tmp_path / "a.mem")) as dump:
         for time_ns, number in ((at(33) + 1, 30), (at(12), 12), (at(10**4), 60)):
             latest = dump.latest("cell", time_ns)
@@ -133,7 +133,7 @@ def test_the_next_change_and_the_next_event(tmp_path: Path) -> None:
         assert dump.next_event("cell", at(70)) is None
 
 
-def test_columns_have_what_frames_have(tmp_path: Path) -> None:
+def test_columns_have_the_same_values_as_frames(tmp_path: Path) -> None:
     with shmio.open_dump(varied(tmp_path / "a.mem")) as dump:
         columns = dump.columns(["cell/*"], at(5), at(50))
         frames = list(dump.frames("cell", at(5), at(50)))
@@ -162,7 +162,7 @@ def test_columns_have_what_frames_have(tmp_path: Path) -> None:
         (["cell/x*"], "no register of this recording"),
     ],
 )
-def test_what_is_no_register(tmp_path: Path, paths: list[str], message: str) -> None:
+def test_invalid_registers_are_refused(tmp_path: Path, paths: list[str], message: str) -> None:
     with shmio.open_dump(varied(tmp_path / "a.mem")) as dump, pytest.raises(PathError, match=message):
         dump.columns(paths)
 
@@ -175,8 +175,8 @@ def test_a_source_must_be_named_and_known(tmp_path: Path) -> None:
             next(dump.items(["cell", "pres"]))
 
 
-def test_files_of_one_run_are_one_dump(tmp_path: Path) -> None:
-    """Whatever their order; what two have comes once; what none has is a gap."""
+def test_files_of_one_run_form_one_dump(tmp_path: Path) -> None:
+    """In any order; frames that two files have come once; frames that no file has are a gap."""
     files = [
         plain(tmp_path / "c.mem", 71, 100),
         plain(tmp_path / "a.mem", 1, 40),
@@ -200,7 +200,7 @@ def test_files_of_one_run_are_one_dump(tmp_path: Path) -> None:
         assert [e.item.number for e in dump.frames(None, at(55), at(72))] == [55, 56, 57, 58, 59, 60, 71, 72]
 
 
-def test_files_that_run_beside_each_other_are_read_in_the_order_of_time(tmp_path: Path) -> None:
+def test_overlapping_files_are_read_in_the_order_of_time(tmp_path: Path) -> None:
     one = plain(tmp_path / "a.mem", 1, 200)
     with build(tmp_path / "b.mem") as work:
         work.block("press", section=2)
@@ -212,7 +212,7 @@ def test_files_that_run_beside_each_other_are_read_in_the_order_of_time(tmp_path
         assert times == sorted(times)
 
 
-def test_what_one_of_two_recorders_missed_columns_have_from_the_other(tmp_path: Path) -> None:
+def test_columns_fill_the_gaps_of_one_recorder_from_another(tmp_path: Path) -> None:
     with build(tmp_path / "a.mem") as work:
         work.block("cell")
         for number in (*range(1, 150), *range(250, 401)):
@@ -225,7 +225,7 @@ def test_what_one_of_two_recorders_missed_columns_have_from_the_other(tmp_path: 
         assert dump.columns("cell/count", at(5), at(8), raw=True)["count"].tolist() == [5, 6, 7, 8]
 
 
-def test_files_that_ran_beside_each_other_for_a_moment_only(tmp_path: Path) -> None:
+def test_files_that_overlap_only_briefly(tmp_path: Path) -> None:
     with build(tmp_path / "a.mem") as work:
         work.block("cell")
         for number in (*range(1, 20), *range(30, 41)):
@@ -236,7 +236,7 @@ def test_files_that_ran_beside_each_other_for_a_moment_only(tmp_path: Path) -> N
         assert not [entry for entry in dump.items() if isinstance(entry.item, Gap)]
 
 
-def test_files_of_two_runs_are_not_one_dump(tmp_path: Path) -> None:
+def test_files_of_different_runs_are_refused(tmp_path: Path) -> None:
     with build(tmp_path / "b.mem", epoch="11" * 8) as work:
         work.block("cell")
         work.frame(1, image(1))
@@ -246,7 +246,7 @@ def test_files_of_two_runs_are_not_one_dump(tmp_path: Path) -> None:
         shmio.open_dump([])
 
 
-def test_a_layout_that_changed(tmp_path: Path) -> None:
+def test_a_changed_layout(tmp_path: Path) -> None:
     other = Layout("DB1", 1, 4, False, (Register("count", "DINT", (), 0, None, 4, 1),))
     with build(tmp_path / "a.mem") as work:
         work.block("cell")
@@ -264,7 +264,7 @@ def test_a_layout_that_changed(tmp_path: Path) -> None:
         assert dump.columns("speed")["speed"].tolist() == [0.0] * 10
 
 
-def test_damage_is_told_and_the_rest_is_read(tmp_path: Path) -> None:
+def test_damage_is_reported_and_the_rest_is_read(tmp_path: Path) -> None:
     file = plain(tmp_path / "a.mem", last=100)
     data = bytearray(file.read_bytes())
     with Part(file, None) as part:
@@ -286,7 +286,7 @@ def test_damage_is_told_and_the_rest_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("back", [3, 20, 60, 200, 400])
-def test_an_index_that_is_damaged_is_done_without(tmp_path: Path, back: int) -> None:
+def test_a_damaged_index_is_not_used(tmp_path: Path, back: int) -> None:
     file = plain(tmp_path / "a.mem", last=100)
     data = bytearray(file.read_bytes())
     data[-back] ^= 0xFF
@@ -296,8 +296,8 @@ def test_an_index_that_is_damaged_is_done_without(tmp_path: Path, back: int) -> 
         assert [e.item.number for e in dump.frames("cell", at(31), at(33))] == [31, 32, 33]
 
 
-def test_the_latest_of_files_that_run_beside_each_other(tmp_path: Path) -> None:
-    """The one that began later may have ended before."""
+def test_latest_in_overlapping_files(tmp_path: Path) -> None:
+    """The file that was started later may have ended earlier."""
     with shmio.open_dump([plain(tmp_path / "a.mem", 1, 400), plain(tmp_path / "b.mem", 100, 200)]) as dump:
         for number in (50, 150, 200, 300, 400):
             latest = dump.latest("cell", at(number))
@@ -324,10 +324,10 @@ KINDS: list[dict[str, Any]] = [
     ),
     chunk=st.integers(1, 200),
 )
-def test_whatever_the_order_of_messages_columns_have_what_frames_have(
+def test_batches_equal_frames_for_any_order_of_messages(
     tmp_path: Path, runs: list[tuple[list[tuple[int, int]], int]], chunk: int
 ) -> None:
-    """Of patterns that repeat, and then others: what is alike is taken at once."""
+    """Frames of equal patterns are read in one batch, so patterns repeat and then change."""
     sources = ["cell", "press", "saw"]
     numbers = dict.fromkeys(sources, 0)
     with build(tmp_path / "a.mem") as work:
@@ -354,7 +354,7 @@ def test_whatever_the_order_of_messages_columns_have_what_frames_have(
             assert len(frames) == numbers[source]
 
 
-def test_tables_of_other_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arrow_tables_and_missing_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with shmio.open_dump(varied(tmp_path / "a.mem")) as dump:
         columns = dump.columns("cell")
     table = columns.to_arrow()
@@ -380,7 +380,7 @@ def test_tables_of_other_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_pandas_and_polars(tmp_path: Path) -> None:
-    import pandas  # slow to import
+    import pandas  # slow import
     import polars
 
     with shmio.open_dump(varied(tmp_path / "a.mem")) as dump:

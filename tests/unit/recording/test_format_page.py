@@ -1,4 +1,4 @@
-"""What docs/reference/dump-format.md shows is run as shown."""
+"""The programs in docs/reference/dump-format.md run as shown."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def content(segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def images(program: str, content: bytes) -> list[bytes]:
-    """Run a program of the page; the images that it comes to."""
+    """Run a program of the page; return the images that it prints."""
     [name] = NAME.findall(program)
     Path(name).write_bytes(content)
     found: list[bytes] = []
@@ -45,12 +45,12 @@ def images(program: str, content: bytes) -> list[bytes]:
 ALL = [cycle.to_bytes(2, "big") for cycle in range(10)] + [LAST]
 
 
-def test_the_program_that_reads_without_shmio(content: bytes) -> None:
+def test_the_program_that_reads_a_closed_file(content: bytes) -> None:
     program, _ = SNIPPET.findall(PAGE.read_text())
     assert images(program, content) == ALL
 
 
-def test_the_program_that_reads_what_was_not_closed(content: bytes) -> None:
+def test_the_program_that_reads_a_file_that_was_not_closed(content: bytes) -> None:
     _, program = SNIPPET.findall(PAGE.read_text())
     assert images(program, content) == ALL
     end = content.rindex(b"cell/frames")

@@ -1,4 +1,4 @@
-"""Recordings of this format that must be read like this for ever: tests/golden/dump."""
+"""The golden recordings in tests/golden/dump: later versions must read them in the same way."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ CODECS: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes]]] = {
 
 
 def described(file: Path) -> dict[str, Any]:
-    """All of a file, as JSON has it; bytes in hexadecimal digits."""
+    """Return a file's whole content as JSON, with bytes in hexadecimal."""
 
     def plain(value: Any) -> Any:
         return value.hex() if isinstance(value, bytes) else str(value)
@@ -81,12 +81,12 @@ def described(file: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_all_of_it_is_read_as_it_was_written(name: str) -> None:
+def test_the_whole_content_is_read_as_written(name: str) -> None:
     assert described(GOLDEN / name) == json.loads((GOLDEN / name).with_suffix(".json").read_text())
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_every_message_is_written_as_it_is_there(name: str) -> None:
+def test_every_message_is_encoded_to_the_same_bytes(name: str) -> None:
     kinds = set()
     with Reader(GOLDEN / name) as reader:
         for record in reader.records.walk():
@@ -96,11 +96,11 @@ def test_every_message_is_written_as_it_is_there(name: str) -> None:
                     assert encode(decode(bytes(data))) == data
                     kinds.add(channel.encoding)
         assert check(reader).whole
-    assert kinds == CODECS.keys() - ({STEP} if name == "killed.mem" else set()), "steps are in the last chunk alone"
+    assert kinds == CODECS.keys() - ({STEP} if name == "killed.mem" else set()), "only the last chunk has steps"
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_dump_of_it_has_the_same(name: str) -> None:
+def test_open_dump_reads_the_same_content(name: str) -> None:
     expected = json.loads((GOLDEN / name).with_suffix(".json").read_text())["messages"]
     with shmio.open_dump(GOLDEN / name) as dump:
         entries = list(dump.items())
@@ -110,8 +110,8 @@ def test_a_dump_of_it_has_the_same(name: str) -> None:
         assert [entry.item.count for entry in entries if isinstance(entry.item, Gap)] == [3]
 
 
-def test_frames_of_the_second_version_are_the_same() -> None:
-    """One by one, as objects, and as arrays."""
+def test_frames_of_the_second_version_are_equal() -> None:
+    """As messages, as frames, and as batches."""
     expected = json.loads((GOLDEN / "closed.json").read_text())
     found = described(GOLDEN / DIFFERENCES)
     for part in ("closed", "layouts", "messages"):
@@ -125,8 +125,8 @@ def test_frames_of_the_second_version_are_the_same() -> None:
             assert check(reader).whole
 
 
-def test_the_second_version_is_written_as_it_is_there() -> None:
-    """By what any reader of MCAP finds, whose messages of the first version are made into the second."""
+def test_frames_of_the_second_version_are_encoded_to_the_same_bytes() -> None:
+    """The mcap library reads both files; frames of the first version are converted."""
     messages: list[list[tuple[Any, ...]]] = []
     for name in ("closed.mem", DIFFERENCES):
         with (GOLDEN / name).open("rb") as stream:
@@ -145,7 +145,7 @@ def test_the_second_version_is_written_as_it_is_there() -> None:
     assert frames > 10
 
 
-def test_any_reader_of_mcap_reads_them() -> None:
+def test_the_mcap_library_reads_them() -> None:
     counts = []
     for name in FILES:
         count = 0

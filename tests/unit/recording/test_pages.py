@@ -1,4 +1,4 @@
-"""What pages of the manual show of reading recordings is run as shown."""
+"""The programs for recordings in the manual run as shown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""New recordings, made by a program; the commands' own tests are in tests/unit/cli/test_dump_rewriting.py."""
+"""New recordings made by a program; tests/unit/cli/test_dump_rewriting.py tests the commands."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shmio.recording.rewriting import part, rewrite
 from tests.unit.recording.build import PERIOD_NS, START_NS, varied
 
 
-def test_a_program_copies_some_registers_of_a_part_and_sees_the_progress(tmp_path: Path) -> None:
+def test_a_program_copies_chosen_registers_and_times_with_progress(tmp_path: Path) -> None:
     done: list[int] = []
     new = tmp_path / "part.mem"
     low, high = START_NS + 16 * PERIOD_NS, START_NS + 40 * PERIOD_NS

@@ -1,4 +1,4 @@
-"""Recordings of a part: chosen sources, chosen registers."""
+"""Recordings of chosen sources and registers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ IMAGE = bytes.fromhex("11223344ff550102")
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """Two sources of this layout."""
+    """A segment with two sources of this layout."""
     blocks = [BlockSpec(name, LAYOUT, 20_000_000, 60_000_000_000, 1 << 20) for name in ("cell", "press")]
     processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
     with Segment.create(instance, blocks, processes) as segment:
@@ -62,7 +62,7 @@ def recorded(segment: Segment, folder: Path, *registers: str, sources: list[str]
         (["cell"], IMAGE.hex(), ["speed", "doors/left", "doors/right", "list"]),
     ],
 )
-def test_what_is_not_chosen_is_zero_and_not_in_the_layout(
+def test_registers_that_are_not_chosen_are_zero_and_not_in_the_layout(
     segment: Segment, tmp_path: Path, registers: list[str], kept: str, paths: list[str]
 ) -> None:
     file = recorded(segment, tmp_path, *registers)
@@ -87,12 +87,14 @@ def test_sources_without_a_chosen_register_are_not_recorded(segment: Segment, tm
     assert (numbers(file), numbers(file, "press")) == ([], [1, 2])
 
 
-def test_sources_and_registers_both_limit(segment: Segment, tmp_path: Path) -> None:
+def test_sources_and_registers_limit_together(segment: Segment, tmp_path: Path) -> None:
     file = recorded(segment, tmp_path, "press/speed", "cell/list", sources=["cell"])
     assert (numbers(file), numbers(file, "press")) == ([1, 2], [])
 
 
-def test_from_outside(segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shmio_dump_record_with_chosen_registers(
+    segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     record = ["record", "--instance", segment.instance, "-o", str(tmp_path), "--for", "0.01"]
     assert main([*record, "--register", "cell/speed", "cell/nothing"]) == 1
     assert "cell/nothing: no register has such a path" in capsys.readouterr().err

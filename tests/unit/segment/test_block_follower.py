@@ -1,4 +1,4 @@
-"""Following a block: frames in order, what was missed, and changes of quality."""
+"""Following a block: frames in order, missed frames, and changes of quality."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def writer(segment: Segment) -> BlockWriter:
 def publish(
     writer: BlockWriter, quality: Quality = Quality.GOOD, reason: str = "", *, old: bool = False, count: int = 1
 ) -> None:
-    """Publish frames; ``old`` ones are stale already."""
+    """Publish frames; with ``old``, they are already stale."""
     now_ns = time.monotonic_ns()
     at = Stamp(now_ns - 2 * STALE_NS, now_ns) if old else None
     for _ in range(count):
@@ -86,7 +86,7 @@ def test_a_frame_that_becomes_stale_is_reported_once(segment: Segment, writer: B
     follower = FrameFollower(segment.blocks["cell"])
     assert not follower.became_stale()
     publish(writer, old=True)
-    assert take(follower, aged=False) is QualityChange.RECOVERED  # as when the reader is behind
+    assert take(follower, aged=False) is QualityChange.RECOVERED  # the reader is behind
     seen = [(follower.stale, follower.became_stale(), follower.stale) for _ in range(2)]
     assert seen == [(False, True, True), (True, False, True)]
     assert follower.reason.startswith("stale: ")
@@ -100,7 +100,7 @@ def test_a_frame_that_becomes_stale_is_reported_once(segment: Segment, writer: B
 
 
 @pytest.mark.parametrize("noticed", [True, False])
-def test_a_gap_that_nobody_saw_is_reported_on_request(segment: Segment, writer: BlockWriter, noticed: bool) -> None:
+def test_a_gap_between_two_frames_is_reported_on_request(segment: Segment, writer: BlockWriter, noticed: bool) -> None:
     follower = FrameFollower(segment.blocks["cell"], notice_gaps=noticed)
     publish(writer, old=True)
     take(follower, aged=False)
@@ -111,7 +111,7 @@ def test_a_gap_that_nobody_saw_is_reported_on_request(segment: Segment, writer: 
     publish(writer, old=True)
     take(follower, aged=False)
     publish(writer, count=2)
-    follower.resume(after=follower.last + 1)  # the skipped frame may have come in time
+    follower.resume(after=follower.last + 1)  # as if the skipped frame had come in time
     assert take(follower) is QualityChange.NONE
 
 
@@ -133,7 +133,7 @@ def test_too_far_behind_it_skips_to_the_newest_frame_and_counts_the_others(
     assert (newest.number, patient.behind, patient.missed) == (22, 0, 0)
 
 
-def test_a_cursor_has_ended_when_all_of_a_retired_block_is_read(segment: Segment, writer: BlockWriter) -> None:
+def test_a_cursor_ends_when_a_retired_block_is_read_to_its_end(segment: Segment, writer: BlockWriter) -> None:
     retired = False
     cursor: Cursor[int] = Cursor(segment.blocks["cell"].ring, lambda fields: fields[0], 0, lambda: retired)
     publish(writer, count=2)

@@ -22,7 +22,7 @@ INDEX = LAYOUT.by_path
 
 
 def bits_of(register: Register, frame: bytes) -> object:
-    """The register's data alone, independently of the scan: element by element."""
+    """Return the register's own bytes or bits, element by element, without the scan."""
     if register.type == "BOOL":
         return codec(register).decode(frame)
     element = register.element
@@ -38,7 +38,7 @@ frames = st.binary(min_size=LAYOUT.size, max_size=LAYOUT.size)
 
 
 @given(frames, st.lists(st.tuples(st.integers(0, LAYOUT.size - 1), st.integers(0, 255)), max_size=5))
-def test_agrees_with_a_comparison_of_each_register(old: bytes, changes: list[tuple[int, int]]) -> None:
+def test_the_scan_equals_a_comparison_of_each_register(old: bytes, changes: list[tuple[int, int]]) -> None:
     new = bytearray(old)
     for position, value in changes:
         new[position] = value
@@ -50,7 +50,7 @@ def test_agrees_with_a_comparison_of_each_register(old: bytes, changes: list[tup
 
 
 @pytest.mark.parametrize("bit", range(LAYOUT.size * 8))
-def test_every_single_bit(bit: int) -> None:
+def test_a_change_of_each_single_bit_is_found(bit: int) -> None:
     old = bytes(LAYOUT.size)
     new = bytearray(old)
     new[bit // 8] |= 1 << bit % 8
@@ -60,7 +60,7 @@ def test_every_single_bit(bit: int) -> None:
 
 
 @pytest.mark.parametrize(("low", "high"), [(0, 3), (2, 5), (0, 7), (3, 8), (5, 19), (8, 19), (16, 19), (19, 19)])
-def test_of_a_slice_of_a_row_of_bits_its_own_bits_alone(low: int, high: int) -> None:
+def test_a_slice_of_bits_changes_only_with_its_own_bits(low: int, high: int) -> None:
     layout = compile_sources([Source("x.toml", b'[registers]\nrow = "ARRAY[0..19] OF BOOL"')]).layouts[0]
     part = find(layout, f"row/{low}..{high}")
     for bit in range(layout.size * 8):
@@ -81,7 +81,7 @@ def test_bytes_are_compared_not_values() -> None:
     assert scan.changed(frame(0.0), frame(-0.0)) == [INDEX["real"]]
 
 
-def test_everything_nothing_and_the_wrong_size() -> None:
+def test_all_changed_none_changed_and_a_wrong_size() -> None:
     old, new = bytes(LAYOUT.size), b"\xff" * LAYOUT.size
     assert ChangeScan(LAYOUT.registers).changed(old, new) == list(range(len(LAYOUT.registers)))
     assert ChangeScan([]).changed(old, new) == []
@@ -93,7 +93,7 @@ def test_everything_nothing_and_the_wrong_size() -> None:
 
 @pytest.mark.parametrize("size", [200, 65_536, 65_600, 200_000])
 def test_a_change_is_found_wherever_it_is(size: int) -> None:
-    """Images are compared in pieces first; a register may lie across several."""
+    """The scan compares images in pieces first; a register may span several pieces."""
     each = 100
     registers = [
         Register(f"r{at}", "BYTE", ((1, each),), at, None, each, each) for at in range(0, size - each + 1, each)

@@ -1,4 +1,4 @@
-"""The clock page, as its owner writes and others read it."""
+"""The clock page: its owner writes it, other processes read it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def segment(instance: str) -> Iterator[Segment]:
         segment.unlink()
 
 
-def test_a_new_instance_lives_in_wall_time(segment: Segment) -> None:
+def test_a_new_instance_has_wall_time(segment: Segment) -> None:
     before_ns = time.monotonic_ns() - segment.header.started_ns
     state = segment.clock.read()
     after_ns = time.monotonic_ns() - segment.header.started_ns
@@ -44,7 +44,7 @@ def test_a_new_instance_lives_in_wall_time(segment: Segment) -> None:
     assert state.time_ns == state.present_ns
 
 
-def test_time_stands_at_zero_in_one_that_is_stepped_from_the_start(instance: str) -> None:
+def test_an_instance_stepped_from_the_start_has_time_zero(instance: str) -> None:
     with Segment.create(instance, [], [], stepped=True) as segment:
         state = segment.clock.read()
         assert (str(state.mode), state.time_ns, state.step) == ("virtual", 0, 0)
@@ -52,38 +52,38 @@ def test_time_stands_at_zero_in_one_that_is_stepped_from_the_start(instance: str
         segment.unlink()
 
 
-def test_who_opens_the_segment_reads_what_was_written(segment: Segment, instance: str) -> None:
+def test_another_process_reads_the_written_state(segment: Segment, instance: str) -> None:
     assert segment.shared.try_lock(time_lock(segment.header))
     segment.clock.write(STATE)
     with Segment.open(instance) as reader:
         assert reader.clock.read() == segment.clock.read() == STATE
 
 
-def test_nobody_plays_time_when_its_owner_is_gone(segment: Segment, instance: str) -> None:
+def test_time_does_not_play_after_its_owner_has_ended(segment: Segment, instance: str) -> None:
     with Segment.open(instance, writable=True) as owner:
         assert owner.shared.try_lock(time_lock(segment.header))
         owner.clock.write(STATE)
         assert segment.clock.read() == STATE
     assert segment.clock.read() == STATE._replace(playing=False)
-    assert segment.clock.last_written() == STATE, "a successor knows that it was"
+    assert segment.clock.last_written() == STATE, "the last state stays readable for a successor"
 
 
-def test_it_is_told_whether_time_was_stepped_from_the_start(segment: Segment, instance: str) -> None:
+def test_the_page_says_whether_time_was_stepped_from_the_start(segment: Segment, instance: str) -> None:
     segment.clock.write(STATE)
-    assert not segment.clock.stepped, "it was taken over"
+    assert not segment.clock.stepped, "time was taken over later"
     with Segment.create(f"{instance}-stepped", [], [], stepped=True) as other:
         assert other.clock.stepped
         other.unlink()
 
 
-def test_the_present_is_before_the_step_that_is_under_way(segment: Segment) -> None:
+def test_now_is_before_the_step_in_progress(segment: Segment) -> None:
     segment.clock.write(STATE)
     assert segment.clock.now_ns() == segment.header.started_ns + 4_980_000_000
     segment.clock.write(STATE._replace(stepping=False))
     assert segment.clock.now_ns() == segment.header.started_ns + 5_000_000_000
 
 
-def test_released_time_goes_on_from_where_it_stood_for_all_who_read(segment: Segment, instance: str) -> None:
+def test_released_time_continues_from_its_last_value_for_all_readers(segment: Segment, instance: str) -> None:
     segment.clock.write(STATE)
     real = Clock(step=12, done=11, resumed_ns=5_000_000_000, offset_ns=-7_000_000_000)
     segment.clock.write(real)
@@ -98,7 +98,7 @@ def test_released_time_goes_on_from_where_it_stood_for_all_who_read(segment: Seg
 
 
 @pytest.mark.parametrize("copy", [64, 320])
-def test_a_writer_that_died_half_way_hides_nothing(segment: Segment, copy: int) -> None:
+def test_the_last_state_is_readable_after_a_writer_died_half_way(segment: Segment, copy: int) -> None:
     segment.clock.write(STATE)
     (entry,) = [
         entry
@@ -113,7 +113,7 @@ def test_a_writer_that_died_half_way_hides_nothing(segment: Segment, copy: int) 
     assert segment.clock.read().step == 13
 
 
-def test_a_rate_that_is_none_is_one(segment: Segment) -> None:
+def test_an_invalid_rate_is_read_as_one(segment: Segment) -> None:
     segment.clock.write(STATE._replace(rate=float("nan")))
     assert segment.clock.read().rate == 1.0
 
@@ -123,7 +123,7 @@ def test_a_long_note_is_cut(segment: Segment) -> None:
     assert segment.clock.read().note == "ä" * 83
 
 
-def test_every_change_rings_the_bell_and_no_other(segment: Segment, instance: str) -> None:
+def test_every_change_rings_the_clocks_doorbell_only(segment: Segment, instance: str) -> None:
     with Segment.open(instance) as reader:
         bell, own = reader.clock.bell, reader.clock.slot_bell(0)
         seen, seen_own = bell.value(), own.value()
@@ -137,7 +137,7 @@ def test_every_change_rings_the_bell_and_no_other(segment: Segment, instance: st
         assert own.value() != seen_own
 
 
-def test_deliveries_are_told_by_slot(segment: Segment, instance: str) -> None:
+def test_deliveries_are_counted_by_slot(segment: Segment, instance: str) -> None:
     with Segment.open(instance) as reader:
         assert reader.clock.delivered(1) is None
         seen = reader.clock.delivered_bell.value()
@@ -147,10 +147,10 @@ def test_deliveries_are_told_by_slot(segment: Segment, instance: str) -> None:
         assert (reader.clock.delivered(0), reader.clock.delivered(1)) == (None, 12)
         assert reader.clock.delivered_bell.value() != seen
         segment.clock.abstain(1)
-        assert reader.clock.delivered(1) is None, "no step waits for it"
+        assert reader.clock.delivered(1) is None, "steps do not wait for this slot"
 
 
-def test_ages_are_taken_against_the_clock_that_a_block_lives_on(segment: Segment) -> None:
+def test_the_age_of_a_frame_uses_the_clock_of_its_block(segment: Segment) -> None:
     sim, cell = segment.writer("sim"), segment.writer("cell")
     hour_ns = 3_600_000_000_000
     segment.clock.write(STATE._replace(time_ns=hour_ns, stepping=False))
@@ -163,7 +163,7 @@ def test_ages_are_taken_against_the_clock_that_a_block_lives_on(segment: Segment
         frames[name] = frame
     assert frames["sim"].publish_ns == segment.header.started_ns + hour_ns
     assert frames["sim"].clock_ns == hour_ns
-    assert frames["cell"].clock_ns < hour_ns, "a device's frames keep real time"
+    assert frames["cell"].clock_ns < hour_ns, "a device's frames have real time"
     assert frames["sim"].age_ns(segment.blocks["sim"].now_ns()) == 0
     segment.clock.write(STATE._replace(time_ns=hour_ns + 600_000_000, stepping=False))
     block = segment.blocks["sim"]
@@ -191,6 +191,6 @@ def test_a_segment_without_a_clock_page_is_refused(segment: Segment, instance: s
 def test_a_wait_returns_the_value_of_the_doorbell(segment: Segment) -> None:
     bell = segment.clock.bell
     before = bell.value()
-    assert bell.wait(before, 1) == before  # nobody rings within a nanosecond
+    assert bell.wait(before, 1) == before  # no ring within a nanosecond
     bell.ring()
     assert bell.wait(before) == bell.value() != before

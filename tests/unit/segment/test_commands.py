@@ -1,4 +1,4 @@
-"""Commands in their queues: whole or not at all, in order, never a wait, and nothing hostile gets through."""
+"""Command queues: commands are complete and in order, and hostile records are refused."""
 
 from __future__ import annotations
 
@@ -40,15 +40,13 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 @given(writes_strategy, st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), st.integers(-(2**63), 2**63 - 1))
-def test_a_command_comes_out_as_it_went_in(
-    writes: list[Write], number: int, incarnation: int, deadline_ns: int
-) -> None:
+def test_a_command_survives_a_round_trip(writes: list[Write], number: int, incarnation: int, deadline_ns: int) -> None:
     command = Command(3, number, incarnation, deadline_ns, tuple(writes))
     assert Command.unpack(3, command.pack()) == command
 
 
 @given(st.binary(max_size=200))
-def test_what_is_no_command_is_refused(record: bytes) -> None:
+def test_invalid_commands_are_refused(record: bytes) -> None:
     try:
         command = Command.unpack(0, record)
     except ValueError:
@@ -57,8 +55,8 @@ def test_what_is_no_command_is_refused(record: bytes) -> None:
 
 
 @given(st.lists(st.one_of(st.binary(max_size=120), st.none()), max_size=60))
-def test_a_queue_gives_back_what_it_took_in_order(actions: list[bytes | None]) -> None:
-    """Bytes: push. None: pop. Against a list, in a queue so small that it wraps and fills."""
+def test_a_queue_returns_its_records_in_order(actions: list[bytes | None]) -> None:
+    """Bytes are pushed, None pops; a list is the model. The small queue wraps and fills."""
     capacity = 256
     memory = bytearray(QUEUE_HEADER_SIZE + capacity)
     expected: list[bytes] = []
@@ -86,12 +84,12 @@ def test_a_broken_queue_is_emptied_and_then_works(head: int, tail: int, data: by
             assert queue_pop(memory, 0, 256) is None
             break
     else:
-        raise AssertionError("it never ends")
+        raise AssertionError("the queue is never empty")
     assert queue_push(memory, 0, 256, b"next")
     assert queue_pop(memory, 0, 256) == b"next"
 
 
-def test_each_writer_has_a_queue_and_all_ring_one_bell(segment: Segment) -> None:
+def test_each_writer_has_a_queue_and_all_share_one_doorbell(segment: Segment) -> None:
     queues = segment.blocks["cell"].commands
     seen = queues.bell()
     assert queues.push(0, b"zero")
@@ -102,7 +100,7 @@ def test_each_writer_has_a_queue_and_all_ring_one_bell(segment: Segment) -> None
         queues.push(8, b"")
 
 
-def test_a_full_queue_is_an_error_to_the_sender(segment: Segment) -> None:
+def test_a_full_queue_is_an_error_for_the_sender(segment: Segment) -> None:
     sender = CommandSender(segment.blocks["cell"], 2)
     write = Write(0, 0, bytes(4000))
     for _ in range(capacity_for(2) // 4096):
@@ -126,7 +124,7 @@ def test_a_command_names_the_process_it_is_for(segment: Segment) -> None:
 
 
 @pytest.mark.parametrize("geometry", [(0, 0, 0, 0), (8, 128, 100, 0), (8, 64, 128, 0), (2000, 256, 128, 0)])
-def test_a_section_that_contradicts_itself_is_refused(geometry: tuple[int, ...]) -> None:
+def test_a_contradictory_section_is_refused(geometry: tuple[int, ...]) -> None:
     memory = bytearray(4096)
     for place, word in enumerate(geometry):
         memory[4 * place : 4 * place + 4] = word.to_bytes(4, "little")

@@ -1,4 +1,4 @@
-"""What tells an event loop that a bell in shared memory rings."""
+"""The relay that wakes an event loop when a doorbell in shared memory rings."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def segment(instance: str) -> Iterator[Segment]:
         segment.unlink()
 
 
-class Ear:
-    """Listens as an event loop does."""
+class WaitingLoop:
+    """Waits for the relay's descriptor, as an event loop does."""
 
     def __init__(self, relay: Relay) -> None:
         self._relay = relay
@@ -35,38 +35,38 @@ class Ear:
         self._poll.register(relay.descriptor, select.POLLIN)
 
     def told(self, timeout_ms: int = GIVE_UP_MS) -> bool:
-        """Wait to be told, and heed it."""
+        """Wait for a wake-up and acknowledge it."""
         told = bool(self._poll.poll(timeout_ms))
         if told:
             self._relay.heard()
         return told
 
 
-def test_it_tells_at_first_and_of_each_ring(segment: Segment) -> None:
+def test_the_relay_wakes_the_loop_at_first_and_at_each_ring(segment: Segment) -> None:
     relay = Relay(segment.clock.bell, "relay", LONG_NS)
-    ear = Ear(relay)
+    loop = WaitingLoop(relay)
     for _ in range(100):
-        assert ear.told()
+        assert loop.told()
         segment.clock.bell.ring()
-    assert ear.told()
+    assert loop.told()
     relay.stop()
     relay.join()
 
 
 def test_no_ring_is_lost_however_busy_the_loop_is(segment: Segment, instance: str) -> None:
-    """Whoever looks when he is told has seen, in the end, the last frame."""
+    """A reader that looks at each wake-up has seen the last frame in the end."""
     writer = segment.writer("cell")
-    with Segment.open(instance) as reader:  # a mapping that cannot be written
+    with Segment.open(instance) as reader:  # a read-only mapping
         block = reader.blocks["cell"]
         relay = Relay(block.ring, "relay", LONG_NS)
-        ear, last = Ear(relay), 20_000
+        loop, last = WaitingLoop(relay), 20_000
         publishing = threading.Thread(
             target=lambda: [writer.publish(bytes(4), cycle=number) for number in range(1, last + 1)]
         )
         publishing.start()
         seen = told = 0
         while seen < last:
-            assert ear.told()
+            assert loop.told()
             told += 1
             seen = block.ring.head()
         publishing.join()
@@ -74,20 +74,20 @@ def test_no_ring_is_lost_however_busy_the_loop_is(segment: Segment, instance: st
         relay.join()
 
 
-def test_it_tells_now_and_then_without_a_ring(segment: Segment) -> None:
+def test_the_relay_wakes_the_loop_periodically_without_a_ring(segment: Segment) -> None:
     relay = Relay(segment.clock.bell, "relay", 1_000_000)
-    ear = Ear(relay)
-    assert [ear.told() for _ in range(3)] == [True] * 3
+    loop = WaitingLoop(relay)
+    assert [loop.told() for _ in range(3)] == [True] * 3
     relay.stop()
     relay.join()
 
 
 @pytest.mark.parametrize("rings", [0, 1, 2])
-def test_one_that_is_stopped_ends_with_its_descriptor_whatever_it_waits_for(segment: Segment, rings: int) -> None:
-    """Without a ring for the bell; with one that nobody has heard for the next; with two for the loop."""
+def test_a_stopped_relay_ends_and_closes_its_descriptor(segment: Segment, rings: int) -> None:
+    """It waits for a ring, for the acknowledgement of one, or for the loop after two."""
     relay = Relay(segment.clock.bell, "relay", 50_000_000)
-    ear = Ear(relay)
-    assert ear.told()
+    loop = WaitingLoop(relay)
+    assert loop.told()
     for _ in range(rings):
         segment.clock.bell.ring()
         assert select.select([relay.descriptor], [], [], GIVE_UP_MS / 1000)[0]
@@ -98,7 +98,7 @@ def test_one_that_is_stopped_ends_with_its_descriptor_whatever_it_waits_for(segm
         os.fstat(relay.descriptor)
 
 
-def test_one_that_is_stopped_before_it_runs_or_heard_after_that_does_not_run(segment: Segment) -> None:
+def test_a_relay_stopped_before_it_runs_does_not_run(segment: Segment) -> None:
     shared = bytearray(_atomics.RELAY_SIZE)
     descriptor = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
     _atomics.relay_stop(shared)
@@ -108,8 +108,8 @@ def test_one_that_is_stopped_before_it_runs_or_heard_after_that_does_not_run(seg
     os.close(descriptor)
 
 
-def test_whoever_waits_for_the_end_stops_it_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thread that is just about to wait does not notice that it is woken."""
+def test_join_repeats_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that is just about to wait does not notice the first stop."""
     stops = threading.Semaphore(0)
 
     class JustAboutToWait:
@@ -124,11 +124,11 @@ def test_whoever_waits_for_the_end_stops_it_again(monkeypatch: pytest.MonkeyPatc
     assert not relay.alive
 
 
-def test_what_is_told_after_the_stop_is_not_heard(segment: Segment) -> None:
-    """The descriptor's number may be that of another file by then."""
+def test_after_the_stop_the_descriptor_is_not_read(segment: Segment) -> None:
+    """The descriptor's number may belong to another file by then."""
     relay = Relay(segment.clock.bell, "relay", LONG_NS)
-    ear = Ear(relay)
-    assert ear.told()
+    loop = WaitingLoop(relay)
+    assert loop.told()
     relay.stop()
     relay.join()
     reading, writing = os.pipe()

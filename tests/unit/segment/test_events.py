@@ -1,4 +1,4 @@
-"""Events and frames of a block are one order."""
+"""Events and frames of a block form one order."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def writer(instance: str) -> Iterator[BlockWriter]:
         segment.unlink()
 
 
-def test_a_writer_begins_with_an_event_of_its_own(writer: BlockWriter) -> None:
+def test_a_writer_begins_with_a_started_event(writer: BlockWriter) -> None:
     first = writer.block.events.read(1)
     assert first is not None
     assert (first.kind, first.text, first.incarnation, first.frame) == (EventKind.STARTED, f"pid {os.getpid()}", 1, 0)
 
 
-def test_an_event_comes_out_as_it_went_in(writer: BlockWriter) -> None:
+def test_an_event_survives_a_round_trip(writer: BlockWriter) -> None:
     writer.publish(b"\0\1", cycle=6)
     writer.cycle = 7
     data = bytes(range(200))
@@ -47,8 +47,8 @@ def test_an_event_comes_out_as_it_went_in(writer: BlockWriter) -> None:
     assert event.publish_ns - event.clock_ns == frame.publish_ns - frame.clock_ns
 
 
-def test_frames_and_events_name_each_other(writer: BlockWriter) -> None:
-    """Two threads write; a reader merges by the numbers alone and finds one order."""
+def test_frames_and_events_refer_to_each_other(writer: BlockWriter) -> None:
+    """Two threads write; a reader finds one order by merging frames and events by their numbers."""
 
     def events() -> None:
         for item in range(300):
@@ -71,7 +71,7 @@ def test_frames_and_events_name_each_other(writer: BlockWriter) -> None:
         assert after is None or after.frame >= frame.number
 
 
-def test_an_event_wakes_who_waits_for_frames(writer: BlockWriter) -> None:
+def test_an_event_wakes_readers_that_wait_for_frames(writer: BlockWriter) -> None:
     ring = writer.block.ring
     seen = ring.doorbell()
     writer.event(Record(EventKind.QUALITY, "cable out"), quality=Quality.BAD)
@@ -87,7 +87,7 @@ def test_a_reader_that_was_too_slow_knows_how_many_it_missed(writer: BlockWriter
     assert items == list(range(cursor.missed, EVENT_SLOTS + 500))
 
 
-def test_most_data_of_one_event(writer: BlockWriter) -> None:
+def test_the_largest_data_of_one_event(writer: BlockWriter) -> None:
     number = writer.event(Record(EventKind.ACCEPTED, data=b"\xff" * EVENT_DATA_SIZE, size=EVENT_DATA_SIZE))
     event = writer.block.events.read(number)
     assert event is not None
@@ -95,14 +95,14 @@ def test_most_data_of_one_event(writer: BlockWriter) -> None:
 
 
 @given(st.binary(min_size=EVENT_SIZE, max_size=EVENT_SIZE), st.integers(0, 255))
-def test_any_bytes_are_some_event(raw: bytes, quality: int) -> None:
-    """The bytes are another process's; a wrong one must not lead outside."""
+def test_any_bytes_decode_to_a_valid_event(raw: bytes, quality: int) -> None:
+    """The bytes come from another process; invalid ones must not cause a read out of bounds."""
     event = decode_event((5, 1, 2, 3, 4, 1, quality, 0, 9, 0, "", raw, None))
     assert len(event.data) <= EVENT_DATA_SIZE
     assert event.quality in Quality
 
 
-def test_kinds_have_the_numbers_of_the_documentation() -> None:
+def test_kinds_have_the_documented_numbers() -> None:
     page = (Path(__file__).parents[3] / "docs" / "reference" / "dump-format.md").read_text()
     found = re.search(r"\| kind \| (1 started.*) \|", page)
     assert found is not None

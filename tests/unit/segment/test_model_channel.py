@@ -1,4 +1,4 @@
-"""The link of a block whose model is elsewhere: two processes at its ends, here two mappings of one segment."""
+"""The channel between a block and its remote model, with two mappings of one segment."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ def ask(step: int, doubt: str = "") -> ModelRequest:
     return ModelRequest(0, step, step * 1000, 1000, 77, doubt, struct.pack(">f8x", step), bytes(12))
 
 
-def test_only_a_block_with_outputs_has_one(segment: Segment) -> None:
+def test_only_a_block_with_outputs_has_a_channel(segment: Segment) -> None:
     assert segment.blocks["panel"].model_channel is None
     assert link_of(segment).frame_size == LAYOUT.size
     assert link_of(segment).model() is None
 
 
-def test_what_is_asked_is_answered(segment: Segment) -> None:
+def test_requests_are_matched_with_their_answers(segment: Segment) -> None:
     with Segment.open(segment.instance, writable=True) as other:
         source, model = link_of(segment), link_of(other)
         source.asked.begin()
@@ -82,7 +82,7 @@ def test_what_is_asked_is_answered(segment: Segment) -> None:
         assert answer is not None
         assert (answer.image, answer.failure) == (b"\1" * 12, None)
         again = source.ask(ask(5), 123)
-        assert source.answer_to(again) is None, "the same step, and another ask"
+        assert source.answer_to(again) is None, "the same step, but another request"
         model.answer(found, 456, b"\2" * 12)
         assert source.answer_to(again) is None, "a late answer"
         model.answer(found._replace(number=again), 456, b"\3" * 12, "ä" * 200)
@@ -91,7 +91,7 @@ def test_what_is_asked_is_answered(segment: Segment) -> None:
         assert answer.failure == "ä" * 128
 
 
-def test_one_model_at_a_time_and_each_is_told_from_the_one_before(segment: Segment) -> None:
+def test_one_model_at_a_time_can_join_and_each_has_its_number(segment: Segment) -> None:
     with (
         Segment.open(segment.instance, writable=True) as first,
         Segment.open(segment.instance, writable=True) as second,
@@ -102,13 +102,13 @@ def test_one_model_at_a_time_and_each_is_told_from_the_one_before(segment: Segme
         assert source.model() == ConnectedModel(1, os.getpid(), "one")
         seen = source.answered.doorbell()
         link_of(first).leave()
-        assert source.answered.doorbell() != seen, "a source that waits looks"
+        assert source.answered.doorbell() != seen, "a waiting source is woken"
         assert source.model() is None
         assert link_of(second).join("ä" * 200)
         assert source.model() == ConnectedModel(2, os.getpid(), "ä" * 51)
 
 
-def test_a_model_has_computed_once_a_step_of_it_was_done_even_by_one_that_has_left(segment: Segment) -> None:
+def test_computed_is_true_after_the_first_answered_step_of_any_model(segment: Segment) -> None:
     source = link_of(segment)
     source.asked.begin()
     with Segment.open(segment.instance, writable=True) as other:
@@ -119,13 +119,13 @@ def test_a_model_has_computed_once_a_step_of_it_was_done_even_by_one_that_has_le
         assert not source.computed()
         model.answer(found, 456, b"\1" * 12)
         assert source.computed()
-        assert source.model() == ConnectedModel(1, os.getpid(), "belt"), "nothing else has changed"
+        assert source.model() == ConnectedModel(1, os.getpid(), "belt"), "the model is the same"
         model.leave()
         assert model.join("belt")
         assert source.computed()
 
 
-def test_a_killed_process_has_left(segment: Segment) -> None:
+def test_a_killed_model_has_left(segment: Segment) -> None:
     command = [sys.executable, "-c", HOLD, segment.instance]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as holder:
         try:
@@ -138,7 +138,7 @@ def test_a_killed_process_has_left(segment: Segment) -> None:
         assert link_of(segment).model() is None
 
 
-def test_inputs_and_outputs_are_those_that_the_patterns_say() -> None:
+def test_patterns_choose_inputs_and_outputs() -> None:
     ends = model_ports(LAYOUT, ["axis"], ["lamps"])
     assert [register.path for register in ends.inputs] == ["target", "lamps"]
     assert [register.path for register in ends.outputs] == ["axis/position", "axis/moving", "axis/ready", "lamps"]
@@ -154,14 +154,14 @@ def test_inputs_and_outputs_are_those_that_the_patterns_say() -> None:
         (["axis"], ["axis/moving"], "inouts: axis/moving is in outputs, too"),
     ],
 )
-def test_patterns_that_name_nothing_are_refused(outputs: list[str], inouts: list[str], message: str) -> None:
+def test_patterns_that_match_nothing_are_refused(outputs: list[str], inouts: list[str], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         model_ports(LAYOUT, outputs, inouts)
     assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize("size", [0, 1 << 40, 2**64 - 1])
-def test_one_that_contradicts_itself_is_refused(segment: Segment, size: int) -> None:
+def test_a_contradictory_channel_is_refused(segment: Segment, size: int) -> None:
     entries = read_sections(segment.memory, segment.header, table_state(segment.memory)[1], "")
     (entry,) = [entry for entry in entries if entry.kind == SectionKind.LINK]
     segment.memory[entry.offset : entry.offset + 8] = struct.pack("<Q", size)

@@ -1,4 +1,4 @@
-"""Where a playhead is: computed by everybody alike, forward and backward."""
+"""The position of a playhead: every reader computes the same one, forward and backward."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ positions = st.integers(100 * S, 110 * S)
 
 
 @given(speeds, positions)
-def test_what_is_due_is_reached_and_was_not_before(speed: float, position_ns: int) -> None:
+def test_a_position_is_reached_when_due_and_not_earlier(speed: float, position_ns: int) -> None:
     play = PLAY._replace(speed=speed)
     due_ns = play.due_ns(position_ns)
     assert play.reach_ns(due_ns) >= position_ns
@@ -28,7 +28,7 @@ def test_what_is_due_is_reached_and_was_not_before(speed: float, position_ns: in
 
 
 @given(speeds, st.integers(0, 3600 * S), st.booleans(), st.booleans())
-def test_to_settle_changes_no_position(speed: float, after_ns: int, loop: bool, paused: bool) -> None:
+def test_settling_changes_no_position(speed: float, after_ns: int, loop: bool, paused: bool) -> None:
     play = PLAY._replace(speed=speed, loop=loop, paused=paused)
     clock_ns = play.anchor_ns + after_ns
     settled = play.settled(clock_ns)
@@ -37,19 +37,19 @@ def test_to_settle_changes_no_position(speed: float, after_ns: int, loop: bool, 
     assert play.begin_ns <= settled.at_ns(clock_ns) <= play.end_ns
 
 
-def test_it_ends_or_begins_anew_or_pauses() -> None:
+def test_it_ends_loops_or_pauses() -> None:
     assert PLAY.at_ns(8 * S) == 103 * S
     assert PLAY.at_ns(99 * S) == 110 * S
     assert PLAY.settled(99 * S).paused
     assert PLAY._replace(loop=True).at_ns(18 * S) == 103 * S
     assert PLAY._replace(loop=True, until_ns=104 * S).settled(18 * S).position_ns == 104 * S
     assert PLAY._replace(paused=True).at_ns(99 * S) == 100 * S
-    assert PLAY.at_ns(0) == 100 * S, "before it begins"
+    assert PLAY.at_ns(0) == 100 * S, "before the start"
 
 
 @given(st.binary(max_size=2560), st.integers(0, 2559))
-def test_what_makes_no_sense_is_no_playhead(data: bytes, at: int) -> None:
-    """Whatever lies there: it is read, is none, or is refused."""
+def test_any_bytes_are_a_valid_playhead_none_or_refused(data: bytes, at: int) -> None:
+    """Any bytes are read as a playhead, as none, or refused."""
     memory = bytearray(2560)
     memory[at : at + len(data)] = data[: 2560 - at]
     from shmio.segment.playhead import Playhead
@@ -63,7 +63,7 @@ def test_what_makes_no_sense_is_no_playhead(data: bytes, at: int) -> None:
     head.asks(0)
 
 
-def test_a_request_and_its_answer_pass(instance: str) -> None:
+def test_a_request_and_its_answer(instance: str) -> None:
     spec = BlockSpec("cell", LAYOUT, 20_000_000, S, 1 << 20, Attributes("replay", stepped=True, replay=True))
     with Segment.create(instance, [spec], []) as segment:
         head = segment.blocks["cell"].playhead
@@ -84,7 +84,7 @@ def test_a_request_and_its_answer_pass(instance: str) -> None:
         segment.unlink()
 
 
-def test_no_other_block_has_one(instance: str) -> None:
+def test_a_block_without_replay_has_no_playhead(instance: str) -> None:
     with Segment.create(instance, [BlockSpec("cell", LAYOUT, 20_000_000, S, 1 << 20)], []) as segment:
         assert segment.blocks["cell"].playhead is None
         segment.unlink()

@@ -1,4 +1,4 @@
-"""The ring and the cells, through the extension's own door."""
+"""The ring and the cells, by the extension's Python functions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_an_empty_ring_has_no_frame() -> None:
     assert (ring.slot_count, ring.frame_size, ring.period_ns, ring.stale_ns) == (8, 20, 20_000_000, 500_000_000)
 
 
-def test_a_frame_comes_out_as_it_went_in() -> None:
+def test_a_frame_survives_a_round_trip() -> None:
     memory = ring_memory()
     ring = Ring(memory, 0, len(memory))
     assert ring.begin() == 1
@@ -57,7 +57,7 @@ def test_a_frame_comes_out_as_it_went_in() -> None:
     assert ring.read(1) == ring.latest()
 
 
-def test_effective_is_there_only_when_it_was_given() -> None:
+def test_the_effective_image_exists_only_if_given() -> None:
     memory = ring_memory()
     ring = Ring(memory, 0, len(memory))
     ring.begin()
@@ -82,7 +82,7 @@ def test_an_overwritten_frame_is_gone() -> None:
     assert ring.read(11) is None
 
 
-def test_a_slot_that_a_dead_writer_left_half_written_is_never_read_and_is_written_anew() -> None:
+def test_a_half_written_slot_is_never_read_and_is_reused() -> None:
     memory = ring_memory()
     ring = Ring(memory, 0, len(memory))
     ring.begin()
@@ -116,7 +116,7 @@ def test_publishing_needs_a_writer_a_writable_buffer_and_the_right_size() -> Non
     assert ring.head() == 0
 
 
-def test_a_reason_is_cut_at_its_room() -> None:
+def test_a_long_reason_is_cut() -> None:
     memory = ring_memory()
     ring = Ring(memory, 0, len(memory))
     ring.begin()
@@ -141,7 +141,7 @@ def test_a_reason_is_cut_at_its_room() -> None:
         {"slot_stride": (1 << 32) - 8},
     ],
 )
-def test_a_header_that_contradicts_itself_is_refused(wrong: dict[str, int]) -> None:
+def test_a_contradictory_header_is_refused(wrong: dict[str, int]) -> None:
     memory = ring_memory(**wrong)
     with pytest.raises(ValueError, match=r"."):
         Ring(memory, 0, len(memory))
@@ -158,7 +158,7 @@ def test_any_bytes_are_refused_or_readable(data: bytes, offset: int, size: int) 
 
 
 @given(st.binary(min_size=RING_HEADER_SIZE + 8 * (RAW_OFFSET + 48), max_size=RING_HEADER_SIZE + 8 * (RAW_OFFSET + 48)))
-def test_any_slots_behind_a_sound_header_are_readable(data: bytes) -> None:
+def test_any_slots_with_a_valid_header_are_readable(data: bytes) -> None:
     memory = ring_memory()
     memory[64:] = data[64:]
     ring = Ring(memory, 0, len(memory))
@@ -171,13 +171,13 @@ def test_a_waiter_is_woken_by_the_next_frame() -> None:
     ring = Ring(memory, 0, len(memory))
     ring.begin()
     seen = ring.doorbell()
-    assert ring.wait(seen, 0) == seen  # nothing happened: the time is over
+    assert ring.wait(seen, 0) == seen  # no ring: it returns after the time-out
     waiter = threading.Thread(target=ring.wait, args=(seen, -1))
     waiter.start()
     publish(ring, bytes(20))
     waiter.join(10)
     assert not waiter.is_alive()
-    assert ring.wait(seen, -1) != seen  # news before the wait: no wait at all
+    assert ring.wait(seen, -1) != seen  # a ring before the call: it returns at once
 
 
 def in_thread(work: Callable[[], None]) -> threading.Thread:
@@ -186,7 +186,7 @@ def in_thread(work: Callable[[], None]) -> threading.Thread:
     return thread
 
 
-def test_readers_see_whole_frames_in_order_while_a_writer_turns_the_ring() -> None:
+def test_readers_see_whole_frames_in_order_while_the_ring_wraps() -> None:
     memory = ring_memory(slots=8, size=800)
     ring = Ring(memory, 0, len(memory))
     ring.begin()
@@ -214,7 +214,7 @@ def test_readers_see_whole_frames_in_order_while_a_writer_turns_the_ring() -> No
 
 
 @given(st.binary(min_size=1, max_size=200), st.binary(min_size=1, max_size=200))
-def test_a_cell_holds_what_was_written_last(first: bytes, second: bytes) -> None:
+def test_a_cell_returns_the_last_written_value(first: bytes, second: bytes) -> None:
     memory = bytearray(256)
     _atomics.cell_write(memory, 8, first)
     assert _atomics.cell_read(memory, 8, len(first)) == first
@@ -266,7 +266,7 @@ def test_changed_names_exactly_the_entries_whose_bytes_differ(
     assert _atomics.changed(old, bytes(new), table) == expected
 
 
-def test_changed_refuses_what_lies_outside() -> None:
+def test_changed_refuses_entries_outside_the_image() -> None:
     with pytest.raises(ValueError, match="outside"):
         _atomics.changed(b"ab", b"ac", ENTRY.pack(1, 2, 0, 0))
     with pytest.raises(ValueError, match="outside"):

@@ -53,7 +53,7 @@ def block(source: str = "cell", **changes: int) -> BlockSpec:
     return BlockSpec(source, LAYOUT, fields["period_ns"], fields["stale_ns"], fields["ring_bytes"])
 
 
-def test_who_opens_a_segment_finds_what_its_supervisor_built(instance: str) -> None:
+def test_an_opened_segment_has_what_its_supervisor_created(instance: str) -> None:
     with Segment.create(instance, [block("cell"), block("press")], PROCESSES, control="/run/x.sock") as built:
         with Segment.open(instance) as opened:
             assert list(opened.blocks) == ["cell", "press"]
@@ -75,7 +75,7 @@ def test_who_opens_a_segment_finds_what_its_supervisor_built(instance: str) -> N
     assert instance not in instances()
 
 
-def test_the_size_is_what_was_foretold(instance: str) -> None:
+def test_the_size_is_the_computed_size(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         assert segment.header.size == segment.shared.size == segment_size([block()], len(PROCESSES))
         segment.unlink()
@@ -89,10 +89,10 @@ def test_a_second_supervisor_is_refused_with_the_pid_of_the_first(instance: str)
 
 
 @pytest.mark.parametrize("cleared", [False, True])
-def test_one_that_another_supervisor_takes_for_left_over_is_given_up(
+def test_a_new_segment_that_another_supervisor_has_locked_is_given_up(
     instance: str, monkeypatch: pytest.MonkeyPatch, cleared: bool
 ) -> None:
-    """The other one comes between creation and lock; it may have removed the name again already."""
+    """The other supervisor comes between creation and lock, and may have removed the name."""
     create = SharedObject.create
     others = []
 
@@ -110,25 +110,25 @@ def test_one_that_another_supervisor_takes_for_left_over_is_given_up(
     with pytest.raises(AlreadyRunningError, match=f"starting instance {instance}"):
         Segment.create(instance, [block()], PROCESSES)
     for other in others:
-        assert other.size == 0, "it is the other one's by now"
+        assert other.size == 0, "the object belongs to the other supervisor"
         assert other.current() is not cleared
         other.close()
     unlink(PREFIX + instance)
 
 
-def test_a_ring_without_a_readable_frame_is_told_with_the_remedy(instance: str) -> None:
+def test_a_ring_without_a_readable_frame_is_reported_with_the_remedy(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         writer = segment.writer("cell")
         assert segment.blocks["cell"].latest() is None
         writer.publish(b"unique", cycle=0)
         at = bytes(segment.memory).find(b"unique") - RAW_OFFSET
-        segment.memory[at : at + 8] = (2 * 9 + 1).to_bytes(8, "little")  # a later frame is being written there
+        segment.memory[at : at + 8] = (2 * 9 + 1).to_bytes(8, "little")  # a later frame is being written into the slot
         with pytest.raises(SegmentError, match=r"overwritten faster.*ring_mb"):
             segment.blocks["cell"].latest()
         segment.unlink()
 
 
-def test_an_instance_that_does_not_run_is_named_with_the_remedy(instance: str) -> None:
+def test_an_instance_that_is_not_running_is_named_with_the_remedy(instance: str) -> None:
     with pytest.raises(NotRunningError, match=f"{instance}.*shmio-supervisor up"):
         Segment.open(instance)
 
@@ -145,7 +145,7 @@ def test_an_instance_of_another_configuration_is_refused_with_both_paths(
         segment.unlink()
 
 
-def test_no_room_is_said_at_creation_and_nothing_is_left(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_creation_without_room_fails_and_leaves_nothing(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -155,7 +155,7 @@ def test_no_room_is_said_at_creation_and_nothing_is_left(instance: str, monkeypa
     assert instance not in instances()
 
 
-def test_an_unknown_group_is_named_and_nothing_is_left(instance: str) -> None:
+def test_an_unknown_group_is_named_and_leaves_nothing(instance: str) -> None:
     with pytest.raises(SegmentError, match="no-such-group"):
         Segment.create(instance, [block()], PROCESSES, group="no-such-group")
     assert instance not in instances()
@@ -175,7 +175,7 @@ def test_another_abi_is_refused_by_name(instance: str) -> None:
         segment.unlink()
 
 
-def test_something_else_by_that_name_is_refused(instance: str) -> None:
+def test_an_object_that_is_not_a_segment_is_refused(instance: str) -> None:
     path = Path("/dev/shm") / f"shmio-{instance}"
     path.write_bytes(b"")
     with pytest.raises(NotRunningError, match="is starting"):
@@ -262,7 +262,7 @@ def test_frames_pass_from_writer_to_reader(instance: str) -> None:
         segment.unlink()
 
 
-def test_a_slow_stream_reader_is_told_exactly_what_it_missed(instance: str) -> None:
+def test_a_slow_reader_counts_missed_frames_exactly(instance: str) -> None:
     with Segment.create(instance, [block(period_ns=1_000_000_000)], PROCESSES) as segment:
         reader = segment.blocks["cell"]
         slots = reader.ring.slot_count
@@ -279,7 +279,7 @@ def test_a_slow_stream_reader_is_told_exactly_what_it_missed(instance: str) -> N
         segment.unlink()
 
 
-def test_a_reader_that_the_writer_laps_again_and_again_comes_to_a_frame_all_the_same() -> None:
+def test_a_reader_that_is_overtaken_repeatedly_still_gets_a_frame() -> None:
     class Fast:
         slot_count = 64
         written = 1000
@@ -288,7 +288,7 @@ def test_a_reader_that_the_writer_laps_again_and_again_comes_to_a_frame_all_the_
             return self.written
 
         def read(self, number: int) -> int | None:
-            self.written += 3  # and has begun with the next
+            self.written += 3  # the next frame is already being written
             return number if number > self.written - self.slot_count + 1 else None
 
     ring: Any = Fast()
@@ -297,7 +297,7 @@ def test_a_reader_that_the_writer_laps_again_and_again_comes_to_a_frame_all_the_
     assert cursor.behind < ring.slot_count
 
 
-def test_a_successor_goes_on_with_the_numbers_and_has_its_own_incarnation(instance: str) -> None:
+def test_a_new_writer_continues_the_numbers_with_the_next_incarnation(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         assert segment.writer("cell").publish(bytes(6), cycle=1) == 1
         assert segment.writer("cell").publish(bytes(6), cycle=9) == 2
@@ -306,7 +306,7 @@ def test_a_successor_goes_on_with_the_numbers_and_has_its_own_incarnation(instan
         segment.unlink()
 
 
-def test_the_time_of_the_answer_is_part_of_the_age(instance: str) -> None:
+def test_the_time_for_the_devices_answer_is_part_of_the_age(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         writer = segment.writer("cell")
         writer.publish(bytes(6), cycle=1, asked_ns=time.monotonic_ns() - 400_000_000)
@@ -334,7 +334,7 @@ def test_an_old_frame_is_never_good(instance: str) -> None:
         segment.unlink()
 
 
-def test_a_process_slot_shows_what_both_sides_wrote(instance: str) -> None:
+def test_a_process_slot_has_the_data_of_supervisor_and_process(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment, Segment.open(instance) as opened:
         mine, theirs = segment.processes.find("cell"), opened.processes.find("cell")
         assert (theirs.report, theirs.supervised, theirs.heartbeat_ns) == (
@@ -352,7 +352,7 @@ def test_a_process_slot_shows_what_both_sides_wrote(instance: str) -> None:
         segment.unlink()
 
 
-def test_a_role_is_held_by_one_and_freed_with_its_holder(instance: str) -> None:
+def test_one_process_at_a_time_has_a_role_until_it_ends(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment, Segment.open(instance) as watcher:
         first, second = Segment.open(instance, writable=True), Segment.open(instance, writable=True)
         assert not watcher.processes.find("cell").alive()
@@ -366,12 +366,12 @@ def test_a_role_is_held_by_one_and_freed_with_its_holder(instance: str) -> None:
         segment.unlink()
 
 
-def test_closing_frees_the_role_even_while_a_ring_is_held(instance: str) -> None:
+def test_closing_frees_the_role_even_if_a_ring_is_referenced(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         holder = Segment.open(instance, writable=True)
         ring = holder.blocks["cell"].ring
         assert holder.processes.find("cell").take()
         holder.close()
         assert not segment.processes.find("cell").alive()
-        assert ring.head() == 0  # the mapping stays
+        assert ring.head() == 0  # the mapping remains
         segment.unlink()

@@ -1,4 +1,4 @@
-"""A segment changed under its readers: blocks added, ended, and put in the place of others."""
+"""A segment that changes while it is read: blocks are added, ended and replaced."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def segment(instance: str) -> Iterator[Segment]:
         segment.unlink()
 
 
-def test_a_new_source_is_seen_by_who_is_attached(segment: Segment) -> None:
+def test_an_attached_reader_sees_a_new_source(segment: Segment) -> None:
     with shmio.attach(segment.instance) as reader:
         before = reader.block("cell")
         segment.change(add=[spec("robot")])
@@ -43,7 +43,7 @@ def test_a_new_source_is_seen_by_who_is_attached(segment: Segment) -> None:
         assert reader.block("cell") is before, "what goes on stays the same object"
 
 
-def test_what_ended_blocks_held_can_still_be_read(segment: Segment) -> None:
+def test_the_frames_of_ended_blocks_can_still_be_read(segment: Segment) -> None:
     for layout, cycle in ((NEW, 1), (OLD, 2)):
         segment.writer("cell").publish(bytes(segment.blocks["cell"].layout.size), cycle=cycle)
         segment.change(add=[spec("cell", layout)], retire=["cell"])
@@ -55,12 +55,12 @@ def test_what_ended_blocks_held_can_still_be_read(segment: Segment) -> None:
         assert [frame.cycle for frame in frames if frame] == [1, 2]
         assert first.retired
         segment.change(retire=["press"])
-        assert reader.ended == [first, second], "as of the last refresh"
+        assert reader.ended == [first, second], "unchanged until the next refresh"
         assert reader.refresh()
         assert [block.source for block in reader.ended] == ["cell", "press", "cell"]
 
 
-def test_a_stream_goes_on_with_the_new_layout(segment: Segment) -> None:
+def test_a_stream_continues_with_the_new_layout(segment: Segment) -> None:
     old = segment.writer("cell")
     with shmio.attach(segment.instance) as reader:
         stream = reader.stream("cell", timeout_s=20)
@@ -75,7 +75,7 @@ def test_a_stream_goes_on_with_the_new_layout(segment: Segment) -> None:
         assert reader["cell/speed"] == 2.5
 
 
-def test_who_waits_on_an_ended_block_is_woken_and_told(segment: Segment) -> None:
+def test_a_reader_that_waits_for_a_removed_source_is_woken_with_an_error(segment: Segment) -> None:
     with shmio.attach(segment.instance) as reader:
         stream = reader.stream("press")
         problems: list[Exception] = []
@@ -113,7 +113,7 @@ def test_a_change_cut_off_by_the_supervisors_death_is_completed(
             patched.setattr(header, "_set_table_state", die)
             with pytest.raises(SystemExit):
                 segment.change(add=[spec("cell", NEW)], retire=["cell"])
-        assert not held.retired, "the new block is there, and the old one has not been ended"
+        assert not held.retired, "the new block exists, and the old one has not been ended"
         with Segment.open(segment.instance, writable=True) as successor:
             successor.end_replaced()
             assert successor.blocks["cell"].layout == NEW
@@ -124,10 +124,13 @@ def test_a_change_cut_off_by_the_supervisors_death_is_completed(
 
 
 @pytest.mark.parametrize("calls", [1, 2, 3])
-def test_who_waits_is_woken_by_the_successor_wherever_the_supervisor_died(
+def test_the_successor_wakes_readers_wherever_the_supervisor_died(
     segment: Segment, monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
-    """After the new block's entry; after the old one's end; before its first bell. All waits are without a time-out."""
+    """It dies after the new block's entry, after the old one's end, or before its first ring.
+
+    All waits are without a time-out.
+    """
     steps = 0
 
     def dying(step: Callable[..., None], *, before: bool = False) -> Callable[..., None]:
@@ -167,10 +170,8 @@ def test_who_waits_is_woken_by_the_successor_wherever_the_supervisor_died(
         assert held.retired
 
 
-def test_a_block_ended_only_in_part_is_ended_by_the_successor(
-    segment: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """For readers that look at their own section's flag alone."""
+def test_a_partly_ended_block_is_ended_by_the_successor(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some readers look only at the flag of their own section."""
     store = _atomics.store64
 
     def die(memory: memoryview, offset: int, value: int) -> None:
@@ -190,10 +191,10 @@ def test_a_block_ended_only_in_part_is_ended_by_the_successor(
 
 
 @pytest.mark.parametrize("timeout_s", [None, 3600.0])
-def test_a_lost_bell_leaves_nobody_waiting(
+def test_a_lost_ring_leaves_no_reader_waiting(
     segment: Segment, timeout_s: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who waits for ever, or long, looks by itself, too."""
+    """A reader that waits long or for ever also looks periodically."""
     monkeypatch.setattr("shmio.segment.segment.wake", lambda *_: None)
     with shmio.attach(segment.instance) as reader:
         held = reader.block("cell")
@@ -204,7 +205,7 @@ def test_a_lost_bell_leaves_nobody_waiting(
         assert not waiter.is_alive()
 
 
-def test_a_held_block_says_that_it_is_over_and_keeps_its_last_frame(segment: Segment) -> None:
+def test_a_referenced_block_is_marked_as_retired_and_keeps_its_last_frame(segment: Segment) -> None:
     segment.writer("press").publish(b"\0\5", cycle=1)
     with shmio.attach(segment.instance) as reader:
         held = reader.block("press")
@@ -215,7 +216,7 @@ def test_a_held_block_says_that_it_is_over_and_keeps_its_last_frame(segment: Seg
         assert [(frame.raw, frame.quality) for frame in frames] == [(b"\0\5", Quality.GOOD)]
 
 
-def test_no_room_changes_nothing(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_change_without_room_changes_nothing(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     size, generation = segment.shared.size, segment.generation
 
     def full(*_: object) -> None:
@@ -229,8 +230,8 @@ def test_no_room_changes_nothing(segment: Segment, monkeypatch: pytest.MonkeyPat
     assert not segment.blocks["cell"].retired
 
 
-def test_changes_have_a_bound(segment: Segment) -> None:
-    for _ in range(45):  # forty of blocks that have a link
+def test_the_number_of_changes_is_limited(segment: Segment) -> None:
+    for _ in range(45):  # forty, if the blocks have a model channel
         segment.change(add=[spec("cell")], retire=["cell"])
     with pytest.raises(
         SegmentError,
@@ -241,8 +242,8 @@ def test_changes_have_a_bound(segment: Segment) -> None:
         assert sorted(late.blocks) == ["cell", "press"]
 
 
-def test_readers_and_changes_at_once(segment: Segment) -> None:
-    """Whoever opens or refreshes sees whole tables only, though the object grows meanwhile."""
+def test_readers_during_changes(segment: Segment) -> None:
+    """A reader that opens or refreshes sees complete tables only, though the object grows."""
     stop = threading.Event()
     problems: list[BaseException] = []
 
@@ -268,7 +269,7 @@ def test_readers_and_changes_at_once(segment: Segment) -> None:
     assert problems == []
 
 
-def test_wait_goes_on_with_the_new_block(segment: Segment) -> None:
+def test_wait_continues_with_the_new_block(segment: Segment) -> None:
     old = segment.writer("cell")
     for cycle in range(1, 11):
         old.publish(b"\0\1", cycle=cycle)
@@ -283,7 +284,7 @@ def test_wait_goes_on_with_the_new_block(segment: Segment) -> None:
         assert reader.wait("cell", after=view, timeout_s=0) is None
 
 
-def test_who_waits_is_woken_by_the_new_block(segment: Segment) -> None:
+def test_the_new_block_wakes_a_waiting_reader(segment: Segment) -> None:
     segment.writer("cell").publish(b"\0\1", cycle=1)
     views: list[View | None] = []
     with shmio.attach(segment.instance) as reader:
@@ -300,9 +301,7 @@ def test_who_waits_is_woken_by_the_new_block(segment: Segment) -> None:
     assert views[0]["count"] == 4
 
 
-def test_a_thread_that_looks_while_another_reads_a_reload_waits_for_it(
-    segment: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refresh_waits_for_that_of_another_thread(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     with Segment.open(segment.instance) as reader:
         segment.change(add=[spec("robot")])
         reads, go_on, seen = threading.Event(), threading.Event(), list[set[str]]()
@@ -322,7 +321,7 @@ def test_a_thread_that_looks_while_another_reads_a_reload_waits_for_it(
         first.start()
         reads.wait()
         second.start()
-        second.join(0.2)  # one that did not wait would be through by then
+        second.join(0.2)  # without a wait it would have finished by then
         go_on.set()
         first.join()
         second.join()

@@ -1,4 +1,4 @@
-"""What a killed supervisor leaves behind."""
+"""Clearing the segment and the processes of a killed supervisor."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ signal.pause()
 """
 
 
-def test_nothing_to_clear_is_no_error(instance: str) -> None:
+def test_no_segment_to_clear_is_not_an_error(instance: str) -> None:
     assert clear(instance) == []
 
 
-def test_a_living_supervisor_is_left_alone(instance: str) -> None:
+def test_the_segment_of_a_running_supervisor_is_not_cleared(instance: str) -> None:
     with Segment.create(instance, [], [ProcessSpec("cell", "source")]) as segment:
         with pytest.raises(AlreadyRunningError, match=f"pid {os.getpid()}"):
             clear(instance)
         segment.unlink()
 
 
-def test_a_pid_that_went_to_a_thread_names_no_process(instance: str) -> None:
+def test_a_pid_reused_by_a_thread_is_not_a_process(instance: str) -> None:
     over = threading.Event()
     thread = threading.Thread(target=over.wait)
     thread.start()
@@ -77,8 +77,8 @@ signal.pause()
 
 
 @pytest.mark.parametrize("field", ["abi", "version"])
-def test_another_versions_processes_are_found_without_its_format(instance: str, field: str) -> None:
-    """Those that run a module of ours and map the segment so that they can write to it; nobody else's."""
+def test_processes_of_another_version_are_found_without_its_format(instance: str, field: str) -> None:
+    """They run a module of shmio and have mapped the segment for writing; others are left alone."""
     with Segment.create(instance, [], [ProcessSpec("cell", "source")]) as segment:
         if field == "abi":
             segment.memory[8:12] = (7).to_bytes(4, "little")
@@ -105,8 +105,10 @@ def test_another_versions_processes_are_found_without_its_format(instance: str, 
     assert instance not in instances()
 
 
-def test_what_does_not_end_is_named_and_keeps_the_segment(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a process that waits in the kernel, which not even SIGKILL ends."""
+def test_a_process_that_does_not_end_is_named_and_keeps_the_segment(
+    instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that waits in the kernel does not end, not even by SIGKILL."""
     monkeypatch.setattr("shmio.segment.stale_segment.GRACE_S", 0.2)
     command = [sys.executable, "-c", SUPERVISOR, instance, ORPHAN.format(stubborn=False)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as supervisor:
@@ -127,7 +129,7 @@ def test_what_does_not_end_is_named_and_keeps_the_segment(instance: str, monkeyp
     assert instance not in instances()
 
 
-def test_another_users_process_is_told_by_its_owner(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_of_another_user_is_reported_with_its_owner(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     command = [sys.executable, "-c", SUPERVISOR, instance, ORPHAN.format(stubborn=False)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as supervisor:
         assert supervisor.stdout is not None

@@ -1,4 +1,4 @@
-"""Threads that wait in the extension while what they wait on is given up under them, or the interpreter ends.
+"""Threads wait in the extension while the segment is closed or the interpreter ends.
 
 Also run on a sanitized build: scripts/test-sanitized.
 """
@@ -27,7 +27,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 class Waiting:
-    """A thread that waits again and again until told to stop, and what ended it."""
+    """A thread that waits repeatedly until stopped, and the error that ended it."""
 
     def __init__(self, wait: Callable[[], object], stopping: threading.Event) -> None:
         self.begun = threading.Event()
@@ -41,13 +41,13 @@ class Waiting:
             self.begun.set()
             try:
                 self._wait()
-            except Exception as error:  # noqa: BLE001 - whatever a use after the end is told with
+            except Exception as error:  # noqa: BLE001 - any error of a use after close
                 self.error = error
                 return
 
 
 def waiting(segment: Segment, pause_ns: int) -> list[Callable[[], object]]:
-    """Each way to wait for something in a segment."""
+    """Return each way to wait for something in a segment."""
     page, block = segment.clock, segment.blocks["sim"]
     frames, events, commands = block.ring, block.events.ring, block.commands
     waits: list[Callable[[], object]] = [
@@ -61,8 +61,8 @@ def waiting(segment: Segment, pause_ns: int) -> list[Callable[[], object]]:
     return waits
 
 
-def test_a_segment_is_closed_under_threads_that_wait(segment: Segment, instance: str) -> None:
-    """The mapping stays as long as they hold it; who begins anew afterwards is told."""
+def test_a_segment_is_closed_while_threads_wait(segment: Segment, instance: str) -> None:
+    """The mapping stays while they wait; a thread that waits again gets an error."""
     for turn in range(20):
         reader, stopping = Segment.open(instance), threading.Event()
         waits = waiting(reader, (-1, 100_000)[turn % 2])
@@ -71,7 +71,7 @@ def test_a_segment_is_closed_under_threads_that_wait(segment: Segment, instance:
             one.begun.wait()
         reader.close()
         stopping.set()
-        while any(one.thread.is_alive() for one in threads):  # of those that wait for ever some may only begin to
+        while any(one.thread.is_alive() for one in threads):  # a thread with an endless wait may start it only now
             for bell in (segment.clock.bell, segment.clock.slot_bell(0), segment.clock.delivered_bell):
                 bell.ring()
             segment.blocks["sim"].ring.wake()
@@ -80,13 +80,13 @@ def test_a_segment_is_closed_under_threads_that_wait(segment: Segment, instance:
         assert {type(one.error) for one in threads} <= {type(None), ValueError}, [one.error for one in threads]
 
 
-def test_what_is_waited_on_is_neither_resized_nor_freed() -> None:
+def test_a_buffer_with_a_waiting_thread_cannot_be_resized() -> None:
     data = bytearray(64)
     thread = threading.Thread(target=_atomics.bell_wait, args=(data, 0, 0, -1))
     thread.start()
 
     def grow() -> None:
-        while thread.is_alive():  # until it waits
+        while thread.is_alive():  # until the thread waits
             data.append(0)
 
     try:
@@ -138,5 +138,5 @@ def test_an_interpreter_ends_with_daemon_threads_in_the_extension(segment: Segme
         command = [sys.executable, "-X", "faulthandler", "-c", ENDING, instance, how]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stderr
-        if how != "closed":  # there a thread that goes on may be told so, in its traceback
+        if how != "closed":  # after closing, a thread may print an error
             assert done.stderr == ""

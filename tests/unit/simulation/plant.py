@@ -1,4 +1,4 @@
-"""A model with everything a model can declare, for the tests."""
+"""A model that uses every kind of declaration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cell as a model; what moves when is tested as the emulated controller's program."""
+"""The A50 cell as a model; the tests of the emulated controller check its movements in detail."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def value(runner: ModelRunner, path: str) -> Any:
     return codec(find(runner.layout, path), runner.layout.byte_order).decode(runner.image)
 
 
-def test_its_own_layout_has_the_signals_of_db201(db201: Layout) -> None:
+def test_its_layout_has_the_signals_of_db201(db201: Layout) -> None:
     own = {register.path: (register.type, register.dims) for register in layout_of(A50Cell).registers}
     assert own == {register.path: (register.type, register.dims) for register in db201.registers}
 
@@ -50,7 +50,7 @@ def test_moves_as_the_emulated_plant_does(db201: Layout) -> None:
     assert len(seen) > 100
 
 
-def test_hold_is_obeyed_and_taken_back(db201: Layout) -> None:
+def test_hold_pauses_and_resumes_the_movement(db201: Layout) -> None:
     runner = ModelRunner(A50Cell, db201)
     hold = find(db201, "Outputs/13")
 
@@ -68,7 +68,7 @@ def test_hold_is_obeyed_and_taken_back(db201: Layout) -> None:
     assert run(200, 220) != pytest.approx(moving, abs=1)
 
 
-def test_what_it_does_not_drive_is_as_it_was_written(db201: Layout) -> None:
+def test_registers_that_it_does_not_compute_keep_written_values(db201: Layout) -> None:
     runner = ModelRunner(A50Cell, db201)
     paths = ("Inputs/0", "Inputs/20", "Outputs/0", "Outputs/18")
     writes = [write for path in paths for write in encode(find(db201, path), 0xA5, "big")]

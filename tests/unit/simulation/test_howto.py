@@ -1,4 +1,4 @@
-"""The model of docs/how-to/write-a-model.md, as it stands there."""
+"""The model of docs/how-to/write-a-model.md, exactly as on the page."""
 
 from __future__ import annotations
 

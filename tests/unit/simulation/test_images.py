@@ -1,4 +1,4 @@
-"""Structures of numbers, which are written and read at once, behave as their members do one by one."""
+"""Structures of numbers, read and written in one operation, behave like their single members."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKED = struct.Struct("<dhxxfd")
 
 
 class Told(Model):
-    """Shows what it is told, and what it sees of that."""
+    """Writes ``tells``, and stores what it read in ``seen``."""
 
     tells: Any = None
     seen: Any = None
@@ -32,7 +32,7 @@ class Told(Model):
 
 
 def shown(tells: object, layout: Layout | None = None) -> tuple[float, ...]:
-    """All numbers after a step in which the model has set them so."""
+    """Return all numbers after a step in which the model wrote ``tells``."""
     Told.tells = tells
     image = ModelRunner(Told, layout).step(1, 1)
     return PACKED.unpack_from(image, PACKED.size)
@@ -52,7 +52,7 @@ def test_all_members_are_written(tells: dict[str, object]) -> None:
     assert shown(tells) == (1.5, -2, 0.25, 4.0)
 
 
-def test_members_that_are_not_named_keep_their_value() -> None:
+def test_members_that_are_not_given_keep_their_value() -> None:
     assert shown({"d": 4.0, "b": 7}) == (0.0, 7, 0.0, 4.0)
 
 
@@ -67,7 +67,7 @@ def test_members_that_are_not_named_keep_their_value() -> None:
         ({"e": 1}, "numbers: expected a dict with some of a, b, c, d"),
     ],
 )
-def test_a_value_that_does_not_fit_is_named_and_nothing_is_shown(change: dict[str, object], message: str) -> None:
+def test_an_invalid_value_is_named_and_the_image_is_unchanged(change: dict[str, object], message: str) -> None:
     Told.tells = {"a": 1.5, "b": -2, "c": 0.25, "d": 4.0}
     runner = ModelRunner(Told)
     before = runner.step(1, 1)
@@ -87,7 +87,7 @@ def test_all_members_are_read() -> None:
     assert [list(part) for part in Told.seen] == [list(NUMBERS)] * 2
 
 
-def test_members_may_lie_apart() -> None:
+def test_members_need_not_be_adjacent() -> None:
     text = """DATA_BLOCK "Apart"
 { S7_Optimized_Access := 'FALSE' }
    STRUCT

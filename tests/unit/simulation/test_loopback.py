@@ -18,7 +18,7 @@ def test_has_the_registers_that_existing_clients_know() -> None:
 
 
 @pytest.mark.parametrize(("path", "new"), [*((path, -0.125) for path in JOINTS), ("safetyzones/Z1/level", 2.5)])
-def test_what_is_written_comes_out_at_the_next_step(path: str, new: float) -> None:
+def test_a_written_value_comes_out_at_the_next_step(path: str, new: float) -> None:
     runner = ModelRunner(Loopback)
     register = find(runner.layout, path)
     read = codec(register, "little").decode

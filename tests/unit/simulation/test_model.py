@@ -12,7 +12,7 @@ from tests.unit.simulation.plant import Belt
 
 
 class Still(Model):
-    """Computes nothing."""
+    """A model that computes nothing."""
 
     def step(self, time_s: float, dt_s: float) -> None:
         """Change nothing."""
@@ -97,18 +97,18 @@ def test_a_wrong_declaration_is_refused_by_name(make: Callable[[], Declaration],
     assert "\n" not in str(caught.value)
 
 
-def test_several_faults_are_told_together() -> None:
+def test_several_faults_are_reported_together() -> None:
     with pytest.raises(ModelError, match=r"model Wrong: a: there is no type 'X'.*; b: there is no type 'Y'"):
         type("Wrong", (Still,), {"a": Input("X"), "b": Input("Y")})
 
 
 @pytest.mark.parametrize("name", ["step", "start", "random", "_hidden"])
-def test_names_of_the_model_itself_are_no_registers(name: str) -> None:
+def test_names_of_model_attributes_cannot_be_registers(name: str) -> None:
     with pytest.raises(ModelError, match=f"model Wrong: {name}: choose another name"):
         type("Wrong", (Still,), {name: Input("INT")})
 
 
-def test_a_model_has_no_init_of_its_own() -> None:
+def test_a_model_must_not_define_init() -> None:
     with pytest.raises(ModelError, match=r"model Wrong: a model has no __init__ of its own; prepare it in start\(\)"):
         type("Wrong", (Still,), {"__init__": lambda self: None})
 

@@ -14,7 +14,7 @@ from shmio.simulation.loopback import Loopback
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Path]:
-    """A folder of modules; what was imported of it is forgotten afterwards."""
+    """A folder for modules; modules imported from it are unloaded afterwards."""
     modules, path = set(sys.modules), list(sys.path)
     yield tmp_path
     sys.path[:] = path
@@ -51,7 +51,7 @@ def test_an_installed_module_comes_first(folder: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "Belt", "plant:", ":Belt", "plant.belt.Belt", "plant:Belt()", "../x:Belt", "a..b:C"]
 )
-def test_what_is_no_name_is_refused(text: str) -> None:
+def test_invalid_names_are_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r"^expected package\.module:Class, found "):
         load(text)
 
@@ -83,7 +83,7 @@ def test_what_is_no_name_is_refused(text: str) -> None:
         ),
     ],
 )
-def test_errors_name_the_thing(folder: Path, source: str, text: str, message: str) -> None:
+def test_errors_name_the_module_and_line(folder: Path, source: str, text: str, message: str) -> None:
     (folder / "plant_m.py").write_text(source)
     with pytest.raises(ConfigError, match=message) as caught:
         load(text, folder)

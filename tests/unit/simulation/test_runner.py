@@ -57,7 +57,7 @@ def test_a_step_computes_the_whole_image() -> None:
     assert image == runner.image
 
 
-def test_what_is_written_is_shown_and_used_from_the_next_step_on() -> None:
+def test_written_values_take_effect_at_the_next_step() -> None:
     runner = ModelRunner(Belt)
     step(runner)
     assert [set_to(runner, path, new) for path, new in {"speed": 1.5, "drives/main": -3, "raw/2": 9}.items()] == [
@@ -166,7 +166,7 @@ def test_the_same_steps_and_seed_give_the_same_bytes() -> None:
 
 
 class Fragile(Model):
-    """Fails as it is told."""
+    """A model that fails in the way that ``how`` chooses."""
 
     how = Input("INT")
     value = Output("INT", 5)
@@ -200,7 +200,7 @@ class Fragile(Model):
         (7, "row: expected a list of 2 elements, found 1"),
     ],
 )
-def test_a_failure_is_told_with_name_and_line_and_shows_nothing(how: int, what: str) -> None:
+def test_a_failure_is_reported_with_name_and_line_and_changes_nothing(how: int, what: str) -> None:
     runner = ModelRunner(Fragile)
     before = runner.begin()
     runner.connect({"how": how})
@@ -213,7 +213,7 @@ def test_a_failure_is_told_with_name_and_line_and_shows_nothing(how: int, what: 
     assert value(runner, "value", step(runner, 2)) == 6
 
 
-def test_a_failing_start_is_told_the_same_way() -> None:
+def test_a_failing_start_is_reported_likewise() -> None:
     class Broken(Model):
         value = Output("INT")
 
@@ -230,7 +230,7 @@ def test_a_failing_start_is_told_the_same_way() -> None:
 
 
 class Counting(Model):
-    """Starts from what is shown."""
+    """A model whose start continues from the image."""
 
     count = Output("DINT")
     given = Input("DINT")
@@ -245,7 +245,7 @@ class Counting(Model):
         self.both.shown = self.both.commanded
 
 
-def test_a_successor_goes_on_from_the_image() -> None:
+def test_a_new_runner_resumes_from_the_image() -> None:
     first = ModelRunner(Counting)
     first.connect({"given": 4, "both": 5})
     for number in range(1, 4):
@@ -259,7 +259,7 @@ def test_a_successor_goes_on_from_the_image() -> None:
         second.resume(image[1:])
 
 
-def test_a_layout_may_have_more_and_other_places() -> None:
+def test_a_layout_may_have_more_registers_and_other_offsets() -> None:
     (layout,) = compile_sources(
         [
             Source(
@@ -303,7 +303,7 @@ def test_a_layout_that_does_not_fit_is_refused(changes: dict[str, Any], message:
 
 
 class Types(Model):
-    """Sets outputs to what numpy gives."""
+    """A model whose outputs get numpy values."""
 
     count = Output("INT")
     row = Output("ARRAY[0..1, 0..2] OF REAL")
@@ -315,7 +315,7 @@ class Types(Model):
         self.flag = np.float64(self.row[1][2]) > 4
 
 
-def test_values_of_numpy_are_taken() -> None:
+def test_numpy_values_are_accepted() -> None:
     runner = ModelRunner(Types)
     step(runner)
     assert [value(runner, path) for path in ("count", "row", "flag")] == [1, [[0, 1, 2], [3, 4, 5]], True]

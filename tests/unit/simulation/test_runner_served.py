@@ -1,4 +1,4 @@
-"""A model's class behind what a client's ``simulate`` gives and takes: the same bytes as where its process is."""
+"""A model's class run by a client's ``simulate``: it gives the same bytes as in the instance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MS = 1_000_000
 
 
 class Given(Mapping[str, Any]):
-    """Inputs as a client has them."""
+    """Inputs as a client receives them."""
 
     def __init__(self, values: Mapping[str, Any], changed: Collection[str] = ()) -> None:
         self._values = values
@@ -34,7 +34,7 @@ class Given(Mapping[str, Any]):
 
 
 class Joined:
-    """A source that was joined, with registers of these values."""
+    """A joined source whose registers have these values."""
 
     source = "belt"
 
@@ -50,7 +50,7 @@ def values(runner: ModelRunner, image: bytes) -> dict[str, Any]:
 
 
 def split(every: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Inputs and outputs of a belt."""
+    """Return inputs and outputs of a belt."""
     both = {"drives/main", "raw"}
     inputs = {"speed", "stop"} | both
     return (
@@ -59,7 +59,7 @@ def split(every: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     )
 
 
-def test_it_shows_what_it_does_in_the_instance() -> None:
+def test_a_served_model_gives_the_same_values_as_in_the_instance() -> None:
     local = ModelRunner(Belt, parameters={"noise_m": 0.5}, seed=7)
     served = ServedModel(Belt, {"noise_m": 0.5}, 7)
     inputs, outputs = split(values(local, local.begin()))
@@ -73,24 +73,24 @@ def test_it_shows_what_it_does_in_the_instance() -> None:
         local.connect({path: value.tolist() if hasattr(value, "tolist") else value for path, value in changed.items()})
         image = local.step(number * 20 * MS, 20 * MS)
         given = served.step(number * 0.02, 0.02, Given(inputs, tuple(changed)))
-        assert all(known.get(path) != value for path, value in given.items()), "only what has changed"
+        assert all(known.get(path) != value for path, value in given.items()), "only changed outputs"
         known |= given
         assert known == split(values(local, image))[1]
     assert set(known) == set(outputs)
 
 
-def test_it_goes_on_from_what_the_source_shows() -> None:
+def test_a_served_model_continues_from_the_sources_values() -> None:
     runner = ModelRunner(Belt)
     inputs, outputs = split(values(runner, runner.begin()))
     served = ServedModel(Belt)
     served.start(Joined(inputs, outputs | {"position": np.float64(1.5), "label": None}, computed=True))
     given = served.step(0.1, 0.1, Given(inputs, tuple(inputs)))
     assert given["position"] == pytest.approx(1.55)
-    served.start(Joined(inputs, outputs, computed=True))  # it was cut off, and has joined again
+    served.start(Joined(inputs, outputs, computed=True))  # the connection was lost and the model has rejoined
     assert served.step(0.2, 0.1, Given(inputs))["position"] == pytest.approx(1.6)
 
 
-def test_a_model_that_nobody_has_computed_yet_begins_with_its_own_values() -> None:
+def test_a_source_that_was_never_computed_starts_with_the_models_initial_values() -> None:
     class Counter(Model):
         start_at = Output("INT", 5)
 
@@ -102,7 +102,7 @@ def test_a_model_that_nobody_has_computed_yet_begins_with_its_own_values() -> No
     assert served.step(1.0, 1.0, Given({})) == {"start_at": 6}
 
 
-def test_one_that_has_only_failed_goes_on_from_what_another_has_computed() -> None:
+def test_a_model_without_a_successful_step_continues_from_another_models_values() -> None:
     class Counter(Model):
         count = Output("INT", 5)
 
@@ -119,7 +119,7 @@ def test_one_that_has_only_failed_goes_on_from_what_another_has_computed() -> No
     assert served.step(2.0, 1.0, Given({})) == {"count": 71}
 
 
-def test_what_is_no_value_is_not_given_and_what_fails_is_given_again() -> None:
+def test_invalid_inputs_are_ignored_and_inputs_of_a_failed_step_are_kept() -> None:
     class Fragile(Model):
         number = Input("INT", 1)
         shown = Output("INT")
@@ -154,7 +154,7 @@ def test_a_source_that_lacks_a_register_is_named(lacking: str, message: str) -> 
         ServedModel(Belt).start(Joined(inputs, outputs))
 
 
-def test_an_in_out_that_is_not_computed_is_to_be_named_in_inouts() -> None:
+def test_an_in_out_that_is_missing_in_the_configuration_is_named() -> None:
     runner = ModelRunner(Belt)
     inputs, outputs = split(values(runner, runner.begin()))
     del outputs["raw"]

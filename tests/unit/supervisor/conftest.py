@@ -13,7 +13,7 @@ from tests.unit.supervisor.harness import CELL, Job, Launch, Launched
 
 @pytest.fixture
 def launch(instance: str, tmp_path: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Launch]:
-    """Start an instance of the jobs given, under the limits given."""
+    """Start an instance with the given jobs and limits."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     launched: list[Launched] = []
 
@@ -22,7 +22,7 @@ def launch(instance: str, tmp_path: Path, runtime: Path, monkeypatch: pytest.Mon
         return launched[-1]
 
     yield start
-    for one in launched:  # all of them, before what is left can be cleared
+    for one in launched:  # stop all of them before clearing
         one.process.kill()
         one.process.wait()
     for one in launched:

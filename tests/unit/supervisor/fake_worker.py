@@ -1,4 +1,4 @@
-"""A worker by exec, as badly behaved as its description says; started by the supervisor under test."""
+"""A worker process that misbehaves as its description says; the supervisor under test starts it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if behaviour == "unfit":
     sys.stderr.write("no such thing here\n")
     sys.exit(2)
 if behaviour == "traceback":
-    raise RuntimeError("as told")
+    raise RuntimeError("told to fail")
 
 stopping = threading.Event()
 signal.signal(signal.SIGTERM, signal.SIG_IGN if behaviour == "stubborn" else lambda *_: stopping.set())

@@ -1,4 +1,4 @@
-"""Whole instances of fake workers, supervised in a process of their own."""
+"""Instances of fake workers, supervised in a separate process."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ CELL: list[Job] = [("plc", "emulator", ["good"]), ("cell", "source", ["good"]), 
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait for something that has no bell to ring, such as a line of the process table."""
+    """Wait for a condition that has no doorbell, such as a line of the process table."""
     deadline = time.monotonic() + DEADLINE_S
     pause = threading.Event()
     while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
+        assert time.monotonic() < deadline, "the condition did not become true in time"
         pause.wait(0.005)
 
 
@@ -54,7 +54,7 @@ class Launched:
         self.states: list[str] = []
 
     def wait_state(self, state: str) -> None:
-        """Read states from the supervisor until this one comes."""
+        """Read states from the supervisor until it reports this one."""
         assert self.process.stdout is not None
         deadline = time.monotonic() + DEADLINE_S
         while state not in self.states:
@@ -96,7 +96,7 @@ class Launched:
         return control.request(path, message, DEADLINE_S)
 
     def plan(self, jobs: list[Any], **others: Any) -> None:
-        """Write what the instance is to be from the next reload on."""
+        """Write the plan for the next reload."""
         (self.folder / "plan.json").write_text(json.dumps({"jobs": jobs, **others}))
 
     def reload(self, jobs: list[Any], **others: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A supervisor of fake workers, in a process of its own: ``run_supervisor.py INSTANCE FOLDER JOBS LIMITS``."""
+"""Supervises fake workers: ``run_supervisor.py INSTANCE FOLDER JOBS LIMITS``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ def block(name: str, layout: Layout, ring_bytes: int) -> BlockSpec:
 
 
 def make(settings: dict[str, Any]) -> Plan:
-    """``settings``: jobs as (name, kind, behaviour[, layout]), and what else of the plan is not as usual."""
+    """Return a plan.
+
+    ``settings``: jobs as (name, kind, behaviour[, layout]), and other deviations.
+    """
     return Plan(
         instance=settings.get("instance", instance),
         mode=settings.get("mode", "live"),
@@ -56,7 +59,7 @@ def make(settings: dict[str, Any]) -> Plan:
 
 
 def replan() -> Plan:
-    """As the file has it by now; it takes until somebody writes to the pipe, if there is one."""
+    """Read the plan from its file; if the pipe exists, wait until a test writes to it."""
     if (pipe := folder / "slow").exists():
         pipe.read_bytes()
     try:
@@ -66,13 +69,13 @@ def replan() -> Plan:
 
 
 def kill(child: ChildProcess, end: Callable[[ChildProcess], None] = ChildProcess.kill) -> None:
-    """As a process takes it that waits in the kernel, as long as there is the file."""
+    """Kill a process, unless the file ``held`` exists: then the process cannot be ended."""
     if not (folder / "held").exists():
         end(child)
 
 
 def send(pidfd: int, sign: int, really: Callable[[int, int], None] = signal.pidfd_send_signal) -> None:
-    """The same for one that is no child."""
+    """Do the same for a process that is not a child."""
     if not (folder / "held").exists():
         really(pidfd, sign)
 

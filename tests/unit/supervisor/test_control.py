@@ -1,4 +1,4 @@
-"""The control socket: who is served, what is refused, and that nobody can hold it up."""
+"""The control socket: requests, refusals, and clients that do not read or write."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shmio.supervisor.control import Answer, ControlServer, Request, Restart, St
 
 
 class Served:
-    """A server, driven step by step from the test's own thread."""
+    """A server, run step by step in the test's thread."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -33,7 +33,7 @@ class Served:
         )
 
     def turn(self) -> None:
-        """Handle what there is, and wait for nothing."""
+        """Handle the pending events without waiting."""
         while events := self.selector.select(0):
             for key, _ in events:
                 key.data()
@@ -89,7 +89,7 @@ LONG = "x" * 1500
         ({"warnings": 0, "done": 200, "problems": 200}, []),
     ],
 )
-def test_of_a_long_answer_the_least_urgent_lines_are_left_out_first(
+def test_a_long_answer_drops_its_least_urgent_lines_first(
     served: Served, sizes: dict[str, int], whole: list[str]
 ) -> None:
     client = served.client(b'{"do": "reload"}\n')
@@ -110,7 +110,7 @@ def test_of_a_long_answer_the_least_urgent_lines_are_left_out_first(
             assert told[-1].startswith(f"… and {size - len(told) + 1} more")
     if not whole:
         assert len(answer["done"]) == 1
-        assert len(received) > control.MAX_ANSWER_BYTES - 2 * len(LONG), "there is no more room"
+        assert len(received) > control.MAX_ANSWER_BYTES - 2 * len(LONG), "the answer is filled up to its limit"
 
 
 def test_a_long_error_is_cut(served: Served) -> None:
@@ -119,7 +119,7 @@ def test_a_long_error_is_cut(served: Served) -> None:
     assert answer_to(client) == {"error": "é" * 1999 + "…"}
 
 
-def test_a_successors_socket_is_left_to_it(served: Served) -> None:
+def test_retiring_leaves_a_successors_socket_alone(served: Served) -> None:
     successor = Served(served.path)
     served.server.retire()
     client = successor.client(b'{"do": "where"}\n')
@@ -128,7 +128,7 @@ def test_a_successors_socket_is_left_to_it(served: Served) -> None:
     successor.close()
 
 
-def test_a_client_stops_waiting_when_there_is_no_point(tmp_path: Path) -> None:
+def test_a_client_stops_waiting_when_its_check_finds_a_reason(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as silent:
         silent.bind(str(tmp_path / "s"))
         silent.listen()
@@ -136,8 +136,8 @@ def test_a_client_stops_waiting_when_there_is_no_point(tmp_path: Path) -> None:
             control.request(str(tmp_path / "s"), Where(), 3600, lambda: "it is asleep")
 
 
-def test_a_client_waits_until_there_is_room(tmp_path: Path) -> None:
-    """Of a UNIX socket that has as many as may wait, connect says so at once."""
+def test_a_client_waits_until_the_backlog_has_room(tmp_path: Path) -> None:
+    """If a UNIX socket's backlog is full, connect fails at once."""
     path = str(tmp_path / "s")
     with ExitStack() as stack:
         listener = stack.enter_context(socket.socket(socket.AF_UNIX))
@@ -150,7 +150,7 @@ def test_a_client_waits_until_there_is_room(tmp_path: Path) -> None:
         with pytest.raises(ControlError, match="it is asleep"):
             control.request(path, Where(), 3600, lambda: "it is asleep")
 
-        def make_room() -> None:  # once it has seen that there is none
+        def make_room() -> None:  # after the client has found the backlog full
             stack.enter_context(listener.accept()[0])
             with listener.accept()[0] as client:
                 client.recv(4096)
@@ -162,7 +162,7 @@ def test_a_client_waits_until_there_is_room(tmp_path: Path) -> None:
     assert answer == {"ok": True}
 
 
-def test_a_request_may_come_in_pieces(served: Served) -> None:
+def test_a_request_may_arrive_in_pieces(served: Served) -> None:
     client = served.client(b'{"do": ')
     assert served.requests == []
     client.sendall(b'"stop"}\n')
@@ -188,32 +188,34 @@ def test_a_request_may_come_in_pieces(served: Served) -> None:
         b'{"do": "stop"}' + b" " * control.MAX_REQUEST_BYTES + b"\n",
     ],
 )
-def test_what_is_no_request_is_refused(served: Served, data: bytes) -> None:
+def test_invalid_requests_are_refused(served: Served, data: bytes) -> None:
     client = served.client(data)
     assert served.requests == []
     assert list(answer_to(client)) == ["error"]
 
 
-def test_a_silent_client_is_dropped_when_its_time_is_over(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_client_is_dropped_after_the_time_out(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     client = served.client(b'{"do"')
     served.server.expire()
     other = served.client(b'{"do": "stop"}\n')
-    assert served.requests, "it keeps nobody waiting"
+    assert served.requests, "the silent client does not delay others"
     moved = time.monotonic() + control.REQUEST_S + 1
     monkeypatch.setattr(time, "monotonic", lambda: moved)
     served.server.expire()
     assert "no request within" in str(answer_to(client)["error"])
     served.requests[0][1].ok()
-    assert answer_to(other) == {"ok": True}, "one whose request is being done is not dropped"
+    assert answer_to(other) == {"ok": True}, "a client whose request is in progress is not dropped"
 
 
-def test_too_many_clients_are_turned_away(served: Served) -> None:
+def test_too_many_clients_are_refused(served: Served) -> None:
     refused = {"error": "too many control connections at once"}
     silent = [served.client() for _ in range(control.MAX_CLIENTS)]
     clients = [served.client(b'{"do": "where"}\n') for _ in silent]
-    assert [answer_to(client) for client in silent] == [refused] * len(silent), "the silent make room"
+    assert [answer_to(client) for client in silent] == [refused] * len(silent), (
+        "silent clients are dropped to make room"
+    )
     assert len(served.requests) == control.MAX_CLIENTS
-    assert answer_to(served.client()) == refused, "those that are served do not"
+    assert answer_to(served.client()) == refused, "clients being served are not dropped"
     clients.pop().close()
     served.turn()
     clients.append(served.client(b'{"do": "where"}\n'))
@@ -222,8 +224,8 @@ def test_too_many_clients_are_turned_away(served: Served) -> None:
         client.close()
 
 
-def test_a_client_that_gave_up_is_not_served(served: Served) -> None:
-    """Its user was told that the request had not been answered."""
+def test_the_request_of_a_client_that_has_left_is_dropped(served: Served) -> None:
+    """Its user was told that the request had no answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.connect(served.path)
         client.sendall(b'{"do": "stop"}\n')
@@ -231,7 +233,7 @@ def test_a_client_that_gave_up_is_not_served(served: Served) -> None:
     assert served.requests == []
 
 
-def test_a_client_that_goes_away_before_its_answer_does_no_harm(served: Served) -> None:
+def test_a_client_that_leaves_before_its_answer_does_no_harm(served: Served) -> None:
     served.client(b'{"do": "stop"}\n').close()
     served.turn()
     served.requests[0][1].ok()
@@ -244,14 +246,14 @@ def test_other_users_are_refused(served: Served, monkeypatch: pytest.MonkeyPatch
     own = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: own + 1)
     client = served.client(b'{"do": "stop"}\n')
-    trusted = own == 0  # root may
+    trusted = own == 0  # root is allowed
     assert bool(served.requests) is trusted
     if not trusted:
         assert answer_to(client) == {"error": "only the supervisor's own user and root may control it"}
     client.close()
 
 
-def test_the_socket_is_its_users_alone_and_removed(tmp_path: Path) -> None:
+def test_the_socket_is_private_to_its_user_and_removed_at_the_end(tmp_path: Path) -> None:
     path = tmp_path / "a.sock"
     served = Served(str(path))
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -278,7 +280,7 @@ def test_a_retired_server_still_answers(served: Served) -> None:
     assert answer_to(client) == {"ok": True}
 
 
-def test_asking_and_being_refused(served: Served) -> None:
+def test_request_returns_the_answer_or_raises_its_error(served: Served) -> None:
     got: list[object] = []
 
     def ask() -> None:
@@ -299,7 +301,7 @@ def test_asking_and_being_refused(served: Served) -> None:
         assert got.pop() == outcome
 
 
-def test_asking_in_vain(tmp_path: Path) -> None:
+def test_request_fails_without_a_server_or_without_an_answer(tmp_path: Path) -> None:
     with pytest.raises(ControlError, match="cannot be reached"):
         control.request(str(tmp_path / "none.sock"), Stop(), 1)
     with pytest.raises(ControlError, match="cannot be reached"):
@@ -315,8 +317,8 @@ def test_asking_in_vain(tmp_path: Path) -> None:
     "answer",
     [b"", b"garbage\n", b"[]\n", b'{"ok": "\xff"}\n', b'{"a":' * 12_000 + b"\n", b"x" * (2 * control.MAX_ANSWER_BYTES)],
 )
-def test_whoever_has_taken_the_sockets_path_cannot_make_a_client_fail_otherwise(tmp_path: Path, answer: bytes) -> None:
-    """Its command ends with one line, and has read no more than an answer may have."""
+def test_hostile_answers_raise_a_control_error(tmp_path: Path, answer: bytes) -> None:
+    """The command ends with one line, and reads no more than the largest allowed answer."""
     path = tmp_path / "taken.sock"
     with socket.socket(socket.AF_UNIX) as hijacker:
         hijacker.bind(str(path))
@@ -324,7 +326,7 @@ def test_whoever_has_taken_the_sockets_path_cannot_make_a_client_fail_otherwise(
 
         def reply() -> None:
             taken, _ = hijacker.accept()
-            with taken, suppress(OSError):  # who was asked too much has hung up
+            with taken, suppress(OSError):  # the client closed the connection
                 taken.recv(control.MAX_REQUEST_BYTES)
                 taken.sendall(answer)
 

@@ -1,4 +1,4 @@
-"""Where the control socket is, and what is no place for it."""
+"""The path of the control socket, and folders that are not suitable."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def no_other_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
-def test_it_lies_in_the_users_runtime_folder(tmp_path: Path) -> None:
+def test_the_socket_is_in_the_users_runtime_folder(tmp_path: Path) -> None:
     assert socket_path("a50") == str(tmp_path / "shmio" / "a50.sock")
     assert stat.S_IMODE((tmp_path / "shmio").stat().st_mode) == 0o700
 
 
-def test_a_folder_that_others_may_enter_is_closed(tmp_path: Path) -> None:
+def test_an_open_folder_is_made_private(tmp_path: Path) -> None:
     (tmp_path / "shmio").mkdir(mode=0o777)
     socket_path("a50")
     assert stat.S_IMODE((tmp_path / "shmio").stat().st_mode) == 0o700
@@ -34,7 +34,7 @@ def test_a_symbolic_link_is_not_followed(tmp_path: Path) -> None:
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_a_path_that_is_too_long_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_whose_path_is_too_long_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     deep = tmp_path / ("d" * 100)
     deep.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
@@ -43,6 +43,6 @@ def test_a_path_that_is_too_long_is_passed_over(tmp_path: Path, monkeypatch: pyt
     assert len(path.encode()) <= MAX_PATH_BYTES
 
 
-def test_no_folder_at_all_is_an_error_that_says_why() -> None:
+def test_no_suitable_folder_is_an_error_with_the_reason() -> None:
     with pytest.raises(ControlError, match="longer than 107 bytes"):
         socket_path("a" * 120)

@@ -1,4 +1,4 @@
-"""The processes of a segment: what the supervisor hears from them, and what it does and says."""
+"""The processes of a segment: their reports, and the supervisor's actions and log lines."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from shmio.supervisor.process import AdoptedProcess
 
 
 @pytest.mark.parametrize("holder_is_child", [True, False])
-def test_only_a_stranger_is_evicted_from_a_slot(
+def test_only_an_unknown_process_is_evicted_from_a_slot(
     instance: str, monkeypatch: pytest.MonkeyPatch, holder_is_child: bool
 ) -> None:
-    """The child may take its slot in the moment between the look at the slot's pid and the search for its holder."""
+    """The child may take its slot just before the supervisor looks for the slot's holder."""
     killed: list[int] = []
 
     def holder(slot: ProcessSlot, _shared: SharedObject) -> stale_segment.Worker:
@@ -48,7 +48,7 @@ def test_only_a_stranger_is_evicted_from_a_slot(
             managed = fleet.named("plc")
             managed.child = AdoptedProcess(child.pid, os.pidfd_open(child.pid))
             managed.life = Life(State.STARTING)
-            managed.slot.report = Report(1, Activity.STOPPING, 0, (), "")  # of the process before
+            managed.slot.report = Report(1, Activity.STOPPING, 0, (), "")  # report of the previous process
             fleet.look(time.monotonic_ns())
             assert bool(killed) is not holder_is_child
             os.close(managed.child.pidfd)
@@ -58,9 +58,7 @@ def test_only_a_stranger_is_evicted_from_a_slot(
             segment.unlink()
 
 
-def test_the_log_tells_what_a_recorder_lost_while_it_was_in_trouble(
-    instance: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_log_says_how_many_frames_a_recorder_lost(instance: str, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "shmio.supervisor")
     with Segment.create(instance, [], [ProcessSpec("recorder", "recorder")]) as segment:
         slot = segment.processes.find("recorder")
@@ -81,7 +79,7 @@ def test_the_log_tells_what_a_recorder_lost_while_it_was_in_trouble(
 
 
 class Told:
-    """A process that is told to read anew."""
+    """A process that counts how often it is told to read its rules again."""
 
     def __init__(self) -> None:
         self.times = 0
@@ -93,15 +91,15 @@ class Told:
 @pytest.mark.parametrize(
     ("before", "rules", "told", "known"),
     [
-        (None, None, False, False),  # a kind of process that has no rules
+        (None, None, False, False),  # this kind of process has no rules
         ({}, {}, False, False),
         ({}, {"token": [1]}, True, True),
-        ({"token": [1]}, {"token": [1]}, True, True),  # the token's file may be another
+        ({"token": [1]}, {"token": [1]}, True, True),  # the token's file may have changed
         ({"token": [1]}, {}, True, True),
         ("another supervisor's", {}, True, False),
     ],
 )
-def test_a_process_that_is_kept_is_told_of_rules(
+def test_a_process_that_is_kept_is_told_to_read_changed_rules(
     instance: str, tmp_path: Path, before: Any, rules: Any, told: bool, known: bool
 ) -> None:
     with Segment.create(instance, [], [ProcessSpec("grpc", "grpc")]) as segment:

@@ -1,4 +1,4 @@
-"""The folder of the log files, looked at while the instance runs."""
+"""The check of the log folder while the instance runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.unit.supervisor.harness import Launch, until
 LOOK_NS, SILENT_NS = round(LOOK_S * 1e9), round(SILENT_S * 1e9)
 
 
-def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_does_not_answer_blocks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     answering, looks = threading.Event(), []
 
     def unwritable(folder: Path) -> Obstacle:
@@ -28,12 +28,12 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(tmp_path: Path, monkeypatch
     assert logs.problem(0) == ""
     assert logs.problem(LOOK_NS + 1) == ""
     assert logs.problem(SILENT_NS + 1) == f"log_dir: {tmp_path}: the disk does not answer"
-    assert looks == [tmp_path], "one look at a time"
+    assert looks == [tmp_path], "one check at a time"
     answering.set()
     until(lambda: logs.problem(0) == "log_dir: it is full; log lines are lost until that is fixed")
 
 
-def test_status_tells_of_it_while_it_lasts_and_all_goes_on(launch: Launch, tmp_path: Path) -> None:
+def test_status_reports_the_problem_while_it_lasts_and_processes_continue(launch: Launch, tmp_path: Path) -> None:
     cell = launch()
     cell.wait_state("running")
     pids = cell.pids()

@@ -1,4 +1,4 @@
-"""What a service manager hears, over a socket as its own."""
+"""Notifications to a service manager, received on a socket like systemd's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.unit.supervisor.harness import CELL, DEADLINE_S, Launch
 
 @pytest.fixture(params=["path", "abstract"])
 def manager(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    """A service manager's end, which the environment names."""
+    """The service manager's end of the socket that the environment names."""
     name = f"@shmio-test-{os.getpid()}" if request.param == "abstract" else str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(name.replace("@", "\0"))
@@ -29,13 +29,15 @@ def heard(manager: socket.socket) -> dict[str, str]:
     return dict(line.split("=", 1) for line in manager.recv(4096).decode().split("\n"))
 
 
-def test_a_life_as_it_is_heard(launch: Launch, manager: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notifications_from_start_to_stop(
+    launch: Launch, manager: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "1000000")
     cell = launch([*CELL, ("witness", "emulator", ["good"])])
     told: list[dict[str, str]] = []
 
     def until(begin: str) -> str:
-        """Listen until a line begins like this."""
+        """Receive until a line begins like this."""
         while True:
             told.append(heard(manager))
             for key, value in told[-1].items():
@@ -60,7 +62,7 @@ def test_a_life_as_it_is_heard(launch: Launch, manager: socket.socket, monkeypat
     assert cell.wait_end() == 0
 
 
-def test_a_refused_reload_is_over_at_once(launch: Launch, manager: socket.socket) -> None:
+def test_a_refused_reload_is_reported_as_finished_at_once(launch: Launch, manager: socket.socket) -> None:
     cell = launch()
     cell.wait_state("running")
     with pytest.raises(Exception, match=r"instance\.name"):
@@ -73,18 +75,18 @@ def test_a_refused_reload_is_over_at_once(launch: Launch, manager: socket.socket
     "environment",
     [{}, {"NOTIFY_SOCKET": "relative"}, {"NOTIFY_SOCKET": "/nowhere/at/all"}, {"NOTIFY_SOCKET": "/" + "x" * 300}],
 )
-def test_without_a_listener_nothing_fails(environment: dict[str, str]) -> None:
+def test_without_a_service_manager_notifications_are_skipped(environment: dict[str, str]) -> None:
     notifier = Notifier(environment)
     notifier.ready()
     notifier.beat(1)
 
 
-def test_another_processs_watchdog_is_not_fed(manager: socket.socket) -> None:
+def test_the_watchdog_is_fed_only_for_the_named_process_and_not_too_often(manager: socket.socket) -> None:
     environment = {"NOTIFY_SOCKET": os.environ["NOTIFY_SOCKET"], "WATCHDOG_USEC": "1000"}
     Notifier({**environment, "WATCHDOG_PID": "1"}).beat(1_000_000_000)
     notifier = Notifier({**environment, "WATCHDOG_PID": str(os.getpid())})
     notifier.beat(1_000_000_000)
-    notifier.beat(1_000_400_000)  # not half of 1 ms later
+    notifier.beat(1_000_400_000)  # less than half of 1 ms later
     notifier.beat(1_000_500_000)
     notifier.ready()
     assert [heard(manager) for _ in range(3)] == [{"WATCHDOG": "1"}, {"WATCHDOG": "1"}, {"READY": "1"}]

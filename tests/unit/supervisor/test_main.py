@@ -1,4 +1,4 @@
-"""The supervisor with real processes that crash, hang, refuse and linger."""
+"""The supervisor with real processes that crash, hang, refuse to start or do not stop."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_processes_start_in_order_and_stop_in_reverse(launch: Launch, tmp_path: 
 
 
 @pytest.mark.parametrize("name", ["plc", "cell", "grpc"])
-def test_a_killed_process_comes_back_and_no_other_is_touched(launch: Launch, name: str) -> None:
+def test_a_killed_process_is_restarted_and_no_other(launch: Launch, name: str) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -51,7 +51,7 @@ def test_a_killed_process_comes_back_and_no_other_is_touched(launch: Launch, nam
     assert f"{name} crashed: killed by SIGKILL; starting it again at once" in cell.log()
 
 
-def test_a_process_that_crashes_when_started_is_tried_again(launch: Launch) -> None:
+def test_a_process_that_crashes_at_its_start_is_retried(launch: Launch) -> None:
     cell = launch([("plc", "emulator", ["crash", "crash", "good"])], backoff_first_s=0.05)
     cell.wait_state("running")
     assert cell.of("plc").restarts == 2
@@ -69,11 +69,11 @@ def test_a_process_that_hangs_is_replaced(launch: Launch, behaviour: str) -> Non
     assert "cell crashed: no heartbeat for 0.5 s, killed by SIGKILL" in cell.log()
 
 
-def test_a_process_that_never_gets_ready_is_replaced(launch: Launch) -> None:
+def test_a_process_that_never_becomes_ready_is_replaced(launch: Launch) -> None:
     cell = launch([("cell", "source", ["never", "good"])], start_s=1.5)
     cell.wait_state("running")
     assert "cell hangs, not running 1.5 s after its start: killed" in cell.log()
-    assert cell.of("cell").restarts >= 1, "on a busy machine the next one is late, too"
+    assert cell.of("cell").restarts >= 1, "on a busy host the next process may be late, too"
 
 
 def test_a_process_that_ignores_sigterm_is_killed(launch: Launch) -> None:
@@ -83,13 +83,13 @@ def test_a_process_that_ignores_sigterm_is_killed(launch: Launch) -> None:
     assert "plc does not stop: killed" in cell.log()
 
 
-def test_asking_twice_to_stop_hastens(launch: Launch) -> None:
+def test_a_second_stop_signal_skips_the_grace_time(launch: Launch) -> None:
     cell = launch([("plc", "emulator", ["stubborn"]), ("grpc", "grpc", ["stubborn"])], grace_s=3600)
     cell.wait_state("running")
     cell.process.send_signal(signal.SIGINT)
     cell.wait_state("stopping")
     assert cell.of("grpc").note == "stopping"
-    assert cell.of("plc").state == "running", "its turn has not come"
+    assert cell.of("plc").state == "running", "it is stopped later"
     cell.process.send_signal(signal.SIGINT)
     assert cell.wait_end() == 0
 
@@ -98,18 +98,18 @@ def test_a_refused_configuration_fails_the_start(launch: Launch, tmp_path: Path)
     cell = launch([("plc", "emulator", ["good"]), ("cell", "source", ["unfit"])])
     assert cell.wait_end() == 1
     assert cell.errors() == "cell: no such thing here (exit status 2)\n"
-    assert (tmp_path / "ends").read_text() == "plc\n", "the other one was stopped in good order"
+    assert (tmp_path / "ends").read_text() == "plc\n", "the other process was stopped orderly"
     assert cell.instance not in instances()
 
 
 def test_a_process_that_never_runs_fails_the_start_and_its_traceback_is_kept(launch: Launch) -> None:
     cell = launch([("cell", "source", ["traceback"])], backoff_first_s=0.01)
     assert cell.wait_end() == 1
-    assert cell.errors() == "cell: failed to start 3 times; RuntimeError: as told (exit status 1)\n"
+    assert cell.errors() == "cell: failed to start 3 times; RuntimeError: told to fail (exit status 1)\n"
     assert cell.log("cell").count("Traceback (most recent call last)") == 3
 
 
-def test_a_refusal_later_on_is_fatal_for_that_process_alone(launch: Launch) -> None:
+def test_a_later_refusal_is_fatal_for_that_process_only(launch: Launch) -> None:
     cell = launch([("plc", "emulator", ["good"]), ("cell", "source", ["good", "unfit", "good"])])
     cell.wait_state("running")
     plc = cell.pid("plc")
@@ -133,7 +133,7 @@ def test_restart_replaces_one_process_and_answers_when_it_runs(launch: Launch) -
     assert after == before
 
 
-def test_restart_tells_what_went_wrong(launch: Launch) -> None:
+def test_restart_reports_the_failure(launch: Launch) -> None:
     cell = launch([("cell", "source", ["good", "crash", "good"])])
     cell.wait_state("running")
     with pytest.raises(ControlError, match="cell did not come back: exit status 3"):
@@ -142,7 +142,7 @@ def test_restart_tells_what_went_wrong(launch: Launch) -> None:
         cell.request(Restart("cel"))
 
 
-def test_stop_by_request_answers_when_the_instance_is_gone(launch: Launch) -> None:
+def test_a_stop_request_is_answered_when_the_instance_has_ended(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     where = cell.request(Where())
@@ -162,7 +162,7 @@ def test_a_second_supervisor_is_refused(launch: Launch) -> None:
     assert second.wait_end() == 1
     assert second.errors() == f"instance {cell.instance!r} is already running, supervisor pid {cell.process.pid}\n"
     assert cell.pids() == pids
-    assert cell.request(Restart("plc")) == {"ok": True}, "its control socket is still its own"
+    assert cell.request(Restart("plc")) == {"ok": True}, "the first supervisor still has its control socket"
 
 
 def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(launch: Launch) -> None:
@@ -173,7 +173,7 @@ def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(la
     cell.wait_end()
     status = cell.status()
     assert (status.state, status.supervisor) == ("degraded", None)
-    assert cell.pids() == pids, "they live on"
+    assert cell.pids() == pids, "the processes continue"
     successor = launch()
     successor.wait_state("running")
     assert successor.pids() == pids
@@ -181,8 +181,8 @@ def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(la
     assert successor.stop() == 0
 
 
-def test_a_supervisor_that_fails_leaves_all_to_the_next_one(launch: Launch) -> None:
-    """Whatever the reason; here it tells its state to somebody who has gone."""
+def test_a_failed_supervisor_leaves_the_processes_for_the_next_one(launch: Launch) -> None:
+    """For any reason; here it writes its state to a pipe without a reader."""
     cell = launch([*CELL, ("press", "source", ["good", "unfit"])])
     cell.wait_state("running")
     before = cell.pids()
@@ -202,8 +202,8 @@ def test_a_supervisor_that_fails_leaves_all_to_the_next_one(launch: Launch) -> N
     assert successor.stop() == 0
 
 
-def test_a_process_that_no_supervisor_knows_loses_its_role(launch: Launch) -> None:
-    """As one that a supervisor started in the last moment before its death."""
+def test_an_unknown_process_in_a_slot_is_killed(launch: Launch) -> None:
+    """A supervisor may have started it just before its own death."""
     cell = launch([("plc", "emulator", ["good", "crash", "good"])], backoff_first_s=2)
     cell.wait_state("running")
     os.kill(cell.pid("plc"), signal.SIGKILL)
@@ -250,7 +250,7 @@ def heartbeat_ns(instance: str, name: str) -> int:
         return segment.processes.find(name).heartbeat_ns
 
 
-def test_only_what_is_configured_otherwise_is_replaced_at_a_take_over(launch: Launch) -> None:
+def test_a_take_over_replaces_only_processes_with_a_changed_configuration(launch: Launch) -> None:
     cell = launch([*CELL, ("press", "source", ["good"])])
     cell.wait_state("running")
     before = cell.pids()
@@ -273,19 +273,19 @@ def test_only_what_is_configured_otherwise_is_replaced_at_a_take_over(launch: La
     assert "plc crashed: ended; its exit status is unknown" in successor.log()
 
 
-def test_a_closed_terminal_stops_it_in_good_order(launch: Launch, tmp_path: Path) -> None:
+def test_a_closed_terminal_stops_the_instance_orderly(launch: Launch, tmp_path: Path) -> None:
     cell = launch([("plc", "emulator", ["no end"])], grace_s=0.5)
     cell.wait_state("running")
     cell.process.send_signal(signal.SIGHUP)
     cell.wait_state("stopping")
-    cell.process.send_signal(signal.SIGHUP)  # the shell sends one, too
+    cell.process.send_signal(signal.SIGHUP)  # the shell sends SIGHUP, too
     assert cell.wait_end() == 0
     assert "killing the processes that have not stopped yet" not in cell.log()
     assert cell.instance not in instances()
 
 
-def test_sighup_that_is_ignored_stays_so(launch: Launch) -> None:
-    """As ``nohup`` has it."""
+def test_an_ignored_sighup_stays_ignored(launch: Launch) -> None:
+    """``nohup`` starts it like this."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         cell = launch()
@@ -307,7 +307,7 @@ def test_a_removed_segment_stops_the_instance(launch: Launch, tmp_path: Path) ->
     assert (tmp_path / "ends").read_text().split() == ["grpc", "cell", "plc"]
 
 
-def test_processes_are_out_of_reach_of_ctrl_c(launch: Launch) -> None:
+def test_ctrl_c_does_not_reach_the_processes(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     sessions = {os.getsid(pid) for pid in cell.pids().values() if pid is not None}
@@ -323,7 +323,7 @@ def test_a_stop_during_the_start_stops_what_has_started(launch: Launch) -> None:
     assert cell.instance not in instances()
 
 
-def test_the_segment_tells_who_supervises(launch: Launch, runtime: Path) -> None:
+def test_the_segment_names_its_supervisor(launch: Launch, runtime: Path) -> None:
     cell = launch()
     cell.wait_state("running")
     with Segment.open(cell.instance) as segment:
@@ -332,7 +332,7 @@ def test_the_segment_tells_who_supervises(launch: Launch, runtime: Path) -> None
         assert segment.header.control == str(runtime / "shmio" / f"{cell.instance}.sock")
 
 
-def test_rude_clients_of_the_control_socket_keep_nobody_away(launch: Launch) -> None:
+def test_misbehaving_clients_of_the_control_socket_do_not_block_others(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     with Segment.open(cell.instance) as segment:
@@ -351,7 +351,7 @@ def test_rude_clients_of_the_control_socket_keep_nobody_away(launch: Launch) -> 
             connected(stack).sendall(b'{"do": "where"}\n')  # never reads
         endless = connected(stack)
         with pytest.raises((BrokenPipeError, ConnectionResetError)):
-            endless.sendall(b" " * (64 << 20))  # dropped, or the supervisor would have to keep it all
+            endless.sendall(b" " * (64 << 20))  # dropped, otherwise the supervisor would have to keep all bytes
         for _ in range(control.MAX_CLIENTS):
             connected(stack).sendall(b'{"do"')  # never ends
         assert cell.request(Restart("plc")) == {"ok": True}

@@ -1,4 +1,4 @@
-"""Decisions under a virtual clock."""
+"""Decisions of the supervisor with a simulated clock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ S = 1_000_000_000
 
 @dataclass
 class World:
-    """One process and the time, driven as the supervisor drives them."""
+    """One process and the time; the test drives them as the supervisor does."""
 
     now_ns: int = 1000 * S
     life: Life = field(default_factory=Life)
@@ -43,7 +43,7 @@ class World:
         return event
 
     def starts_again_after(self) -> float:
-        """Wait out the back-off; how long it was."""
+        """Wait for the end of the back-off; return its length in seconds."""
         assert self.state() is State.BACKOFF
         assert self.life.due_ns is not None
         wait_s = (self.life.due_ns - self.now_ns) / S
@@ -70,7 +70,7 @@ def started(world: World) -> World:
 
 @pytest.mark.parametrize("state", State)
 @pytest.mark.parametrize("event", Event)
-def test_every_pair_follows_the_graph(state: State, event: Event) -> None:
+def test_every_state_and_event_follow_the_graph(state: State, event: Event) -> None:
     life = Life(state, starts=1)
     after, action = policy.step(life, event, 5 * S, LIMITS, "why")
     if event in GRAPH[state]:
@@ -87,14 +87,14 @@ def test_the_first_crash_restarts_at_once_and_the_next_ones_back_off_to_a_limit(
         world.happens(Event.EXIT, "killed by SIGKILL")
         assert world.life.note == "killed by SIGKILL"
         waits.append(world.starts_again_after())
-        assert world.life.note == "killed by SIGKILL", "until it works, who looks sees why"
+        assert world.life.note == "killed by SIGKILL", "the status gives the reason until the process is stable"
     world.happens(Event.READY)
     assert world.life.note == ""
     assert waits == [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]
     assert world.life.restarts == 9
 
 
-def test_running_stably_resets_the_backoff(world: World) -> None:
+def test_a_stable_run_resets_the_back_off(world: World) -> None:
     started(world)
     for _ in range(3):
         world.happens(Event.EXIT)
@@ -111,7 +111,7 @@ def test_running_stably_resets_the_backoff(world: World) -> None:
     assert world.starts_again_after() == 0.0
 
 
-def test_a_long_start_is_not_stable_running(world: World) -> None:
+def test_a_long_start_does_not_count_as_a_stable_run(world: World) -> None:
     world.happens(Event.START)
     for crashes in (1, 2):
         world.passes(LIMITS.stable_s + 1)
@@ -120,7 +120,7 @@ def test_a_long_start_is_not_stable_running(world: World) -> None:
         world.starts_again_after()
 
 
-def test_no_report_in_time_is_a_crash(world: World) -> None:
+def test_a_process_that_does_not_report_in_time_has_crashed(world: World) -> None:
     world.happens(Event.START)
     assert world.passes(LIMITS.start_s - 0.001) is None
     assert world.passes(0.001) is Event.ELAPSED
@@ -130,7 +130,7 @@ def test_no_report_in_time_is_a_crash(world: World) -> None:
     assert world.life.crashes == 1
 
 
-def test_a_start_without_a_processor_is_given_more_time_up_to_a_limit(world: World) -> None:
+def test_a_start_that_waits_for_a_processor_gets_more_time_up_to_a_limit(world: World) -> None:
     def after(seconds: float, waited_s: float) -> Event | None:
         world.now_ns = world.life.spawned_ns + round(seconds * S)
         waited_ns = round(waited_s * S)
@@ -138,15 +138,15 @@ def test_a_start_without_a_processor_is_given_more_time_up_to_a_limit(world: Wor
 
     world.happens(Event.START)
     assert after(LIMITS.start_s, 0.5 * LIMITS.start_s) is None
-    assert after(LIMITS.start_s, 0.4 * LIMITS.start_s) is Event.ELAPSED, "it waits for something else"
+    assert after(LIMITS.start_s, 0.4 * LIMITS.start_s) is Event.ELAPSED, "it did not wait for a processor"
     assert after(LIMITS.start_most_s - 1, LIMITS.start_most_s - 2) is None
     assert after(LIMITS.start_most_s, LIMITS.start_most_s - 1) is Event.ELAPSED
     assert world.passes(0, ready=True) is Event.READY
 
 
-def test_silence_while_running_is_a_crash(world: World) -> None:
+def test_a_missing_heartbeat_while_running_is_a_hang(world: World) -> None:
     started(world)
-    assert world.passes(100, quiet_s=LIMITS.hang_s - 0.001) is None, "only silence counts, not time"
+    assert world.passes(100, quiet_s=LIMITS.hang_s - 0.001) is None, "only a missing heartbeat counts, not time"
     assert world.passes(0, quiet_s=LIMITS.hang_s) is Event.HANG
     assert (world.state(), world.last_action()) == (State.HUNG, Action.KILL)
     assert world.passes(LIMITS.kill_s - 0.001, quiet_s=200) is None, "killed once"
@@ -154,12 +154,12 @@ def test_silence_while_running_is_a_crash(world: World) -> None:
     assert world.life.note == "no heartbeat for 5 s, killed by SIGKILL"
 
 
-def test_silence_while_starting_is_none(world: World) -> None:
+def test_a_missing_heartbeat_while_starting_is_ignored(world: World) -> None:
     world.happens(Event.START)
     assert world.passes(LIMITS.start_s - 1, quiet_s=LIMITS.start_s) is None
 
 
-def test_a_refusal_is_fatal_until_asked(world: World) -> None:
+def test_a_refusal_is_fatal_until_a_restart_is_requested(world: World) -> None:
     started(world)
     world.happens(Event.REFUSAL, "no such program")
     assert (world.state(), world.life.note) == (State.FATAL, "no such program")
@@ -169,7 +169,7 @@ def test_a_refusal_is_fatal_until_asked(world: World) -> None:
 
 
 @pytest.mark.parametrize(("code", "event"), [(0, Event.EXIT), (1, Event.EXIT), (2, Event.REFUSAL), (-2, Event.EXIT)])
-def test_what_an_exit_status_means(code: int, event: Event) -> None:
+def test_the_event_of_an_exit_status(code: int, event: Event) -> None:
     assert policy.ended(code) is event
 
 
@@ -203,8 +203,8 @@ def test_a_process_that_sigkill_does_not_end_is_stuck_until_it_ends(world: World
 
 
 @pytest.mark.parametrize("late", [True, False])
-def test_what_was_stuck_and_has_ended_is_told_as_what_hung(world: World, late: bool) -> None:
-    for _ in range(2):  # at the second crash there is a wait before the start
+def test_a_stuck_process_that_ends_is_reported_with_the_reason_of_its_hang(world: World, late: bool) -> None:
+    for _ in range(2):  # the second crash is followed by a back-off
         if late:
             world.happens(Event.START)
             world.passes(LIMITS.start_s)
@@ -220,7 +220,7 @@ def test_what_was_stuck_and_has_ended_is_told_as_what_hung(world: World, late: b
         world.starts_again_after()
 
 
-def test_what_is_stuck_holds_up_no_stop_of_others() -> None:
+def test_a_stuck_process_does_not_delay_the_stop_of_others() -> None:
     stuck = Life(State.STOPPING, starts=1, killed=True, stuck=True)
     processes = [(1, Life(State.RUNNING, starts=1)), (2, stuck)]
     assert policy.to_stop(processes) == [0]
@@ -229,7 +229,7 @@ def test_what_is_stuck_holds_up_no_stop_of_others() -> None:
     assert policy.to_stop([(1, Life(State.RUNNING, starts=1)), (2, replace(stuck, state=State.HUNG))]) == [1]
 
 
-def test_a_restart_asked_for_is_not_held_against_the_process(world: World) -> None:
+def test_a_requested_restart_does_not_count_as_a_crash(world: World) -> None:
     started(world)
     for _ in range(3):
         world.happens(Event.EXIT)
@@ -249,7 +249,7 @@ def lives(*states: tuple[int, State, int]) -> list[tuple[int, Life]]:
     ("processes", "turn"),
     [
         pytest.param(lives((2, State.STOPPED, 0), (0, State.STOPPED, 0), (0, State.STOPPED, 0)), [1, 2], id="lowest"),
-        pytest.param(lives((0, State.STARTING, 1), (1, State.STOPPED, 0)), [], id="wait for the one before"),
+        pytest.param(lives((0, State.STARTING, 1), (1, State.STOPPED, 0)), [], id="wait for the earlier one"),
         pytest.param(lives((0, State.RUNNING, 1), (1, State.STOPPED, 0)), [1], id="it runs"),
         pytest.param(lives((0, State.BACKOFF, 1), (1, State.STOPPED, 0)), [1], id="it failed"),
         pytest.param(lives((0, State.STARTING, 2), (1, State.STOPPED, 0)), [1], id="it tries again"),
@@ -257,7 +257,7 @@ def lives(*states: tuple[int, State, int]) -> list[tuple[int, Life]]:
         pytest.param([], [], id="none"),
     ],
 )
-def test_whose_turn_it_is_to_start(processes: list[tuple[int, Life]], turn: list[int]) -> None:
+def test_which_processes_are_started_next(processes: list[tuple[int, Life]], turn: list[int]) -> None:
     assert policy.to_start(processes) == turn
 
 
@@ -267,26 +267,26 @@ def test_whose_turn_it_is_to_start(processes: list[tuple[int, Life]], turn: list
         pytest.param(
             lives((0, State.RUNNING, 1), (2, State.RUNNING, 1), (2, State.FATAL, 1)), [1, 2], False, id="last"
         ),
-        pytest.param(lives((0, State.RUNNING, 1), (2, State.STOPPING, 1)), [], False, id="wait for the one before"),
+        pytest.param(lives((0, State.RUNNING, 1), (2, State.STOPPING, 1)), [], False, id="wait for the earlier one"),
         pytest.param(lives((0, State.HUNG, 1), (2, State.STOPPED, 1)), [0], False, id="it is gone"),
         pytest.param(lives((0, State.STOPPED, 1), (2, State.STOPPED, 0)), [], True, id="all are gone"),
         pytest.param([], [], True, id="none"),
     ],
 )
-def test_whose_turn_it_is_to_stop(processes: list[tuple[int, Life]], turn: list[int], gone: bool) -> None:
+def test_which_processes_are_stopped_next(processes: list[tuple[int, Life]], turn: list[int], gone: bool) -> None:
     assert policy.to_stop(processes) == turn
     assert policy.all_gone(processes) is gone
 
 
-def test_a_start_fails_by_refusal_or_by_crashing_over_and_over() -> None:
+def test_a_start_fails_by_refusal_or_repeated_crashes() -> None:
     assert policy.start_failure(Life(State.FATAL, note="bad key"), LIMITS) == "bad key"
     crashed = Life(State.BACKOFF, crashes=3, note="exit status 1")
     assert policy.start_failure(crashed, LIMITS) == "failed to start 3 times; exit status 1"
     assert policy.start_failure(replace(crashed, crashes=2), LIMITS) is None
-    assert policy.start_failure(replace(crashed, ran=True), LIMITS) is None, "it has been running"
+    assert policy.start_failure(replace(crashed, ran=True), LIMITS) is None, "it was running before"
 
 
-def test_a_start_is_over_when_all_ran_and_the_sources_have_told() -> None:
+def test_a_start_is_over_when_all_run_and_the_sources_have_reported() -> None:
     ran, new = (0, Life(State.RUNNING, ran=True)), (1, Life(State.STARTING))
     assert not policy.start_over([ran, new], [], 0, 100 * S, LIMITS)
     assert policy.start_over([ran, ran], [Quality.GOOD, Quality.BAD], 100 * S, 100 * S, LIMITS)
@@ -305,5 +305,5 @@ def test_a_start_is_over_when_all_ran_and_the_sources_have_told() -> None:
         ([], [], InstanceState.RUNNING),
     ],
 )
-def test_what_an_instance_is(running: list[bool], qualities: list[Quality | None], state: InstanceState) -> None:
+def test_the_state_of_an_instance(running: list[bool], qualities: list[Quality | None], state: InstanceState) -> None:
     assert assess(running, qualities) is state

@@ -1,4 +1,4 @@
-"""The graph: what the documentation says, and what must hold of every walk through it."""
+"""The state graph: as documented, and consistent on every path."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EDGE = re.compile(r"^ +(\w+) --> (\w+): (\w+)(?: / (\w+))?$", re.MULTILINE)
 EDGES = [(state, event, *edge) for state, edges in GRAPH.items() for event, edge in edges.items()]
 
 
-def test_the_documented_graph_is_the_graph() -> None:
+def test_the_graph_is_as_documented() -> None:
     documented = [
         (State(source), Event(event), State(target), Action(action) if action else None)
         for source, target, event, action in EDGE.findall(PAGE.read_text())
@@ -25,26 +25,26 @@ def test_the_documented_graph_is_the_graph() -> None:
 
 
 @pytest.mark.parametrize(("state", "event", "target", "action"), EDGES)
-def test_an_edge_agrees_with_whether_there_is_a_process(
+def test_edges_start_and_signal_processes_consistently(
     state: State, event: Event, target: State, action: Action | None
 ) -> None:
     alive = state in LIVING and event not in (Event.EXIT, Event.REFUSAL)
     if action is Action.SPAWN:
-        assert not alive, "two processes of one name"
+        assert not alive, "it would start a second process"
         alive = True
     elif action is not None:
-        assert alive, "a signal to no process"
+        assert alive, "it would signal without a process"
     assert alive == (target in LIVING)
 
 
 @pytest.mark.parametrize("state", State)
-def test_every_end_of_a_process_is_noticed(state: State) -> None:
+def test_every_state_with_a_process_handles_its_end(state: State) -> None:
     for event in (Event.EXIT, Event.REFUSAL):
         assert (event in GRAPH[state]) == (state in LIVING)
 
 
 @pytest.mark.parametrize("state", State)
-def test_whatever_the_state_a_stop_ends_in_stopped(state: State) -> None:
+def test_a_stop_in_any_state_ends_in_stopped(state: State) -> None:
     for event in (Event.STOP, Event.HASTEN):
         reached, _ = GRAPH[state].get(event, (state, None))
         if reached in LIVING:
@@ -56,7 +56,7 @@ def test_whatever_the_state_a_stop_ends_in_stopped(state: State) -> None:
 
 
 @pytest.mark.parametrize("state", [state for state in State if state is not State.STOPPING])
-def test_whatever_the_state_a_restart_ends_in_starting(state: State) -> None:
+def test_a_restart_in_any_state_ends_in_starting(state: State) -> None:
     reached, _ = GRAPH[state].get(Event.RESTART, (state, None))
     if reached is State.RESTARTING:
         assert GRAPH[reached][Event.EXIT] == (State.STARTING, Action.SPAWN)
@@ -64,6 +64,6 @@ def test_whatever_the_state_a_restart_ends_in_starting(state: State) -> None:
         assert reached is State.STARTING
 
 
-def test_every_state_can_be_reached_and_is_published() -> None:
+def test_every_state_is_reachable_and_published() -> None:
     reached = {State.STOPPED} | {target for _, _, target, _ in EDGES}
     assert reached == set(State) == set(PHASES)

@@ -1,4 +1,4 @@
-"""One child: what it is given, and its end in words."""
+"""A child process: its description, its environment, and the text about its end."""
 
 from __future__ import annotations
 
@@ -17,30 +17,32 @@ def run(
 ) -> tuple[ChildProcess, int]:
     monkeypatch.setenv("PYTHONPATH", str(folder))
     child = ChildProcess.spawn(module, description, folder / "a.log")
-    assert select.select([child.pidfd], [], [], 30)[0], "its end rings"
+    assert select.select([child.pidfd], [], [], 30)[0], "its end makes the pidfd readable"
     return child, child.reap()
 
 
-def test_a_description_of_any_size_arrives_and_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_description_arrives_completely(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "echo.py").write_text("import json, sys; print(len(json.loads(sys.stdin.read())))")
     child, code = run("echo", tmp_path, monkeypatch, json.dumps("x" * 500_000).encode())
     assert (code, child.last_words()) == (0, "500000")
 
 
-def test_a_child_that_does_not_read_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_that_does_not_read_its_description_blocks_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "deaf.py").write_text("")
     assert run("deaf", tmp_path, monkeypatch, b"x" * 500_000)[1] == 0
 
 
-def test_last_words_are_its_own_and_not_a_predecessors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.log").write_text("words of the one before\n")
+def test_last_words_are_of_this_process_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.log").write_text("words of an earlier process\n")
     (tmp_path / "mute.py").write_text("")
     assert run("mute", tmp_path, monkeypatch)[0].last_words() == ""
     (tmp_path / "logs.py").write_text("print('2026-11-21T05:20:01.000000Z ERROR   cell[12] no such host')")
     assert run("logs", tmp_path, monkeypatch)[0].last_words() == "no such host"
 
 
-def test_a_namesake_in_the_working_directory_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_in_the_working_directory_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here").mkdir()
     (tmp_path / "here" / "logging.py").write_text("raise SystemExit(7)")
     (tmp_path / "honest.py").write_text("import logging, shmio")
@@ -48,7 +50,7 @@ def test_a_namesake_in_the_working_directory_is_not_imported(tmp_path: Path, mon
     assert run("honest", tmp_path, monkeypatch)[1] == 0
 
 
-def test_it_has_a_session_and_descriptors_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_has_a_new_session_and_inherits_no_descriptors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "me.py").write_text(
         "import os; print(os.getsid(0) == os.getpid(), sorted(map(int, os.listdir('/proc/self/fd')))[:-1])"
     )
@@ -65,9 +67,9 @@ def test_it_has_a_session_and_descriptors_of_its_own(tmp_path: Path, monkeypatch
     ("code", "words"),
     [(0, "ended by itself"), (1, "exit status 1"), (-9, "killed by SIGKILL"), (-11, "killed by SIGSEGV")],
 )
-def test_an_end_in_words(code: int, words: str) -> None:
+def test_an_exit_status_in_words(code: int, words: str) -> None:
     assert describe_end(code) == words
 
 
-def test_a_signal_without_a_name() -> None:
+def test_a_signal_without_a_name_in_words() -> None:
     assert describe_end(-50) == "killed by signal 50"

@@ -1,4 +1,4 @@
-"""A running instance that becomes as its configuration is by now, with real processes."""
+"""Reloads of a running instance, with real processes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PRESS: Job = ("press", "source", ["good"])
 
 
 def refused_later(cell: Launched) -> tuple[threading.Thread, list[str]]:
-    """A reload asked for in a thread, and the errors that it will have ended with."""
+    """Request a reload in a thread; return the thread and the list for its errors."""
     outcomes: list[str] = []
 
     def reload() -> None:
@@ -34,7 +34,7 @@ def refused_later(cell: Launched) -> tuple[threading.Thread, list[str]]:
     return asking, outcomes
 
 
-def test_nothing_new_touches_nothing(launch: Launch) -> None:
+def test_a_reload_without_changes_changes_nothing(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -43,7 +43,7 @@ def test_nothing_new_touches_nothing(launch: Launch) -> None:
     assert cell.pids() == before
 
 
-def test_what_is_odd_is_told_as_far_as_an_answer_has_room(launch: Launch) -> None:
+def test_warnings_are_reported_as_far_as_the_answer_has_room(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     assert cell.reload(CELL, warnings=["odd", "odder"])["warnings"] == ["odd", "odder"]
@@ -51,11 +51,11 @@ def test_what_is_odd_is_told_as_far_as_an_answer_has_room(launch: Launch) -> Non
     assert 0 < len(told) < 100
     assert told[-1] == f"… and {1000 - len(told) + 1} more warnings: shmio-supervisor check prints them"
     told = cell.reload(CELL, warnings=["\1" * 9000] * 60)["warnings"]
-    assert told[0] == "\1" * 1999 + "…", "six bytes each on their way"
+    assert told[0] == "\1" * 1999 + "…", "six bytes each in the answer"
     assert told[-1] == f"… and {60 - len(told) + 1} more warnings: shmio-supervisor check prints them"
 
 
-def test_the_configuration_is_as_old_as_its_last_good_reload(launch: Launch) -> None:
+def test_the_age_of_the_configuration_is_that_of_the_last_successful_reload(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     times = [cell.request(Where())["read_ns"]]
@@ -67,7 +67,7 @@ def test_the_configuration_is_as_old_as_its_last_good_reload(launch: Launch) -> 
     assert times[0] < times[1] == cell.request(Where())["read_ns"]
 
 
-def test_a_source_is_added_and_nothing_else_is_touched(launch: Launch) -> None:
+def test_a_source_is_added_and_nothing_else_changes(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -104,7 +104,7 @@ def test_a_source_is_removed_and_its_place_is_used_again(launch: Launch) -> None
     assert [slot.name for slot in segment.processes.guests] == ["guest-1", "guest-2", "guest-3", "guest-4"]
 
 
-def test_what_is_configured_otherwise_is_replaced(launch: Launch) -> None:
+def test_a_process_with_a_changed_configuration_is_replaced(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -117,7 +117,7 @@ def test_what_is_configured_otherwise_is_replaced(launch: Launch) -> None:
     assert cell.reload(changed)["done"] == []
 
 
-def test_another_layout_replaces_block_and_source_and_streams_go_on(launch: Launch) -> None:
+def test_another_layout_replaces_block_and_source_and_streams_continue(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -153,8 +153,8 @@ def test_a_wrong_configuration_changes_nothing(launch: Launch) -> None:
     assert cell.pids() == before
 
 
-def test_a_reload_that_fails_by_a_fault_changes_nothing(launch: Launch) -> None:
-    """As of a connector that is not ours."""
+def test_a_reload_that_fails_with_an_exception_changes_nothing(launch: Launch) -> None:
+    """A third-party connector may cause one."""
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -166,7 +166,7 @@ def test_a_reload_that_fails_by_a_fault_changes_nothing(launch: Launch) -> None:
     assert cell.reload(CELL)["done"] == []
 
 
-def test_what_goes_is_stopped_in_the_order_of_a_stop(launch: Launch) -> None:
+def test_removed_processes_are_stopped_in_the_order_of_a_stop(launch: Launch) -> None:
     cell = launch([*CELL, ("press", "source", ["stubborn"])], grace_s=3600)
     cell.wait_state("running")
     press = cell.pid("press")
@@ -174,7 +174,7 @@ def test_what_goes_is_stopped_in_the_order_of_a_stop(launch: Launch) -> None:
     reloading.start()
     until(lambda: cell.of("press").note == "stopping")
     plc = cell.of("plc")
-    assert (plc.state, plc.note) == ("running", ""), "an emulator, or a recorder, outlives the sources"
+    assert (plc.state, plc.note) == ("running", ""), "emulators and recorders are stopped after the sources"
     os.kill(press, signal.SIGKILL)
     reloading.join()
     assert list(cell.pids()) == ["cell", "grpc"]
@@ -188,7 +188,7 @@ def test_what_goes_is_stopped_in_the_order_of_a_stop(launch: Launch) -> None:
         ({"stepped": True}, "instance.clock"),
     ],
 )
-def test_what_cannot_change_is_refused_by_its_key(launch: Launch, others: dict[str, Any], refused: str) -> None:
+def test_a_key_that_cannot_change_is_named_in_the_refusal(launch: Launch, others: dict[str, Any], refused: str) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -197,7 +197,7 @@ def test_what_cannot_change_is_refused_by_its_key(launch: Launch, others: dict[s
     assert cell.pids() == before
 
 
-def test_no_room_changes_nothing(launch: Launch) -> None:
+def test_a_reload_without_room_changes_nothing(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -212,8 +212,8 @@ def test_no_room_changes_nothing(launch: Launch) -> None:
         assert list(segment.blocks) == ["cell"]
 
 
-def test_when_the_blocks_are_used_up_the_instance_goes_on_as_it_is(launch: Launch) -> None:
-    """Ten sources of which each reload changes the layout: four of these are all that an instance has room for."""
+def test_without_free_blocks_the_instance_continues_unchanged(launch: Launch) -> None:
+    """Each reload changes the layout of ten sources; an instance has room for four such reloads."""
     names = [f"cell-{i}" for i in range(10)]
 
     def jobs(layout: str) -> list[Any]:
@@ -230,18 +230,18 @@ def test_when_the_blocks_are_used_up_the_instance_goes_on_as_it_is(launch: Launc
             cell.reload(jobs("new"))
         assert (segment.shared.size, segment.generation) == (size, generation)
         cursor = segment.blocks[names[0]].cursor()
-        assert cursor.next(20) is not None, "frames go on"
+        assert cursor.next(20) is not None, "frames continue"
     assert cell.pids() == before
     assert cell.status().state == "running"
     assert cell.request(Restart(names[0])) == {"ok": True}
-    assert cell.reload(jobs("old")[1:])["done"] == [f"{names[0]}: stopped"], "what needs no block is done"
+    assert cell.reload(jobs("old")[1:])["done"] == [f"{names[0]}: stopped"], "a change that needs no block is done"
 
 
-def test_another_size_of_rings_replaces_the_blocks_that_it_changes(launch: Launch) -> None:
+def test_another_ring_size_replaces_only_affected_blocks(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
-    assert cell.reload(CELL, ring=1 << 24)["kept"] == ["plc", "cell", "grpc"], "the ring had its 8 s already"
+    assert cell.reload(CELL, ring=1 << 24)["kept"] == ["plc", "cell", "grpc"], "the ring already had room for 8 s"
     with shmio.attach(cell.instance) as reader:
         old = reader.block("cell")
         stream = reader.stream("cell", timeout_s=20)
@@ -260,7 +260,7 @@ def test_another_size_of_rings_replaces_the_blocks_that_it_changes(launch: Launc
     assert after == before
 
 
-def test_what_does_not_run_is_told_and_the_rest_goes_on(launch: Launch) -> None:
+def test_a_new_process_that_does_not_run_is_reported_and_the_rest_continues(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -274,8 +274,8 @@ def test_what_does_not_run_is_told_and_the_rest_goes_on(launch: Launch) -> None:
     assert cell.of("press").state == "running"
 
 
-def test_while_a_reload_is_planned_the_supervisor_looks_after_all(launch: Launch) -> None:
-    """To compile a big layout takes seconds."""
+def test_the_supervisor_works_while_a_reload_is_planned(launch: Launch) -> None:
+    """Compiling a large layout takes seconds."""
     cell = launch()
     cell.wait_state("running")
     os.mkfifo(cell.folder / "slow")
@@ -283,7 +283,7 @@ def test_while_a_reload_is_planned_the_supervisor_looks_after_all(launch: Launch
     answers: list[dict[str, Any]] = []
     asking = threading.Thread(target=lambda: answers.append(cell.request(Reload())))
     asking.start()
-    with (cell.folder / "slow").open("w"):  # it is being planned, and will not be done before this is closed
+    with (cell.folder / "slow").open("w"):  # planning is not done before this is closed
         with pytest.raises(ControlError, match="another reload is being prepared: try again when it is done"):
             cell.request(Reload())
         os.kill(cell.pid("cell"), signal.SIGKILL)
@@ -310,7 +310,7 @@ def test_a_stop_does_not_wait_for_a_plan(launch: Launch) -> None:
     assert outcomes == ["the instance is stopping"]
 
 
-def test_a_plan_that_does_not_come_is_given_up_and_another_one_made(launch: Launch) -> None:
+def test_a_plan_that_takes_too_long_is_given_up_and_another_can_be_made(launch: Launch) -> None:
     cell = launch(plan_s=2)
     cell.wait_state("running")
     before = cell.pids()
@@ -324,7 +324,7 @@ def test_a_plan_that_does_not_come_is_given_up_and_another_one_made(launch: Laun
     assert cell.stop() == 0
 
 
-def test_a_stop_ends_a_change_under_way(launch: Launch) -> None:
+def test_a_stop_ends_a_reload_in_progress(launch: Launch) -> None:
     cell = launch([*CELL, ("press", "source", ["stubborn"])], grace_s=3600)
     cell.wait_state("running")
     asking, outcomes = refused_later(cell)

@@ -8,7 +8,7 @@ from shmio.errors import ConfigError
 from shmio.supervisor.start import LOCK_NAME, hold_log_folder
 
 
-def test_a_second_instance_is_refused_by_the_name_of_the_first(tmp_path: Path) -> None:
+def test_a_second_instance_in_a_log_folder_is_refused_and_the_first_named(tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     refused = pytest.raises(ConfigError, match=r"instance\.log_dir: instance 'a50' writes its logs")
     with hold_log_folder(folder, "a50"), refused, hold_log_folder(folder, "b50"):
@@ -17,7 +17,7 @@ def test_a_second_instance_is_refused_by_the_name_of_the_first(tmp_path: Path) -
         assert (folder / LOCK_NAME).read_text() == "b50\n"
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+def test_a_log_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "logs").touch()
     with (
         pytest.raises(ConfigError, match=r"instance\.log_dir: cannot write .*logs"),
@@ -26,7 +26,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         pass
 
 
-def test_what_a_link_leads_to_is_not_touched(tmp_path: Path) -> None:
+def test_the_target_of_a_link_is_not_changed(tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("as it was")
     (tmp_path / LOCK_NAME).symlink_to("precious")
     with pytest.raises(ConfigError, match=r"instance\.log_dir: cannot write"), hold_log_folder(tmp_path, "a50"):

@@ -1,4 +1,4 @@
-"""Processes that not even SIGKILL ends: named to who waits for them, waited for by nobody else, and gone on from."""
+"""Processes that not even SIGKILL ends: they are reported, and delay nothing else."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STUCK = "pid {pid} was killed and still runs: remove the cause, or restart the h
 
 
 def held(launch: Launch, name: str) -> tuple[Launched, int, str]:
-    """A cell in which the process of this name cannot be ended; its pid, and what is to be said of it."""
+    """Return a cell with a process that cannot be ended, its pid, and the expected report."""
     jobs = [(n, kind, ["stubborn", "good"] if n == name else behaviour) for n, kind, behaviour in CELL]
     cell = launch(jobs, grace_s=0.05, kill_s=0.05)
     cell.wait_state("running")
@@ -26,7 +26,7 @@ def held(launch: Launch, name: str) -> tuple[Launched, int, str]:
     return cell, pid, f"{name}: {STUCK.format(pid=pid)}"
 
 
-def test_a_restart_names_what_does_not_end_and_goes_on_when_it_has(launch: Launch) -> None:
+def test_a_restart_names_a_stuck_process_and_continues_after_its_end(launch: Launch) -> None:
     cell, pid, stuck = held(launch, "cell")
     for _ in range(2):
         with pytest.raises(ControlError) as caught:
@@ -43,7 +43,7 @@ def test_a_restart_names_what_does_not_end_and_goes_on_when_it_has(launch: Launc
     assert cell.of("cell").note == ""
 
 
-def test_a_process_that_hangs_and_cannot_be_killed_is_told_by_status(launch: Launch) -> None:
+def test_status_reports_a_hanging_process_that_cannot_be_killed(launch: Launch) -> None:
     cell = launch([("cell", "source", ["good"])], hang_s=0.5, kill_s=0.05)
     cell.wait_state("running")
     (cell.folder / "held").touch()
@@ -55,7 +55,7 @@ def test_a_process_that_hangs_and_cannot_be_killed_is_told_by_status(launch: Lau
     until(lambda: cell.of("cell").state == "running" and cell.of("cell").restarts == 1)
 
 
-def test_a_reload_names_what_does_not_end_and_goes_on_when_it_has(launch: Launch) -> None:
+def test_a_reload_names_a_stuck_process_and_continues_after_its_end(launch: Launch) -> None:
     cell, pid, stuck = held(launch, "cell")
     with pytest.raises(ControlError) as caught:
         cell.reload([*CELL[:1], *CELL[2:]])
@@ -68,7 +68,7 @@ def test_a_reload_names_what_does_not_end_and_goes_on_when_it_has(launch: Launch
     assert cell.reload([*CELL[:1], *CELL[2:]])["kept"] == ["plc", "grpc"]
 
 
-def test_a_stop_names_what_does_not_end_and_stops_all_else(launch: Launch) -> None:
+def test_a_stop_names_a_stuck_process_and_stops_all_others(launch: Launch) -> None:
     cell, pid, stuck = held(launch, "cell")
     others = [os.pidfd_open(cell.pid(name)) for name in ("plc", "grpc")]
     for _ in range(2):
@@ -85,7 +85,7 @@ def test_a_stop_names_what_does_not_end_and_stops_all_else(launch: Launch) -> No
     assert cell.instance not in instances()
 
 
-def test_a_start_fails_that_cannot_end_what_never_got_ready(launch: Launch) -> None:
+def test_a_start_fails_if_an_unready_process_cannot_be_ended(launch: Launch) -> None:
     cell = launch([("cell", "source", ["never"])], start_s=0.5, kill_s=0.05)
     (cell.folder / "held").touch()
     until((cell.folder / "cell.starts").exists)
@@ -96,7 +96,7 @@ def test_a_start_fails_that_cannot_end_what_never_got_ready(launch: Launch) -> N
     assert cell.errors() == f"cell: {STUCK.format(pid=pid)}\n"
 
 
-def test_a_take_over_fails_that_cannot_end_what_hangs_and_leaves_the_rest(launch: Launch) -> None:
+def test_a_take_over_fails_if_a_hanging_process_cannot_be_ended(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()

@@ -1,4 +1,4 @@
-"""A take-over that fails leaves everything as it was: what runs goes on, for the next attempt."""
+"""A take-over that fails changes nothing: the processes continue for the next attempt."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.unit.supervisor.harness import CELL, Job, Launch
 
 
-def test_no_place_for_the_control_socket(launch: Launch, runtime: Path) -> None:
+def test_a_take_over_without_a_control_socket_changes_nothing(launch: Launch, runtime: Path) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
@@ -27,7 +27,7 @@ def test_no_place_for_the_control_socket(launch: Launch, runtime: Path) -> None:
     assert successor.stop() == 0
 
 
-def test_no_room_for_what_is_new(launch: Launch) -> None:
+def test_a_take_over_without_room_for_new_processes_changes_nothing(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()

@@ -1,4 +1,4 @@
-"""The broker of the tests."""
+"""The test fixture that runs mosquitto."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ with reserved_port() as address:
 
 @pytest.mark.skipif(bool(missing()), reason=missing())
 @pytest.mark.skipif(not TETHER, reason="setpriv is not installed: it is in util-linux")
-def test_it_does_not_outlive_a_test_run_that_is_killed(tmp_path: Path) -> None:
+def test_it_ends_with_a_killed_test_run(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as run:
         assert run.stdout is not None

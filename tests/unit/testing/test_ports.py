@@ -8,7 +8,7 @@ from shmio.testing.ports import reserved_port
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-def test_refuses_until_somebody_listens(host: str) -> None:
+def test_a_reserved_port_refuses_until_a_server_listens(host: str) -> None:
     with reserved_port(host) as address:
         place = (address.host, address.port)
         with pytest.raises(ConnectionRefusedError):
@@ -21,6 +21,6 @@ def test_refuses_until_somebody_listens(host: str) -> None:
                 assert peer.recv(1) == b"x"
 
 
-def test_two_are_never_the_same() -> None:
+def test_two_reserved_ports_differ() -> None:
     with reserved_port() as first, reserved_port() as second:
         assert first != second

@@ -1,4 +1,4 @@
-"""Each fault, seen from a plain socket."""
+"""Each fault of the fault proxy, seen by a plain socket."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def frame(payload: bytes) -> bytes:
 
 @pytest.fixture
 def server() -> Iterator[Address]:
-    """A server that sends back what it receives."""
+    """A server that returns what it receives."""
     listener = socket.create_server(("127.0.0.1", 0))
     threads: list[threading.Thread] = []
 
@@ -73,7 +73,7 @@ def assert_echo(client: socket.socket, data: bytes = b"hello") -> None:
     assert receive(client, len(data)) == data
 
 
-def test_relays(proxy: FaultProxy) -> None:
+def test_relays_to_several_clients(proxy: FaultProxy) -> None:
     with connect(proxy) as first, connect(proxy) as second:
         assert_echo(first)
         assert_echo(second)
@@ -89,7 +89,7 @@ def test_relays_much_more_than_any_buffer(proxy: FaultProxy) -> None:
         sender.join()
 
 
-def test_hands_on_the_end_of_a_stream_after_its_data(proxy: FaultProxy) -> None:
+def test_passes_on_the_end_of_a_stream_after_its_data(proxy: FaultProxy) -> None:
     proxy.delay(0.02, 0.02)
     with connect(proxy) as client:
         client.sendall(b"last words")
@@ -106,10 +106,10 @@ def test_delays_both_ways_without_limiting_throughput(proxy: FaultProxy) -> None
         assert receive(client, 1000)[4::5] == bytes(range(200))
         taken_s = time.monotonic() - begun_s
     assert taken_s >= 0.25
-    # One after the other they would have taken 50 s; the time-out of the test is the bound.
+    # In sequence they would take 50 s, longer than the time-out of the test.
 
 
-def test_a_shorter_delay_does_not_overtake(proxy: FaultProxy) -> None:
+def test_a_shorter_delay_does_not_reorder_data(proxy: FaultProxy) -> None:
     with connect(proxy) as client:
         proxy.delay(0.2, 0.0)
         client.sendall(b"first")
@@ -240,7 +240,7 @@ def test_pass_all_ends_faults(proxy: FaultProxy) -> None:
     assert not proxy.wait_held(0)
 
 
-def test_without_framing_pieces_are_frames(server: Address) -> None:
+def test_without_framing_each_piece_is_a_frame(server: Address) -> None:
     with FaultProxy(server, framing=None) as proxy, connect(proxy) as client:
         proxy.edit(bytes.upper)
         client.sendall(b"plain text")
@@ -257,4 +257,4 @@ def test_stop_ends_everything(server: Address) -> None:
         assert client.recv(1) == b""
     with pytest.raises(ConnectionRefusedError):
         connect(proxy)
-    assert threading.active_count() <= before + 1  # the echo server's own
+    assert threading.active_count() <= before + 1  # the echo server's own thread

@@ -1,4 +1,4 @@
-"""Inject of version 2, over real sockets: the paths of originals and values, and when an injection ends."""
+"""Inject of version 2, over real sockets: paths, and when an injection ends."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ async def shadow(served: Endpoint, target: str, prefix: str = "shadow/test 1", s
 async def reaches(served: Endpoint, device: Plant, step: bytes) -> None:
     """Wait until the device has the value.
 
-    Write returns when the source has accepted it; the device gets it a cycle later."""
+    Write returns when the source has accepted it; the device gets it a cycle later.
+    """
 
     async def condition() -> bool:
         return device.memory[12:14] == step

@@ -1,4 +1,4 @@
-"""A model in JavaScript computes a source, on Node's gRPC stack, which shares no code with Python's."""
+"""A model in JavaScript computes a source, on Node's own gRPC stack."""
 
 from __future__ import annotations
 

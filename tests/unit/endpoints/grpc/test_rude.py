@@ -1,4 +1,4 @@
-"""Clients that disconnect, stop half-way, send garbage or never read: they leave nothing, and others continue."""
+"""Clients that disconnect, stop half-way, send garbage or never read leave nothing behind."""
 
 from __future__ import annotations
 

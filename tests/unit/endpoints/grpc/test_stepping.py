@@ -1,4 +1,4 @@
-"""Time controlled by clients: what streams receive of a step, in which order, and when the call returns."""
+"""Time controlled by clients: what streams receive of a step, and when the call returns."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_every_value_of_a_step_comes_before_its_one_marker(instance: str) -> Non
 
 
 def test_all_streams_have_received_a_step_when_its_call_returns(instance: str) -> None:
-    """Messages that the server has written by then arrive before the answer, as they share a connection."""
+    """Messages written before the answer arrive before it, as they share a connection."""
 
     async def test(served: Endpoint, models: Models) -> None:
         streams = [await served.subscriber(str(n), "sim/count", "SIMLOG://step") for n in range(5)]
@@ -200,7 +200,7 @@ def test_a_step_applies_the_values_published_before_it_by_version_1(instance: st
 
 
 def test_a_step_applies_values_that_arrive_in_one_packet_with_it(instance: str) -> None:
-    """Values and step follow each other on the wire, and the endpoint reads them in different calls."""
+    """Values and step follow each other on the wire, but the endpoint reads them in two calls."""
 
     async def test(served: Endpoint, models: Models) -> None:
         goal = await open_v1(served, "sim/goal")

@@ -1,4 +1,4 @@
-"""Structures of known shape: a message type each in version 1, and values in version 2, both ways."""
+"""Structures of known shape: message types of version 1, and values of version 2."""
 
 from __future__ import annotations
 

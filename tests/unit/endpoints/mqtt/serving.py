@@ -1,4 +1,4 @@
-"""The broker that shmio starts, run in a thread as in its process; and a client that sends raw packets."""
+"""The broker that shmio starts, run in a thread; and a client that sends raw packets."""
 
 from __future__ import annotations
 

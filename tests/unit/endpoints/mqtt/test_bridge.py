@@ -47,7 +47,7 @@ def test_a_later_subscriber_gets_the_current_values(segment: Segment, broker: Mo
 
 
 def test_bad_quality_is_published_on_each_topic(segment: Segment, broker: Mosquitto) -> None:
-    """The text topic is emptied, also for later subscribers; the JSON topic has the last value, marked as bad."""
+    """The text topic is emptied, also for later subscribers; the JSON value is marked as bad."""
     rules = [MqttTopic(match="cell/step", payload="json")]
     writer = segment.writer("cell")
     writer.publish(image(position=1.5, step=3), cycle=1)
@@ -209,7 +209,10 @@ def test_a_rate_limit_skips_values_but_never_the_last(segment: Segment, broker: 
 
 
 def test_a_structure_is_one_message_for_each_frame_that_changes_it(segment: Segment, broker: Mosquitto) -> None:
-    """It has all members that no earlier rule matches; a rule that names a register itself sends it alone."""
+    """It has all members that no earlier rule matches.
+
+    If a rule names a register itself, the register is sent alone.
+    """
     rules = [
         MqttTopic(match="cell/long", publish=False),
         MqttTopic(match=["cell/axis", "cell/step"], payload="structure"),

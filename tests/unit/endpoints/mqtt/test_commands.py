@@ -142,7 +142,10 @@ def test_a_retained_command_is_not_carried_out(segment: Segment, broker: Mosquit
 def test_a_retained_command_of_a_bridged_broker_is_not_carried_out(
     segment: Segment, make_broker: Callable[..., Mosquitto], tmp_path: Path
 ) -> None:
-    """A broker bridged to ours: whenever their connection is restored, ours takes its retained messages as new."""
+    """A second broker is bridged to ours.
+
+    Whenever their connection is restored, ours receives the retained messages as new ones.
+    """
     (tmp_path / "elsewhere").mkdir()
     with reserved_port() as address:
         elsewhere = Mosquitto(tmp_path / "elsewhere", address)

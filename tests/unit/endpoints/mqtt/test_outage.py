@@ -141,7 +141,7 @@ def test_the_bridge_reconnects_to_a_broker_killed_repeatedly(segment: Segment, b
 def test_another_client_misses_no_change_though_the_broker_is_killed_repeatedly(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Under load, with the bridge's connection frozen before each kill, so that it gets no more acknowledgements.
+    """The bridge's connection is frozen before each kill, so that it gets no acknowledgement.
 
     A message that a broker has acknowledged and then lost cannot be sent again.
     """

@@ -1,4 +1,4 @@
-"""The queue to the broker: order, conflation, and the bounded backlog for outages. No broker runs."""
+"""The queue to the broker: order, conflation, and the bounded backlog. No broker runs."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def test_a_broker_slower_than_the_changes_still_catches_up() -> None:
 
 
 def test_a_change_after_the_resend_is_sent() -> None:
-    """Messages of the backlog are sent without the retain flag, so the broker would still retain the older value."""
+    """The backlog is sent without the retain flag, so the broker would retain an older value."""
     connection = FakeConnection()
     outbox, a, b = Outbox(connection, connection, 10_000), Counter("a"), Counter("b")
     connection.room = 1

@@ -1,4 +1,4 @@
-"""An instance that is reloaded: sources are added, removed and changed, and stale retained topics are cleared."""
+"""Reloads: sources are added, removed and changed, and obsolete retained topics are cleared."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_changed_source_continues_and_topics_of_removed_registers_are_cleared(
 
 
 def test_topics_of_earlier_rules_are_cleared(segment: Segment, broker: Mosquitto) -> None:
-    """A reload of the rules restarts the bridge, which must clear values that no rule updates any more."""
+    """The reload restarts the bridge, which must clear topics that no rule updates any more."""
     segment.writer("cell").publish(image(step=1), cycle=1)
     before = [MqttTopic(match="cell/inputs", elements=True), MqttTopic(match="cell", payload="frames")]
     with bridge(segment, broker.address, topic=before) as running:

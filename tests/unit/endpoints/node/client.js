@@ -1,4 +1,4 @@
-// Calls SimlogAPI version 2 as existing clients do, and prints what came of each step: one JSON object.
+// Calls SimlogAPI version 2 as existing clients do, and prints the result of each step: one JSON object.
 // Usage: node client.js ADDRESS PROTO
 'use strict';
 
@@ -11,14 +11,14 @@ const { SimlogAPI } = grpc.loadPackageDefinition(definition).simlog.server;
 const client = new SimlogAPI(address, grpc.credentials.createInsecure());
 const deadline = () => ({ deadline: Date.now() + 60000 });
 
-// The answer of a call, or the name of the status it ended with.
+// Returns the answer of a call, or the name of the status with which it ended.
 const call = (name, request) =>
   new Promise((resolve) =>
     client[name](request, deadline(), (error, answer) => resolve(error ? grpc.status[error.code] : answer)));
 
 const number = (value) => ({ type: 'NUMBER', value: { numberValue: value } });
 
-// A google.protobuf.Value as JavaScript's.
+// Converts a google.protobuf.Value to a JavaScript value.
 function plain(value) {
   if (value.kind === 'listValue') return value.listValue.values.map(plain);
   if (value.kind === 'structValue') {
@@ -28,7 +28,7 @@ function plain(value) {
   return value.kind === 'nullValue' ? null : value[value.kind];
 }
 
-// A subscriber's stream: everything that came, and a promise of what is still to come.
+// A subscriber's stream: the messages so far, and a promise of a later one.
 class Stream {
   constructor(uuid) {
     this.seen = [];
@@ -85,7 +85,7 @@ async function main() {
   result.refused = await call('Write', { topic: 'cell/step', data: { value: { stringValue: 'seven' } } });
   result.secret = await call('Write', { topic: 'cell/secret', data: number(1) });
   const shadow = await call('Inject', { targetPath: 'CELL://step/in', shadowPathPrefix: 'a/b' });
-  await call('Write', { topic: shadow.shadowPathIn, data: number(20) }); // before any message has come
+  await call('Write', { topic: shadow.shadowPathIn, data: number(20) }); // before any message was received
   result.given = await stream.until('CELL://step/out', 20);
   await call('Subscribe', { path: shadow.shadowPathOut, subscriberUUID: 'u-1' });
   result.original = await call('Write', { topic: 'CELL://step/in', data: number(9) });

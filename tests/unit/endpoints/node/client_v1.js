@@ -1,4 +1,4 @@
-// Calls SimlogAPI version 1 as existing clients do, and prints what came of each step: one JSON object.
+// Calls SimlogAPI version 1 as existing clients do, and prints the result of each step: one JSON object.
 // Usage: node client_v1.js ADDRESS PROTO
 'use strict';
 
@@ -15,7 +15,7 @@ const call = (name, request) =>
   new Promise((resolve) =>
     client[name](request, deadline(), (error, answer) => resolve(error ? grpc.status[error.code] : answer)));
 
-// One topic: everything that came, and a promise of what is still to come.
+// One topic: the messages so far, and a promise of a later one.
 class Stream {
   constructor(call) {
     this.seen = [];

@@ -1,5 +1,5 @@
-// A model of a source of the connector "remote", for Node: joins it, answers its steps, and prints what it was told, as
-// one JSON object, when the stream is over. Usage: node model.js ADDRESS PROTO SOURCE
+// A model for a source of the connector "remote": joins it, answers its steps, and prints what it received, as
+// one JSON object, when the stream has ended. Usage: node model.js ADDRESS PROTO SOURCE
 'use strict';
 
 const grpc = require('@grpc/grpc-js');
@@ -10,13 +10,13 @@ const definition = loader.loadSync(proto, { keepCase: true, longs: Number, enums
 const { Shmio } = grpc.loadPackageDefinition(definition).shmio.v1;
 const client = new Shmio(address, grpc.credentials.createInsecure());
 
-// The field of Values that a register's values are in, by the number of its column.
+// The field of Values that has the values of a column, by the column's number.
 const FIELDS = {
   COLUMN_BOOL: 'bools', COLUMN_INT32: 'int32s', COLUMN_INT64: 'int64s', COLUMN_UINT64: 'uint64s', COLUMN_FLOAT: 'floats',
   COLUMN_DOUBLE: 'doubles', COLUMN_TEXT: 'texts',
 };
 
-// The values of a table's scalars by now: those of a message, over those before.
+// Returns the current values of a table's scalars: those of a message, and earlier ones for the rest.
 function take(table, values, known) {
   for (const [column, field] of Object.entries(FIELDS)) {
     const part = values && values[field];

@@ -1,6 +1,6 @@
-// Ill-treats each of the calls that are given on standard input, and prints what became of them: one JSON object.
-// Usage: node rude.js ADDRESS ACT < CALLS, a list of {method, request (base64)}. With the act `hold` all calls are left
-// open, each with its message sent, and who has started this program ends it.
+// Mistreats each of the calls given on standard input, and prints how they ended: one JSON object.
+// Usage: node rude.js ADDRESS ACT < CALLS, a list of {method, request (base64)}. With the act `hold` all calls stay
+// open, each with its message sent, until this program is killed.
 'use strict';
 
 const grpc = require('@grpc/grpc-js');
@@ -13,7 +13,7 @@ const raw = (data) => data;
 function begin(call, ms = 60000) {
   const stream = client.makeBidiStreamRequest(call.method, raw, raw, { deadline: Date.now() + ms });
   const ended = new Promise((resolve) => {
-    stream.on('error', () => {}); // its status tells
+    stream.on('error', () => {}); // the status is enough
     stream.on('status', (status) => resolve(grpc.status[status.code]));
   });
   const answered = new Promise((resolve) => {

@@ -1,9 +1,9 @@
-// Decodes and encodes payloads of Sparkplug B by another implementation, Eclipse Tahu's.
+// Decodes and encodes payloads of Sparkplug B with another implementation, Eclipse Tahu's.
 // Usage: node sparkplug.js < LINES, each {decode: base64} or {encode: payload}; prints a list with an answer to each.
 "use strict";
 const { decodePayload, encodePayload } = require("sparkplug-payload").get("spBv1.0");
 
-// A Long as a number. The library gives one of Int64 as unsigned where its Long is not the protobuf library's own.
+// Converts a Long to a number. The library treats an Int64 as unsigned if its Long is not the protobuf library's.
 function plain(metric) {
   const long = metric.value;
   if (typeof long !== "object" || long === null || !("low" in long)) return metric;

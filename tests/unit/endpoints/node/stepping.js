@@ -1,4 +1,4 @@
-// Drives time as existing clients of both generations do, and prints what came of it: one JSON object.
+// Controls time as existing clients of both generations do, and prints the results: one JSON object.
 // Usage: node stepping.js ADDRESS FOLDER_OF_PROTOS STEPS
 'use strict';
 
@@ -20,7 +20,7 @@ const call = (client, name, request) =>
   new Promise((resolve) =>
     client[name](request, deadline(), (error, answer) => resolve(error ? grpc.status[error.code] : answer)));
 
-// All messages of a stream, and a promise of so many.
+// The messages of a stream so far, and a promise of a given number of them.
 function follow(stream) {
   const followed = { seen: [], waiting: null };
   stream.on('data', (message) => {
@@ -39,8 +39,8 @@ function follow(stream) {
 
 const topic = (name) => ({ path: name, msgType: 'double' });
 
-// Version 1: sets the step, publishes some values, and steps when it has seen them, again and again: Node does not send
-// what belongs to several calls in the order of the calls.
+// Version 1: sets the step size, publishes some values, and steps once it has received them, repeatedly: Node does
+// not keep the order of messages that belong to different calls.
 async function first(result) {
   const clock = follow(old.Subscribe(topic('/model/clock'), deadline()));
   const goal = follow(old.Subscribe(topic('sim/goal/out'), deadline()));
@@ -70,7 +70,7 @@ async function first(result) {
   written.cancel();
 }
 
-// Version 2: the calls in the order in which its clients make them.
+// Version 2: the calls in their usual order.
 async function second(result) {
   const publish = simlog.Publish(deadline(), () => {});
   const stream = follow(simlog.CreateSubscriber({ name: 'node', uuid: 'n-1' }, deadline()));
@@ -92,7 +92,7 @@ async function second(result) {
   statuses.cancel();
 }
 
-// shmio.v1: steps without a call for each, each when it is asked for, then many at once.
+// shmio.v1: many steps in one call, first one at a time, then many at once.
 async function third(result) {
   const stream = ours.Steps(deadline());
   const steps = [];

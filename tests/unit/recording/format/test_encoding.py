@@ -1,4 +1,4 @@
-"""Messages of a recording as bytes, and bytes that are none."""
+"""Encoding and decoding a recording's messages, and undecodable bytes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ images = st.integers(0, 50).flatmap(
     st.tuples(u32, u64, u64),
 )
 def test_a_frame(fields: tuple[int, ...], images: tuple[bytes, bytes | None], header: tuple[int, int, int]) -> None:
-    """Of both versions, whatever the message's own header says."""
+    """Both versions are tested, with any values in the message's own header."""
     frame = Frame._make((*fields, *images))
     data = encode_frame(frame)
     assert decode_frame(data) == frame
@@ -69,14 +69,14 @@ def test_a_gap() -> None:
         {"before_ns": -1},
     ],
 )
-def test_a_gap_that_contradicts_itself(change: dict[str, object]) -> None:
+def test_a_contradictory_gap_is_refused(change: dict[str, object]) -> None:
     fields = {"source": "c", "block": 1, "what": "frames", "first": 5, "last": 9, "count": 5, "reason": "overtaken"}
     with pytest.raises(ValueError, match="contradicts"):
         decode_gap(encode_json(Gap(**fields | change)))  # type: ignore[arg-type]
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_are_a_message_or_refused(data: bytes) -> None:
+def test_any_bytes_are_decoded_or_refused(data: bytes) -> None:
     for decode in (decode_frame, decode_event, decode_gap):
         with suppress(ValueError):
             decode(data)

@@ -38,7 +38,7 @@ def look(file: Path) -> tuple[list[Message], bool]:
 
 
 def cut(file: Path) -> list[Message]:
-    """Messages up to where the file is damaged."""
+    """Return the messages up to the damage in the file."""
     found = []
     with suppress(RecordingError), Reader(file) as reader:
         for message in reader.messages():
@@ -47,7 +47,7 @@ def cut(file: Path) -> list[Message]:
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_a_survey_counts_what_is_there(recording: bytes, tmp_path: Path, whole: bool) -> None:
+def test_a_survey_counts_the_messages(recording: bytes, tmp_path: Path, whole: bool) -> None:
     file = tmp_path / "x.mem"
     file.write_bytes(recording if whole else recording[: recording.rindex(b"cell/frames") - 400])
     with Reader(file) as reader:
@@ -63,8 +63,8 @@ def test_a_survey_counts_what_is_there(recording: bytes, tmp_path: Path, whole: 
         assert (first_ns, last_ns) == (of_topic[0], of_topic[-1])
 
 
-def test_cut_off_anywhere_what_came_before_is_read(recording: bytes, tmp_path: Path) -> None:
-    """As a killed recorder leaves it. Every message of a chunk that is whole is there; nothing else is made up."""
+def test_a_file_cut_off_anywhere_is_read_up_to_the_cut(recording: bytes, tmp_path: Path) -> None:
+    """A killed recorder leaves such a file; every message of a complete chunk is read."""
     file = tmp_path / "x.mem"
     file.write_bytes(recording)
     whole, closed = look(file)
@@ -74,7 +74,7 @@ def test_cut_off_anywhere_what_came_before_is_read(recording: bytes, tmp_path: P
         file.write_bytes(recording[:size])
         try:
             messages, closed = look(file)
-        except RecordingError:  # not even the metadata are there
+        except RecordingError:  # not even the metadata are complete
             assert longest == 0
             continue
         assert not closed
@@ -106,8 +106,8 @@ def test_any_bytes_are_refused_or_read(tmp_path: Path, data: bytes) -> None:
         look(file)
 
 
-def test_a_zeroed_tail_is_told(recording: bytes, tmp_path: Path) -> None:
-    """As a power failure leaves it."""
+def test_zeros_at_the_end_are_reported(recording: bytes, tmp_path: Path) -> None:
+    """A power failure leaves such a file."""
     file = tmp_path / "x.mem"
     cut_at = recording.rindex(b"cell/frames") - 400
     file.write_bytes(recording[:cut_at])
@@ -152,7 +152,7 @@ def test_hostile_chunks_cost_no_memory_and_no_traceback(content: bytes, message:
 
 
 def described(encoding: str) -> bytes:
-    """A chunk that describes channel 1."""
+    """Return a chunk that describes channel 1."""
     about = dict.fromkeys(("block", "section", "after", "period_ns", "stale_ns"), "1")
     builder = RecordBuilder()
     Channel(1, "cell/frames", encoding, {**about, "source": "cell", "layout": "00"}, 1).write(builder)
@@ -161,8 +161,8 @@ def described(encoding: str) -> bytes:
 
 
 @pytest.mark.parametrize("encodings", [(FRAME, FRAME_V2), (FRAME_V2, FRAME), (FRAME, EVENT)])
-def test_a_channel_of_two_descriptions_is_refused(encodings: tuple[str, str], tmp_path: Path) -> None:
-    """Its messages could be read in two ways, and would be, by who reads the file from another place on."""
+def test_a_channel_with_two_descriptions_is_refused(encodings: tuple[str, str], tmp_path: Path) -> None:
+    """Otherwise a message could be read in two ways, depending on where the reader starts."""
     file = tmp_path / "x.mem"
     first, second = map(described, encodings)
     file.write_bytes(first + described(encodings[0])[len(MAGIC) :] + second[len(MAGIC) :])
@@ -170,7 +170,7 @@ def test_a_channel_of_two_descriptions_is_refused(encodings: tuple[str, str], tm
         list(reader.messages())
 
 
-def test_a_chunk_larger_than_any_of_ours_is_not_read(tmp_path: Path) -> None:
+def test_a_chunk_above_the_size_limit_is_not_read(tmp_path: Path) -> None:
     file = tmp_path / "x.mem"
     size = MAX_CHUNK_BYTES + 1
     with file.open("wb") as stream:
@@ -192,14 +192,14 @@ def foreign(file: Path, change: Callable[[Writer], Any]) -> None:
     ("content", "message"),
     [(b"", "is empty: its recorder wrote nothing"), (b"PK\3\4", "it does not begin like an MCAP file")],
 )
-def test_what_is_no_recording(content: bytes, message: str, tmp_path: Path) -> None:
+def test_files_that_are_not_recordings_are_refused(content: bytes, message: str, tmp_path: Path) -> None:
     file = tmp_path / "x.mem"
     file.write_bytes(content)
     with pytest.raises(RecordingError, match=message):
         Reader(file)
 
 
-def test_another_programs_mcap(tmp_path: Path) -> None:
+def test_an_mcap_file_of_another_program_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "x.mcap"
 
     def change(writer: Writer) -> None:
@@ -211,7 +211,7 @@ def test_another_programs_mcap(tmp_path: Path) -> None:
         survey(reader)
 
 
-def test_a_layout_that_is_not_the_one_recorded_with_is_refused(recording: bytes, tmp_path: Path) -> None:
+def test_a_changed_layout_is_refused(recording: bytes, tmp_path: Path) -> None:
     file = tmp_path / "x.mem"
     changed = recording.replace(b'"path":"count"', b'"path":"tnuoc"')
     assert changed != recording

@@ -1,4 +1,4 @@
-"""Which client may call what: tokens, certificates, and the roles of an address, over real sockets."""
+"""Access rights over real sockets: tokens, certificates, and the roles of an address."""
 
 from __future__ import annotations
 

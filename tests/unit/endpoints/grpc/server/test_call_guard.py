@@ -125,7 +125,7 @@ def test_one_client_cannot_take_all_calls_and_their_total_is_limited(segment: Se
 
 
 def test_the_limits_hold_as_documented(segment: Segment) -> None:
-    """The numbers of the page on roles and limits: 4,096 calls, of which one client leaves 1,024."""
+    """The numbers of the page on limits: 4,096 calls, of which one client leaves 1,024."""
 
     async def test(served: Endpoint) -> None:
         method, request = "/simulation.server.SimlogAPI/Subscribe", STEP.SerializeToString()

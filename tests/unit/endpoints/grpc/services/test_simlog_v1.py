@@ -1,4 +1,4 @@
-"""Inject of version 1, over real sockets: between publishers and the device, or between source and subscribers."""
+"""Inject of version 1, over real sockets: toward the device, and toward subscribers."""
 
 from __future__ import annotations
 

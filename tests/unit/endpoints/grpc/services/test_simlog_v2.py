@@ -1,4 +1,4 @@
-"""The unary calls of version 2, over real sockets: topic info, Write, Read, and a whole session of a client."""
+"""The unary calls of version 2, over real sockets: topic info, Write and Read."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_an_unknown_topic_has_empty_info_and_other_calls_fail_with_not_found(seg
 
 
 def test_a_typical_client_session(segment: Segment) -> None:
-    """The calls of the wire contract, in order; the first Write comes before any message was received."""
+    """The calls of the wire contract, in order; the first Write comes before any message."""
 
     async def test(served: Endpoint, device: Plant) -> None:
         published: Any = served.v2.Publish(timeout=TIMEOUT_S)
@@ -352,17 +352,5 @@ def test_a_read_of_too_many_values_is_refused(segment: Segment, monkeypatch: pyt
             status, text = await refusal(served.v2.Read(v2.ReadRequest(path=paths), timeout=TIMEOUT_S))
             assert status is Status.INVALID_ARGUMENT
             assert "too much for one Read" in text
-
-    serve(segment, test)
-
-
-def test_undecodable_requests_fail_without_effect_on_others(segment: Segment) -> None:
-    async def test(served: Endpoint) -> None:
-        served.publish(image(step=1))
-        for name in ("GetTopicInfo", "Subscribe", "Write", "PublishSynch", "Read"):
-            call: Any = served.channel.unary_unary(f"/simlog.server.SimlogAPI/{name}")
-            with pytest.raises(grpc.aio.AioRpcError):
-                await call(b"\xff\xff\xff", timeout=TIMEOUT_S)
-        assert await read(served, "cell/step") == [(v2.NUMBER, "cell/step", 1.0)]
 
     serve(segment, test)

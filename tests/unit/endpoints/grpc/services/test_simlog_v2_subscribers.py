@@ -1,4 +1,4 @@
-"""The streams of version 2: all topics of a subscriber in one, with well-behaved and misbehaving clients."""
+"""The streams of version 2: all topics of a subscriber in one."""
 
 from __future__ import annotations
 
@@ -409,7 +409,7 @@ def test_topics_survive_a_reload_and_removed_registers_resume_when_they_return(s
 
 
 def test_a_uuid_belongs_to_its_client(segment: Segment) -> None:
-    """Other clients can neither end its stream nor add topics; a client is recognised by its token."""
+    """Other clients can neither end its stream nor add topics; a token identifies the client."""
     first, other = (("authorization", "Bearer one"),), (("authorization", "Bearer other"),)
     subscriber, topic = v2.Subscriber(name="a", uuid="a"), v2.SubscriptionRequest(path="cell/step", subscriberUUID="a")
 

@@ -138,11 +138,6 @@ def test_structures_are_readable_up_to_the_limit_of_depth() -> None:
         assert "7.0" in str(plain(message.value))
 
 
-@pytest.mark.parametrize("clock_ns", [0, 1, 999_999_999, 10**9, 123_456_789_012_345_678])
-def test_the_time_stamp_is_the_instance_clock(clock_ns: int) -> None:
-    assert v2.Header.FromString(time_stamp(clock_ns)).timestamp.ToNanoseconds() == clock_ns
-
-
 def test_a_large_integer_can_be_given_exactly_as_text() -> None:
     counter = Shape("counter", (Register("counter", "LINT", (), 0, None, 8, 1),), whole=True)
     assert from_wire(Value(string_value=str(2**63 - 1)), counter) == {"counter": 2**63 - 1}

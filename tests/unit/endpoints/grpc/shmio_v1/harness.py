@@ -62,7 +62,8 @@ class Stream:
 def values(registers: Iterable[Any], found: Any) -> dict[str, Any]:
     """Return the scalars and whole arrays of ``Values`` by path.
 
-    For an array in part, the value is a dict of its elements by index."""
+    For an array in part, the value is a dict of its elements by index.
+    """
     elements: dict[tuple[int, int], Any] = {}
     for column, name in enumerate(COLUMNS):
         if name and found.HasField(name):

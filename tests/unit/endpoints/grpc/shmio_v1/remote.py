@@ -40,7 +40,7 @@ def spec(source: str, period_ns: int = 20_000_000) -> BlockSpec:
 
 @contextmanager
 def remote_segment(instance: str, *, virtual: bool = True) -> Iterator[Segment]:
-    """Create a segment with the sources ``drive``, computed by a client, and ``cell``, which is not."""
+    """Create a segment with the source ``drive``, computed by a client, and ``cell``."""
     plain = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("memory", WRITABLE))
     processes = [ProcessSpec("drive", "source"), ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]
     with Segment.create(instance, [spec("drive"), plain], processes, stepped=virtual) as segment:

@@ -1,4 +1,4 @@
-"""Simulate over real sockets: with the generated code only, as any client has it, and by the Python clients."""
+"""Simulate over real sockets: with the generated code only, and by the Python clients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models that disconnect, stop half-way or never read: they free their source, and do not disturb others."""
+"""Models that disconnect, stop half-way or never read: they free their source."""
 
 from __future__ import annotations
 

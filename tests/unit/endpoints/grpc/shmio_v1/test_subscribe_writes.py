@@ -1,4 +1,4 @@
-"""Subscriptions to ``/in``: every write toward a source, in the order in which the source accepted it."""
+"""Subscriptions of shmio.v1 to ``/in``: every accepted write, in the source's order."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """From images to packed arrays and on to a client's numpy arrays, compared with the codec.
 
-The codec has its own tests with fixed bytes."""
+The codec has its own tests with fixed bytes.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +33,10 @@ def table_of(registers: list[Register], columns: Columns) -> Table:
 
 
 def plain(value: Value, register: Register) -> Any:
-    """Return what a client gets for a value: zero or an empty text for an array's invalid element."""
+    """Return what a client gets for a value.
+
+    For an array's invalid element that is zero or an empty text.
+    """
     if isinstance(value, list):
         return [plain(item, register) for item in value]
     if value is None:

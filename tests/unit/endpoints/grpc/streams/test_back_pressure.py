@@ -1,4 +1,4 @@
-"""Back-pressure: a feed reads no more frames than its streams can take; streams far behind get the newest."""
+"""Back-pressure: a feed reads only the frames that its streams can take."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behin
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Never look for stale frames, count every frame as late, and wake resting feeds only by themselves."""
+    """Never look for stale frames, count every frame as late, and let feeds rest until woken."""
     monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
     monkeypatch.setattr(back_pressure, "LATE_S", 0.0)
     monkeypatch.setattr(wakeups, "REST_S", 1000.0)

@@ -1,4 +1,4 @@
-"""The brokers that shmio starts, mosquitto and aMQTT: run as in their process, and seen by clients."""
+"""The brokers that shmio starts, mosquitto and aMQTT, seen by clients."""
 
 from __future__ import annotations
 

@@ -208,7 +208,8 @@ def test_the_disconnect_is_sent_though_the_brokers_last_data_is_unread(
 ) -> None:
     """Otherwise the broker would publish the will.
 
-    Closing a socket with unread data discards what has not been sent yet."""
+    Closing a socket with unread data discards what has not been sent yet.
+    """
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
         try:

@@ -48,7 +48,10 @@ def flood(address: Address, qos: int) -> None:
 
 
 class Narrow:
-    """A broker that serves one client and acknowledges nothing. ``lets_in``: it accepts others, too."""
+    """A broker that serves one client and acknowledges nothing.
+
+    ``lets_in``: it accepts other clients, too.
+    """
 
     def __init__(self, *, lets_in: bool = False) -> None:
         self.heard = b""

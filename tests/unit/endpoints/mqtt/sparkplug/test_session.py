@@ -126,7 +126,10 @@ def test_a_node_sends_birth_changes_and_death(segment: Segment, broker: Mosquitt
 
 
 def test_an_orderly_end_sends_the_death_and_with_mqtt_5_the_will(segment: Segment, broker: Mosquitto) -> None:
-    """Both messages are required, and have the same bdSeq; hosts ignore the second (Sparkplug 3.0.0, 5.5, 6.4.25)."""
+    """Sparkplug 3.0.0 requires both messages (5.5, 6.4.25).
+
+    They have the same bdSeq, so hosts ignore the second one.
+    """
     segment.writer("cell").publish(image(), cycle=1)
     with hosting(broker.address) as host:
         with node(segment, broker.address):

@@ -109,7 +109,7 @@ def test_a_host_that_returns_at_once_gets_a_new_birth(segment: Segment, broker: 
 def test_of_several_brokers_the_node_uses_the_one_with_its_host(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The node moves to the next broker when the host has left the current one, or sends nothing."""
+    """The node moves to the next broker when the host has left the current one or is silent."""
     monkeypatch.setattr("shmio.endpoints.mqtt.sparkplug.session.HOST_S", 0.05)
     segment.writer("cell").publish(image(step=1), cycle=1)
     first, second = make_broker(), make_broker()
