@@ -54,7 +54,7 @@ ONE_AFTER_THE_OTHER = (
     ("tests/system/test_step.py",),
     ("tests/system/test_write.py",),
 )
-"""Beginnings of the names of tests that share something, of which one process has to run all."""
+"""Beginnings of the names of tests that share something; one xdist worker runs each group."""
 
 
 START_PROCESSES = (
@@ -68,10 +68,13 @@ START_PROCESSES = (
     "tests/unit/simulation/test_a50.py::test_runs_as_a_source_on_db201",
     "tests/unit/simulation/test_howto.py",
 )
-"""Beginnings of the names of tests that start processes without a word of STARTERS. The fast tier leaves them out."""
+"""Beginnings of the names of tests that start processes without one of STARTERS.
+
+The fast tier leaves them out.
+"""
 
 STARTERS = {"ChildProcess", "Popen", "create_subprocess_exec", "fork", "forkpty", "pty", "subprocess"}
-"""The fast tier leaves out each test that has one of these names in its code, its helpers or its fixtures."""
+"""The fast tier leaves out tests with one of these names in their code, helpers or fixtures."""
 
 SLOW = (
     "tests/unit/cli/test_dump_hostile.py",
@@ -99,10 +102,13 @@ SLOW = (
     "tests/unit/recording/test_dump.py::test_batches_equal_frames",
     "tests/unit/segment/test_segment.py::test_a_damaged_segment",
 )
-"""Beginnings of the names of tests that start no process but take seconds. The fast tier leaves them out."""
+"""Beginnings of the names of tests that start no process but take seconds.
+
+The fast tier leaves them out.
+"""
 
 APART = ("tests/system/test_benchmarks.py",)
-"""Beginnings of the names of tests that run only with --all, or when they are named."""
+"""Beginnings of the names of tests that run only with --all, or if you name them."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

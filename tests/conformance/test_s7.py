@@ -24,7 +24,7 @@ from shmio.testing.proxy import FaultProxy
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer
 
 TAIL = SPARE + 2
-"""Bytes behind the counter: spare ones, flags, and what the count in the flags must be."""
+"""Bytes after the counter: spare bytes, the flag byte, and the count that the flags must have."""
 
 
 class Shared:

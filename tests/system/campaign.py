@@ -83,7 +83,7 @@ J1, J2, POSITION = "joints/Kuka.j1/R", "joints/Kuka.j2/R", "joints/R3200/Link1/R
 STEPS: Final = 80
 PATIENCE_S: Final = 60
 SLOW_S: Final = 0.004
-"""What a slow subscriber does between two messages."""
+"""Pause of a slow subscriber between two messages."""
 _SMALL_WINDOW = [("grpc.http2.bdp_probe", 0), ("grpc.use_local_subchannel_pool", 1)]
 
 Streams = dict[str, list[bytes]]

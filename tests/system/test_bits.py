@@ -124,7 +124,7 @@ def test_simlog_version_2_with_injection_of_a_bit(cell: Cell, local: Attachment)
         write(answer.shadowPathIn, bool_value=False)
         assert not next(stream).value.bool_value
         write("cell/Outputs/120", number_value=0x0F)
-        until(lambda: local["cell/Outputs/120"] == 0x07, "the other bits come through")
+        until(lambda: local["cell/Outputs/120"] == 0x07, "writes of the other bits")
         stream.cancel()
 
 

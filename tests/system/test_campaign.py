@@ -204,10 +204,10 @@ def test_a_reload_changes_configured_injections_without_a_restart(cell: Cell) ->
         assert "injection blind: changed at cell" in cell.supervisor("reload").stdout
         until(lambda: local["cell/Outputs/98"] == 78, "changed")
         assert cell.run("shmio", "inject", "--lift-all").returncode == 0
-        until(lambda: local["cell/Outputs/98"] == 5, "lifted in an emergency")
+        until(lambda: local["cell/Outputs/98"] == 5, "lifted by lift-all")
         file.write_text(plain)
         assert "injection blind: lifted at cell" in cell.supervisor("reload").stdout
-        until(lambda: local.injections("cell") == [], "gone")
+        until(lambda: local.injections("cell") == [], "the end of the injection")
     assert cell.processes()["cell"]["pid"] == pid
     file.write_text(plain + CONFIGURED.replace("cell/Outputs/98", "cell/Outputs/9800"))
     refused = cell.supervisor("reload")

@@ -139,7 +139,8 @@ def test_a_killed_process_is_restarted_and_no_other(
         cycles = [cycle for _, cycle, _ in load.cycles]
         lost = cycles[-1] - cycles[0] + 1 - len(cycles)
         until(
-            lambda: cell.processes()["cell"]["overruns"] - before["cell"]["overruns"] >= lost, "why, in the next report"
+            lambda: cell.processes()["cell"]["overruns"] - before["cell"]["overruns"] >= lost,
+            "the reason in the next report",
         )
 
 

@@ -83,4 +83,4 @@ def test_the_page_on_emulated_controllers_runs_as_shown(reader: Reader) -> None:
         reader.follow(unplug, "")
         until(lambda: press.read("press/Fault").reason.startswith("no answer within 1000 ms"), "the reason")
         assert json.loads(reader.run("shmio-supervisor status --json").stdout)["state"] == "degraded"
-        until(lambda: press.read("press/Fault").quality is Quality.GOOD, "another process in its place")
+        until(lambda: press.read("press/Fault").quality is Quality.GOOD, "another process")

@@ -76,7 +76,7 @@ def test_all_consumers_see_the_injected_value_until_the_command_ends(cell: Cell)
             assert view["Robot_800/Axs1_Pos"] == -1.5
             assert view.original("Robot_800/Axs1_Pos") != -1.5
             assert local["panel/speed"] == 9
-            until(lambda: next(stream).value == "-1.5", "the subscriber sees it")
+            until(lambda: next(stream).value == "-1.5", "the injected value at the subscriber")
             listed = cell.run("shmio", "inject")
             assert POSITION in listed.stdout
             assert "test 7" in listed.stdout
@@ -84,7 +84,7 @@ def test_all_consumers_see_the_injected_value_until_the_command_ends(cell: Cell)
             assert command.wait(PATIENCE_S) == 0
         assert get(cell, POSITION)["value"] != -1.5
         assert get(cell, "panel/speed")["value"] == 0.5
-        until(lambda: next(stream).value != "-1.5", "the subscriber, without subscribing anew")
+        until(lambda: next(stream).value != "-1.5", "the original at the same subscriber")
         assert cell.output("shmio", "inject") == ""
 
 

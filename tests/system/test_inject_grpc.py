@@ -124,7 +124,7 @@ def test_version_2_toward_an_emulated_controller(cell: Cell, local: Attachment) 
         stream.cancel()
         until(lambda: standing(local) == 0, "lifted")
         write(other, f"{PLACE}/in", 9)
-        until(lambda: local[PLACE] == 9, "what is written reaches the device again")
+        until(lambda: local[PLACE] == 9, "a write reaches the device again")
 
 
 CLIENT = """

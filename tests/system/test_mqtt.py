@@ -68,9 +68,9 @@ def test_a_killed_broker_is_restarted_and_its_bridge_continues(
     with running(make_cell, broker, more=f'broker = "{program}"\n{EVERYBODY}') as cell:
         before = cell.processes()
         kill(before["broker"]["pid"])
-        until(lambda: cell.processes()["broker"]["restarts"] == 1, "the broker is started again")
-        until(lambda: cell.processes()["mqtt"]["counters"]["connects"] == 2, "the bridge is connected again")
-        until(lambda: cell.status()["state"] == "running", "all is well")
+        until(lambda: cell.processes()["broker"]["restarts"] == 1, "the broker's restart")
+        until(lambda: cell.processes()["mqtt"]["counters"]["connects"] == 2, "the bridge's reconnection")
+        until(lambda: cell.status()["state"] == "running", "no problem")
         with listening(broker, protocol=4) as listener:
             counts(listener, "cell/Robot_800/Axs1_Pos/out", 3)
         for name in ("mqtt", "grpc", "cell", "plc"):
@@ -152,7 +152,7 @@ def test_accounts_can_do_only_what_their_roles_allow(
             told.update(cell.processes()["mqtt"]["counters"])
             return told["commands"] >= 2
 
-        until(both_commands, "the bridge tells of both commands")
+        until(both_commands, "the bridge reports both commands")
         assert told["connects"] == 1, "no other client has taken over its session"
         for account in ({}, {"username": "anna", "password": "guess"}):
             assert connected(broker, "me", **account) in (4, 5)

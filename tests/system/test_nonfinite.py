@@ -62,7 +62,7 @@ def test_every_interface_refuses_nonfinite_values_until_a_reload_allows_them(mak
             iter([v1.PubRequest(topic=v1.TopicDescriptor(path="sim/a"), data=text) for text in texts]),
             timeout=PATIENCE_S,
         )
-        until(lambda: local["sim/a"] == 1.5, "what was published after it")
+        until(lambda: local["sim/a"] == 1.5, "the value published after it")
         with local.inject("sim/a/in") as shadow:
             (outcome,) = shadow.set({"sim/a": math.nan})
             assert REASON in outcome.text

@@ -185,7 +185,7 @@ def test_a_model_killed_between_steps_continues_after_rejoining(
 
         def kill_it() -> None:
             model.kill()
-            until(lambda: "no model is connected" in cell.processes()["drive"]["reason"], "it is missed")
+            until(lambda: "no model is connected" in cell.processes()["drive"]["reason"], "a bad quality")
             again.__enter__()
 
         again = served(cell)
@@ -225,7 +225,7 @@ def test_a_kill_during_a_step_fails_it_and_the_next_step_works(make_drive: Calla
         pid = cell.processes()["grpc"]["pid"]
         assert "drive: model 'serve.py' disconnected before it answered" in failing(lambda: kill(pid))
         model.kill()
-        until(lambda: cell.processes()["grpc"]["pid"] not in (pid, None), "the endpoint is started anew")
+        until(lambda: cell.processes()["grpc"]["pid"] not in (pid, None), "the endpoint's restart")
     with served(cell):
         step(cell)
         assert cell.processes()["drive"]["quality"] == "good"
@@ -291,5 +291,5 @@ def test_the_page_runs_as_shown(make_cell: Callable[..., Cell], tmp_path: Path, 
             assert model.wait(PATIENCE_S) == 130
         finally:
             model.kill()
-    until(lambda: cell.processes()["drive"]["quality"] == "bad", "it is missed")
+    until(lambda: cell.processes()["drive"]["quality"] == "bad", "a bad quality")
     assert "step 4: drive: no model is connected: " in cell.run("shmio", "step").stderr

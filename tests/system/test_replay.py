@@ -41,7 +41,7 @@ match = "cell/Robot_800/Axs1_Pos"
 payload = "json"
 """
 FRAMES = int(os.environ.get("SHMIO_REPLAY_FRAMES", "150"))
-"""How long a cell is recorded, and replayed: 50 a second."""
+"""Number of frames that are recorded and replayed, at 50 a second."""
 POSITION = "cell/Robot_800/Axs1_Pos"
 PLACE = "cell/Outputs/100"
 
@@ -163,7 +163,7 @@ def test_a_replay_gives_the_same_recording_and_the_same_streams(
         assert cell.status()["mode"] == "replay"
         assert sorted(cell.processes()) == ["broker", "cell", "grpc", "mqtt", "recorder"]
         replayed = Streams(cell, broker)
-        until(lambda: bool(replayed.v1 and replayed.v2 and replayed.native), "what is there at the beginning")
+        until(lambda: bool(replayed.v1 and replayed.v2 and replayed.native), "the first messages")
         refused = cell.run("shmio", "set", PLACE, "1")
         assert "refused" in refused.stdout + refused.stderr
         [playing] = attached.replay.play()
@@ -257,7 +257,7 @@ directory = "again"
         with attached.inject(POSITION) as shadow:
             shadow.set({POSITION: 123.0})
             assert attached[POSITION] == 123.0
-            until(lambda: attached["sim/joints/Kuka.j1/R"] == 123.0, "the model sees it")
+            until(lambda: attached["sim/joints/Kuka.j1/R"] == 123.0, "the value in the model")
         attached.step(0.5)
         assert attached.clock.virtual
         frame = attached.frame("cell").frame.number

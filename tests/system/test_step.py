@@ -154,7 +154,7 @@ def test_wall_time_runs_until_a_program_takes_control(make_line: Callable[[str],
     line = make_line("wall")
     assert line.status()["clock"]["mode"] == "wall"
     first = line.processes()["belt"]["cycle"]
-    until(lambda: line.processes()["belt"]["cycle"] > first + 5, "it runs")
+    until(lambda: line.processes()["belt"]["cycle"] > first + 5, "the belt runs")
     clock = step(line, "--pause")
     assert clock["mode"] == "virtual"
     before = get(line, "belt/position")
@@ -167,7 +167,7 @@ def test_time_can_be_released_and_taken_again(make_line: Callable[[str], Cell]) 
 
     def runs() -> None:
         [before], cycle = get(line, "belt/position"), line.processes()["belt"]["cycle"]
-        until(lambda: line.processes()["belt"]["cycle"] > cycle + 3, "it runs by itself")
+        until(lambda: line.processes()["belt"]["cycle"] > cycle + 3, "the belt runs by itself")
         assert get(line, "belt/position")[0] > before
 
     moments = []
@@ -327,7 +327,7 @@ def test_a_frozen_model_is_named_after_the_hard_time_out(line: Cell) -> None:
 def test_time_stops_when_the_program_that_plays_is_killed(line: Cell) -> None:
     playing = "import shmio, sys, time; cell = shmio.attach(sys.argv[1], writable=True); cell.play(); time.sleep(3600)"
     with subprocess.Popen([sys.executable, "-c", playing, line.instance]) as player:
-        until(lambda: line.status()["clock"]["playing"], "it plays")
+        until(lambda: line.status()["clock"]["playing"], "time plays")
         begun = line.status()["clock"]["step"]
         until(lambda: line.status()["clock"]["step"] > begun + 3, "time runs")
         player.kill()

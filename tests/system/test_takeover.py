@@ -128,7 +128,7 @@ def test_down_clears_an_instance_of_another_version(cell: Cell) -> None:
     refused = cell.supervisor("down")
     assert refused.returncode == 1
     name = f"--instance {cell.instance}"
-    assert f"down {name}` clears" in refused.stderr, "its file is unknown"
+    assert f"down {name}` clears" in refused.stderr, "the file that it was started from is unknown"
     down = cell.supervisor("down", *name.split())
     assert down.returncode == 0, down.stderr
     assert all(gone(pid) for pid in before.values())
@@ -140,7 +140,7 @@ def test_a_segment_without_a_process_is_stale(cell: Cell) -> None:
     kill_supervisor(cell)
     for pid in before.values():
         kill(pid)
-    until(lambda: all(gone(pid) for pid in before.values()), "their death")
+    until(lambda: all(gone(pid) for pid in before.values()), "the processes' death")
     up = cell.supervisor("up", "--detach")
     assert up.returncode == 0, up.stderr
     assert f"removed the left-over segment shmio-{cell.instance}" in up.stdout

@@ -104,9 +104,9 @@ def test_a_command_register_controls_the_plant(cell: Cell) -> None:
     with shmio.attach(cell.instance, writable=True) as local:
         assert [outcome.done for outcome in local.write({"cell/Outputs/13": 1})] == [True]  # command: hold
         positions = (view["Robot_800/Axs1_Pos"] for view in local.stream("cell", timeout_s=PATIENCE_S))
-        until(lambda: len(set(islice(positions, 5))) == 1, "the robots stand")
+        until(lambda: len(set(islice(positions, 5))) == 1, "the robots stop")
         assert local.write({"cell/Outputs/13": 0})[0].done
-        until(lambda: len(set(islice(positions, 5))) == 5, "they move")
+        until(lambda: len(set(islice(positions, 5))) == 5, "the robots move")
         positions.close()
 
 

@@ -96,10 +96,10 @@ def test_it_takes_its_role_reports_sends_heartbeats_and_stops(segment: Segment, 
         assert (report.pid, report.activity, report.counters[:3]) == (worker.process.pid, Activity.RUNNING, (1, 2, 3))
         assert slot.alive()
         beat = slot.heartbeat_ns
-        until(lambda: slot.heartbeat_ns > beat, "a beat")
+        until(lambda: slot.heartbeat_ns > beat, "a heartbeat")
         worker.process.send_signal(signal.SIGINT)  # the supervisor handles Ctrl-C
         beat = slot.heartbeat_ns
-        until(lambda: slot.heartbeat_ns > beat, "a beat after SIGINT")
+        until(lambda: slot.heartbeat_ns > beat, "a heartbeat after SIGINT")
         worker.process.terminate()
         assert worker.end() == (0, "")
     assert (slot.report.activity, slot.alive()) == (Activity.STOPPING, False)
@@ -118,7 +118,7 @@ def test_it_reads_its_files_again_at_each_sighup(segment: Segment, tmp_path: Pat
         until(lambda: slot.report.pid == worker.process.pid and slot.report.note == "at work", "work")
         worker.process.send_signal(signal.SIGHUP)
         beat = slot.heartbeat_ns
-        until(lambda: slot.heartbeat_ns > beat, "a beat after SIGHUP")
+        until(lambda: slot.heartbeat_ns > beat, "a heartbeat after SIGHUP")
         worker.process.terminate()
         assert worker.end() == (0, "")
 
@@ -149,10 +149,10 @@ def test_the_exit_status_says_whether_a_restart_can_help(
 def test_it_waits_for_its_role_until_the_holder_has_ended(segment: Segment, tmp_path: Path) -> None:
     slot = segment.processes.find("cell")
     with Started(segment, tmp_path, "work") as first:
-        until(lambda: slot.report.note == "at work", "the first at work")
+        until(lambda: slot.report.note == "at work", "the first worker's report")
         with Started(segment, tmp_path, "work") as second:
             os.kill(first.process.pid, signal.SIGKILL)
-            until(lambda: slot.report.pid == second.process.pid, "the second in its role")
+            until(lambda: slot.report.pid == second.process.pid, "the second worker in the role")
 
 
 def test_a_worker_works_without_a_log(segment: Segment, tmp_path: Path) -> None:

@@ -49,15 +49,15 @@ LAYOUT = Layout(
 )
 WRITABLE = ("axis", "running", "inputs", "step", "bits", "name", "long")
 STALE_NS = 60_000_000_000
-"""No source is taken for stale because the host is busy."""
+"""So long that no source turns stale because the host is busy."""
 SOON_STALE_NS = 300_000_000
 TIMEOUT_S = 60
-"""When a test gives up; nothing waits for it to pass."""
+"""Time-out of a test; no test waits for it to pass."""
 LOOK_S = 0.001
 
 
 LOOPBACK = Listener(Address("127.0.0.1", 0), ListenerAccess(Keys()))
-"""Open to all of this host."""
+"""Address with all rights for every program of this host."""
 
 
 def image(

@@ -14,7 +14,7 @@ from shmio.segment import BlockWriter, Provenance, Quality, Write
 from tests.unit.endpoints.harness import WRITER
 
 GUEST = 0
-"""The command queue of a program from outside."""
+"""Number of the command queue for a program outside the instance."""
 
 
 class Plant:

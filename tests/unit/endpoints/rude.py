@@ -121,7 +121,7 @@ CALLS = (
         stays=True,
     ),
 )
-"""What is served now; the subscriber ``polite`` is there."""
+"""All calls that the endpoint serves; a subscriber ``polite`` must exist."""
 
 
 class Polite:

@@ -39,7 +39,7 @@ class Model:
     def __init__(self, segment: Segment, source: str) -> None:
         self.image = bytearray(LAYOUT.size)
         self.mute = False
-        """While it is set, steps are not answered."""
+        """True if steps are not answered."""
         self.failure = ""
         self.writer = segment.writer(source)
         self.output = Output(self.writer)

@@ -182,7 +182,7 @@ def test_the_successor_closes_the_file_of_a_killed_recorder(segment: Segment, tm
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 20)
-        until(lambda: first.file.is_file() and len(numbers_of(first)) == 20, "what was published")
+        until(lambda: first.file.is_file() and len(numbers_of(first)) == 20, "the published frames")
         kill(first.popen.pid)
         first.popen.wait()
     old = first.file
@@ -191,7 +191,7 @@ def test_the_successor_closes_the_file_of_a_killed_recorder(segment: Segment, tm
     with Process(segment, tmp_path) as second:
         until(lambda: closed(old), "the predecessor's file closed")
         publish(writer, 5, first=20)
-        until(lambda: second.counts("frames") == 5, "its own")
+        until(lambda: second.counts("frames") == 5, "its own file")
         assert second.stop() == 0
     assert [topic for topic, _, _ in messages(old)].count("cell/frames") == 20
     assert f"{old} is closed now: its recorder died" in second.log.read_text()
@@ -204,14 +204,14 @@ def test_a_full_disk_leaves_the_file_unchanged_with_a_log_line(segment: Segment,
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 20)
-        until(lambda: first.file.is_file() and len(numbers_of(first)) == 20, "what was published")
+        until(lambda: first.file.is_file() and len(numbers_of(first)) == 20, "the published frames")
         kill(first.popen.pid)
         first.popen.wait()
     old = first.file
     before = old.read_bytes()
     limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({len(before)}, resource.RLIM_INFINITY))"
     with Process(segment, tmp_path, before=limit) as second:
-        until(lambda: "stays as it is: " in second.log.read_text() if second.log.exists() else False, "the word of it")
+        until(lambda: "stays as it is: " in second.log.read_text() if second.log.exists() else False, "the log line")
         second.popen.kill()
     assert f"{old} stays as it is: [Errno {errno.EFBIG}]" in second.log.read_text()
     assert before.startswith(old.read_bytes())

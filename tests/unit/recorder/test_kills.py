@@ -53,13 +53,16 @@ def test_a_kill_at_any_moment_loses_no_frame_and_leaves_intact_files(segment: Se
     try:
         for _ in range(KILLS):
             with Process(segment, tmp_path) as process:
-                until(lambda: ready(process), "that it records", 60)
+                until(lambda: ready(process), "its file", 60)
                 over.wait(chance.choice([0.0, chance.uniform(0, 0.1), chance.uniform(0, 1.2)]))
                 kill(process.popen.pid)
         with Process(segment, tmp_path) as process:
-            until(lambda: ready(process), "that it records", 60)
+            until(lambda: ready(process), "its file", 60)
             folder = process.folder
-            until(lambda: all(closed(file) for file in folder.iterdir() if file != process.file), "all of them closed")
+            until(
+                lambda: all(closed(file) for file in folder.iterdir() if file != process.file),
+                "all earlier files closed",
+            )
             over.set()
             thread.join()
             assert process.stop() == 0

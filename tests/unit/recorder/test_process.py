@@ -61,7 +61,7 @@ def test_a_killed_recorders_file_is_readable_and_its_successor_continues(segment
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 20)
-        until(lambda: ready(first) and len(written(first)) == 20, "what was published, within the file")
+        until(lambda: ready(first) and len(written(first)) == 20, "the published frames in the file")
         publish(writer, 30)
         kill(first.popen.pid)
         first.popen.wait()
@@ -73,7 +73,7 @@ def test_a_killed_recorders_file_is_readable_and_its_successor_continues(segment
         list(reader.messages())
         assert not reader.records.closed
     with Process(segment, tmp_path) as second:
-        until(lambda: second.counts("frames") == 50 - len(kept), "what the first had not written")
+        until(lambda: second.counts("frames") == 50 - len(kept), "the frames that the first had not written")
         assert second.file != old
         assert second.stop() == 0
     assert kept + numbers(second.file) == list(range(1, 51))
@@ -91,7 +91,7 @@ def test_frames_that_the_ring_no_longer_has_are_a_gap_after_the_predecessor(segm
         first.stop()
     publish(writer, 2 * RING)
     with Process(segment, tmp_path) as second:
-        until(lambda: second.counts("frames") + second.counts("missed") == 2 * RING, "all, or missed")
+        until(lambda: second.counts("frames") + second.counts("missed") == 2 * RING, "all frames, or missed ones")
         second.stop()
     [gap] = gaps(second.file)
     assert (gap.first, gap.reason) == (11, Reason.NOT_RUNNING)
@@ -111,7 +111,7 @@ def test_frames_recorded_in_another_folder_are_a_gap_marked_as_elsewhere(segment
         first.stop()
     publish(writer, 2 * RING)
     with Process(segment, tmp_path, directory=str(tmp_path / "other")) as second:
-        until(lambda: second.counts("frames") + second.counts("missed") == 2 * RING + 10, "all, or missed")
+        until(lambda: second.counts("frames") + second.counts("missed") == 2 * RING + 10, "all frames, or missed ones")
         second.stop()
     assert f"{old.name} is not in this folder" in second.log.read_text()
     [file] = (tmp_path / "other").iterdir()
@@ -147,14 +147,14 @@ def test_events_are_not_recorded_again_by_later_recorders_of_a_quiet_cell(segmen
 def test_a_replaced_block_is_not_mistaken_for_the_earlier_one(segment: Segment, tmp_path: Path) -> None:
     publish(segment.writer("cell"), 20)
     with Process(segment, tmp_path) as process:
-        until(lambda: process.counts("frames") == 20, "the old block's")
+        until(lambda: process.counts("frames") == 20, "the old block's frames")
         process.stop()
     old = segment.blocks["cell"]
     spec = BlockSpec("cell", old.layout, old.period_ns, old.stale_ns, 1 << 22)
     segment.change(add=[spec], retire=["cell"])
     publish(segment.writer("cell"), 30)
     with Process(segment, tmp_path) as process:
-        until(lambda: process.counts("frames") == 30, "all of the new block's")
+        until(lambda: process.counts("frames") == 30, "all frames of the new block")
         process.stop()
     assert numbers(process.file) == list(range(1, 31))
 
@@ -254,7 +254,7 @@ def test_files_of_other_users_are_ignored(segment: Segment, tmp_path: Path) -> N
     assert (strange.read_bytes(), after.st_mtime_ns, after.st_ino) == (content, before.st_mtime_ns, before.st_ino)
     with Process(segment, tmp_path) as process:
         publish(writer, 1, first=10)
-        until(lambda: process.counts("frames") == 1, "what came since its own predecessor")
+        until(lambda: process.counts("frames") == 1, "the frames since its own previous file")
         process.stop()
     assert numbers(own) + numbers(process.file) == list(range(1, 12))
 
@@ -289,14 +289,14 @@ def test_without_room_it_reports_that_and_continues_once_there_is_room(segment: 
             publish(writer, 20, first=writer.block.ring.head())
             return process.counts("missed") > 0
 
-        until(costs, "something lost")
+        until(costs, "lost frames")
         until(lambda: f"{file}: File too large; " in process.slot.report.note, "the reason in the status")
         assert "File too large" in process.log.read_text()
         assert file.stat().st_size == size, "whole pieces only"
         resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (hard, hard))
-        until(lambda: ready(process), "well again")
+        until(lambda: ready(process), "a status without a problem")
         publish(writer, 1, first=writer.block.ring.head())
-        until(lambda: file.stat().st_size > size, "written again")
+        until(lambda: file.stat().st_size > size, "more bytes in the file")
         process.stop()
     assert "is being written again" in process.log.read_text()
     found, missed = numbers(file), gaps(file)
@@ -330,7 +330,7 @@ def test_after_a_failed_fsync_it_continues_in_a_new_file(
         until(lambda: ready(process) and len(written(process)) == 20, "frames in the file")
         synced.unlink(missing_ok=True)
         publish(writer, 1, first=20)
-        until(synced.exists, "what came before on the disk")
+        until(synced.exists, "an fsync of the earlier frames")
         (tmp_path / "broken").touch()
         publish(writer, more, first=21)
         old = process.file
@@ -365,12 +365,12 @@ def test_a_failed_fsync_is_reported_until_a_new_file_is_started(segment: Segment
         process.folder.touch()  # prevents a new file in it
         (tmp_path / "broken").touch()
         publish(writer, 1, first=5)
-        until(lambda: "may be lost" in process.slot.report.note, "the doubt in the status")
+        until(lambda: "may be lost" in process.slot.report.note, "the possible loss in the status")
         (tmp_path / "synced").unlink()
         publish(writer, 1, first=6)
         until(lambda: len(numbers(old)) == 7, "a good write")
         until((tmp_path / "synced").exists, "a good fsync")
-        until(lambda: process.counts("bytes") == old.stat().st_size, "a report of it")
+        until(lambda: process.counts("bytes") == old.stat().st_size, "a report of the write")
         assert "may be lost" in process.slot.report.note
         assert "cannot make a recording" in process.log.read_text()
         process.folder.unlink()
@@ -410,10 +410,10 @@ def test_a_full_disk_is_reported_until_there_is_room(segment: Segment, tmp_path:
             publish(writer, 20, first=writer.block.ring.head())
             return process.counts("missed") > 0
 
-        until(costs, "something lost")
+        until(costs, "lost frames")
         until(lambda: "No space left on device" in process.slot.report.note, "the reason in the status")
         ballast.unlink()
-        until(lambda: ready(process), "well again")
+        until(lambda: ready(process), "a status without a problem")
         process.stop()
     found = numbers(file)
     lost = [number for gap in gaps(file) for number in range(gap.first, gap.last + 1)]

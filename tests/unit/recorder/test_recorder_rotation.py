@@ -34,7 +34,7 @@ DAY_S = 86_400
 def tend(work: RotatingRecorder) -> None:
     """Wait until the previous file is written, then rotate."""
     work.recorder._writer.flush()
-    until(lambda: all(old.output.ended for old in work._ending), "the file before")
+    until(lambda: all(old.output.ended for old in work._ending), "the previous file")
     work.tend()
 
 
@@ -160,10 +160,10 @@ def test_no_new_file_is_started_while_the_disk_fails(
         publish(segment.writer("cell"), 100)
         work.turn()
         work.recorder._writer.flush()
-        until(lambda: bool(work.problem), "the trouble")
+        until(lambda: bool(work.problem), "the problem")
         work.tend()
         assert len(list(tmp_path.iterdir())) == 1
-    until(lambda: not work.problem, "the end of it")
+    until(lambda: not work.problem, "the end of the problem")
     work.tend()
     assert work.close() == []
     assert len(files(tmp_path)) == 2
@@ -180,7 +180,7 @@ def test_a_file_is_written_only_after_the_previous_one(tmp_path: Path) -> None:
     second.flush()
     first.write(b"one")
     first.flush()
-    until(lambda: first.written == 3, "the first")
+    until(lambda: first.written == 3, "the first file")
     assert paths[1].read_bytes() == b""
     first.end()
     assert second.close(30)
@@ -344,7 +344,7 @@ def test_a_file_that_cannot_be_deleted_is_reported_once(
 def test_the_process_deletes_by_its_configuration(segment: Segment, tmp_path: Path) -> None:
     old = recorded(segment, tmp_path / "dumps", 9)
     with Process(segment, tmp_path, keep_days=7) as process:
-        until(lambda: not old.exists(), "the old one deleted")
+        until(lambda: not old.exists(), "the old file deleted")
         publish(segment.writer("cell"), 3)
         process.stop()
     assert "is deleted: it is 9.0 days old" in process.log.read_text()

@@ -70,7 +70,7 @@ def ready(process: Process) -> bool:
 def test_a_fast_run_is_recorded_whole(segment: Segment, tmp_path: Path) -> None:
     """Without waiting, the rings would wrap several times between two looks of the recorder."""
     with Process(segment, tmp_path) as process:
-        until(lambda: ready(process), "it records")
+        until(lambda: ready(process), "its file")
         coordinator = Coordinator(segment)
         made = [coordinator.step(MS) for _ in range(STEPS)]
         file = process.file
@@ -117,14 +117,14 @@ def test_steps_that_did_not_wait_for_the_recorder_have_gaps_and_no_marks(segment
 def test_steps_do_not_wait_for_a_killed_recorder_but_for_its_successor(segment: Segment, tmp_path: Path) -> None:
     coordinator = Coordinator(segment)
     with Process(segment, tmp_path) as first:
-        until(lambda: ready(first), "it records")
+        until(lambda: ready(first), "its file")
         coordinator.step(MS)
         kill(first.popen.pid)
         first.popen.wait()
         for _ in range(10):
             coordinator.step(MS)
     with Process(segment, tmp_path) as second:
-        until(lambda: ready(second), "its successor records")
+        until(lambda: ready(second), "the successor's file")
         for _ in range(STEPS):
             coordinator.step(MS)
         file = second.file

@@ -231,7 +231,7 @@ def test_the_waiting_data_are_bounded_while_the_disk_fails(
     assert "No space left on device" in bench.work.problem
     assert caplog.text.count("no new file is started while") == 1
     full = False
-    until(lambda: all(series.ended for series in bench.work._ending), "what waits is written")
+    until(lambda: all(series.ended for series in bench.work._ending), "the waiting data written")
     bench.publish(10)
     assert bench.close()[-1] == [208, 209, 210]
 
@@ -240,10 +240,10 @@ def test_the_process_reports_that_it_waits_and_closes_the_file_by_itself(segment
     writer = segment.writer("cell")
     trigger = {"when": "cell/count = 5", "before_s": 60, "after_s": 0.2}
     with Process(segment, tmp_path, trigger=trigger) as process:
-        until(lambda: process.slot.report.note == "to a file as soon as its trigger comes", "that it waits")
+        until(lambda: process.slot.report.note == "to a file as soon as its trigger comes", "the trigger awaited")
         publish(writer, 6)
         until(lambda: process.slot.report.note.endswith(".mem"), "its file")
-        until(lambda: process.slot.report.note == "to a file as soon as its trigger comes", "that it waits again")
+        until(lambda: process.slot.report.note == "to a file as soon as its trigger comes", "the trigger awaited again")
         assert process.stop() == 0
     [file] = files(process.folder)
     assert numbers(file) == [1, 2, 3, 4, 5, 6]
@@ -253,14 +253,14 @@ def test_a_recorder_killed_during_a_triggered_file_continues_it(segment: Segment
     writer = segment.writer("cell")
     trigger = {"when": "cell/count = 5", "before_s": 60, "after_s": 60}
     with Process(segment, tmp_path, trigger=trigger) as first:
-        until(lambda: first.slot.report.note == "to a file as soon as its trigger comes", "that it waits")
+        until(lambda: first.slot.report.note == "to a file as soon as its trigger comes", "the trigger awaited")
         publish(writer, 10)
         until(lambda: first.counts("bytes") > 2000, "its file")
         kill(first.popen.pid)
         first.popen.wait()
     publish(writer, 5, first=10)
     with Process(segment, tmp_path, trigger=trigger) as second:
-        until(lambda: second.counts("frames") > 0, "the rest")
+        until(lambda: second.counts("frames") > 0, "the remaining frames")
         assert second.stop() == 0
     assert [number for file in files(first.folder) for number in numbers(file)] == list(range(1, 16))
 

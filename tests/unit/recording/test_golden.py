@@ -39,7 +39,7 @@ from shmio.recording.reading.reader import Reader
 GOLDEN = Path(__file__).parents[2] / "golden/dump"
 FILES = ["closed.mem", "killed.mem"]
 DIFFERENCES = "differences.mem"
-"""What ``closed.mem`` holds, its frames of the second version."""
+"""The content of ``closed.mem``, with frames of the second version."""
 CODECS: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes]]] = {
     FRAME: (decode_frame, encode_frame),
     EVENT: (decode_event, encode_event),

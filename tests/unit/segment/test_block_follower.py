@@ -23,7 +23,7 @@ from shmio.segment.block import Cursor
 LAYOUT = Layout("DB1", 1, 4, False, (Register("speed", "REAL", (), 0, None, 4, 1),))
 PERIOD_NS = 20_000_000
 STALE_NS = 3600 * 10**9
-"""So long that no test takes it."""
+"""Longer than any test takes."""
 
 
 @pytest.fixture

@@ -84,7 +84,7 @@ def test_a_broken_queue_is_emptied_and_then_works(head: int, tail: int, data: by
             assert queue_pop(memory, 0, 256) is None
             break
     else:
-        raise AssertionError("the queue is never empty")
+        raise AssertionError("the queue never becomes empty")
     assert queue_push(memory, 0, 256, b"next")
     assert queue_pop(memory, 0, 256) == b"next"
 

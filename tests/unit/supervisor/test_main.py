@@ -98,7 +98,7 @@ def test_a_refused_configuration_fails_the_start(launch: Launch, tmp_path: Path)
     cell = launch([("plc", "emulator", ["good"]), ("cell", "source", ["unfit"])])
     assert cell.wait_end() == 1
     assert cell.errors() == "cell: no such thing here (exit status 2)\n"
-    assert (tmp_path / "ends").read_text() == "plc\n", "the other process was stopped orderly"
+    assert (tmp_path / "ends").read_text() == "plc\n", "the other process was stopped cleanly"
     assert cell.instance not in instances()
 
 
@@ -273,7 +273,7 @@ def test_a_take_over_replaces_only_processes_with_a_changed_configuration(launch
     assert "plc crashed: ended; its exit status is unknown" in successor.log()
 
 
-def test_a_closed_terminal_stops_the_instance_orderly(launch: Launch, tmp_path: Path) -> None:
+def test_a_closed_terminal_stops_the_instance_cleanly(launch: Launch, tmp_path: Path) -> None:
     cell = launch([("plc", "emulator", ["no end"])], grace_s=0.5)
     cell.wait_state("running")
     cell.process.send_signal(signal.SIGHUP)

@@ -35,7 +35,7 @@ from tests.unit.endpoints.rude import (
 
 Status = grpc.StatusCode
 NARROW = http2.frame(http2.SETTINGS, 0, 0, b"\0\4\0\0\1\0")
-"""So much of a stream that is not read is on its way: 256 bytes."""
+"""Flow-control window that lets only 256 bytes of an unread stream be sent."""
 
 
 async def until_calls(served: Endpoint, count: int) -> None:

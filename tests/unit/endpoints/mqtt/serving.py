@@ -120,7 +120,7 @@ class Raw:
         kind, told = self.packet()
         assert kind == 0x20
         self.before, self.code = bool(told[0]), told[1]
-        """Whether there was a session; whether it was let in: 0."""
+        """From CONNACK: whether a session existed, and the return code; 0: accepted."""
 
     def __enter__(self) -> Raw:
         return self

@@ -13,7 +13,7 @@ from tests.unit.endpoints.harness import Endpoint, image, serve, value
 from tests.unit.endpoints.mqtt.harness import PREFIX, bridge, listening
 
 BATCH = 20
-"""Frames that are published before both clients have seen them: fewer than any endpoint leaves out."""
+"""Frames published before both clients have seen them; few enough that no endpoint skips one."""
 
 
 def positions(count: int) -> list[float]:

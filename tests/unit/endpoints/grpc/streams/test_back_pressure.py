@@ -21,7 +21,10 @@ from tests.unit.endpoints.harness import LAYOUT, SOON_STALE_NS, STALE_NS, TIMEOU
 
 MANY = 300
 STEPS = 2**15
-"""Numbers from 0 on that fit in the register `step`, an INT: a fast host publishes more frames in one test."""
+"""Number of values that the register `step`, an INT, can count from 0.
+
+A fast host publishes more frames in one test.
+"""
 
 
 class Known(LossMonitor):

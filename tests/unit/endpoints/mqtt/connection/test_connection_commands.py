@@ -25,7 +25,7 @@ CONNACK = b"\x20\x03\0\0\0"
 FLOOD = 20_000
 FRAMES = 20
 IN_FLIGHT = 5
-"""Fewer than the frames: the broker has to acknowledge values, or no more are sent."""
+"""Fewer than the published frames, so that the broker must acknowledge values for more to be sent."""
 
 
 @pytest.fixture(autouse=True)
