@@ -27,7 +27,7 @@ from shmio.testing.mosquitto import missing
 # Tests interrupt themselves and other processes with SIGINT. In the background, and in workers of xdist,
 # Python starts with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-if "PYTEST_XDIST_WORKER" in os.environ:  # under nohup, SIGHUP is ignored too, which is right for the main process only
+if "PYTEST_XDIST_WORKER" in os.environ:  # under nohup, SIGHUP is ignored, too; only the main process should
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # No deadline, as the host may be busy. Each run uses the same examples, with --fast fewer of them;

@@ -327,7 +327,7 @@ def test_declared_injections_and_their_events(cell: shmio.Cell) -> None:
     assert cell.injections() == []
 
 
-def test_one_invalid_declaration_makes_declare_start_none(cell: shmio.Cell) -> None:
+def test_one_invalid_declaration_refuses_all(cell: shmio.Cell) -> None:
     for wrong in ({"target": "cell/nix"}, {"operation": "melt"}, {"end_s": -1.0}):
         with pytest.raises(ValueRangeError, match="injection"):
             cell.declare([DRIFT, DRIFT | {"name": "wrong"} | wrong])

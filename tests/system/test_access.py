@@ -90,7 +90,7 @@ def test_a_reload_adds_and_removes_tokens(guarded: Cell) -> None:
 
 
 def test_failed_handshakes_log_nothing(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
-    """gRPC itself would print a line for each."""
+    """By default, gRPC prints a line for each of them."""
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     words = [
         "openssl",

@@ -82,7 +82,7 @@ def test_a_campaign_repeats_exactly(cell: Cell) -> None:
     first = campaign(cell)
     assert_same(first, campaign(cell, beside=load))
     assert_same(first, campaign(cell, before=restarted, pause_s=SLOW_S))
-    # Check that the compared streams are not empty of what they should contain.
+    # Check that the compared streams contain what the campaign does.
     two = [v2.SimlogMessage.FromString(message) for message in first["v2 two"]]
     assert [m.value.number_value for m in two if m.header.path == "SIMLOG://step"] == list(range(1, STEPS + 1))
     assert {"joints/Kuka.j1/R", "/sim/joints/Kuka.j1/R", "panel/lamps", "noise/glitches/20"} < {

@@ -9,7 +9,7 @@ from shmio.testing.ports import reserved_port
 from tests.faults import flood
 
 
-def test_a_flood_of_unknown_calls_harms_nobody(tmp_path: Path, instance: str) -> None:
+def test_a_flood_of_unknown_calls_does_not_disturb_clients(tmp_path: Path, instance: str) -> None:
     with ExitStack() as stack:
         plc, plain, secure = (stack.enter_context(reserved_port()) for _ in range(3))
         cell, context = flood.prepare(tmp_path, instance, plc, plain, secure)

@@ -204,9 +204,8 @@ def same_events(cell: Cell, first: Path, second: Path) -> None:
 def assert_continues(name: str, live: list[Any], replayed: list[Any]) -> None:
     """Assert that the replay's client received all that the live client did.
 
-    The first message is not compared.
-
-    It may have received more, as it was connected for longer.
+    The first message is not compared. The replay's client may have received more, as it was
+    connected for longer.
     """
     assert len(live) > 10, name
     at = replayed.index(live[1])

@@ -200,7 +200,7 @@ def test_the_successor_closes_the_file_of_a_killed_recorder(segment: Segment, tm
 
 
 def test_a_full_disk_leaves_the_file_unchanged_with_a_log_line(segment: Segment, tmp_path: Path) -> None:
-    """The limit is that of a file's size; the file's index needs more than is left."""
+    """A limit on the file's size stands for the full disk; the index needs more than is left."""
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 20)

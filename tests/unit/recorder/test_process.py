@@ -276,7 +276,7 @@ def test_a_file_of_another_user_is_refused_when_it_is_opened(tmp_path: Path) -> 
 
 
 def test_without_room_it_reports_that_and_continues_once_there_is_room(segment: Segment, tmp_path: Path) -> None:
-    """The limit is the file size, which any user can set for a process of theirs."""
+    """A limit on the file's size stands for the full disk, as any user can set one."""
     writer = segment.writer("cell")
     with Process(segment, tmp_path, buffer_mb=0.02) as process:
         publish(writer, 10)

@@ -296,7 +296,7 @@ def test_a_file_that_was_in_use_is_closed_later(segment: Segment, tmp_path: Path
         assert reader.records.footer() is not None
 
 
-def test_files_that_are_not_the_recorders_are_never_deleted(segment: Segment, tmp_path: Path) -> None:
+def test_files_that_the_recorder_did_not_write_are_never_deleted(segment: Segment, tmp_path: Path) -> None:
     name = segment.instance
     strange = {recorded(segment, tmp_path, 9, by="shmio-dump")}
     own = recorded(segment, tmp_path, 9)
@@ -341,7 +341,7 @@ def test_a_file_that_cannot_be_deleted_is_reported_once(
     assert not old.exists()
 
 
-def test_the_process_deletes_by_its_configuration(segment: Segment, tmp_path: Path) -> None:
+def test_the_process_deletes_old_files_as_configured(segment: Segment, tmp_path: Path) -> None:
     old = recorded(segment, tmp_path / "dumps", 9)
     with Process(segment, tmp_path, keep_days=7) as process:
         until(lambda: not old.exists(), "the old file deleted")

@@ -78,7 +78,7 @@ def test_an_event_wakes_readers_that_wait_for_frames(writer: BlockWriter) -> Non
     assert ring.doorbell() != seen
 
 
-def test_a_reader_that_was_too_slow_knows_how_many_it_missed(writer: BlockWriter) -> None:
+def test_a_slow_reader_counts_missed_events_exactly(writer: BlockWriter) -> None:
     cursor = writer.block.events.cursor()
     for item in range(EVENT_SLOTS + 500):
         writer.event(Record(EventKind.WRITTEN, item=item))

@@ -167,7 +167,7 @@ def test_only_the_owner_can_open_it_by_default(instance: str) -> None:
         segment.unlink()
 
 
-def test_another_abi_is_refused_by_name(instance: str) -> None:
+def test_another_abi_version_is_refused(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         segment.memory[8:12] = (7).to_bytes(4, "little")
         with pytest.raises(FormatError, match=r"ABI 7.*ABI 1"):

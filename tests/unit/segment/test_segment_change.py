@@ -40,7 +40,7 @@ def test_an_attached_reader_sees_a_new_source(segment: Segment) -> None:
         segment.writer("robot").publish(b"\0\7", cycle=1)
         assert reader["robot/count"] == 7
         assert reader.sources == ["cell", "press", "robot"]
-        assert reader.block("cell") is before, "what goes on stays the same object"
+        assert reader.block("cell") is before, "an unchanged block stays the same object"
 
 
 def test_the_frames_of_ended_blocks_can_still_be_read(segment: Segment) -> None:

@@ -89,7 +89,7 @@ def test_a_subclass_has_the_registers_of_the_class_above() -> None:
         (lambda: Parameter("RAEL"), "speed: there is no type 'RAEL'"),
     ],
 )
-def test_a_wrong_declaration_is_refused_by_name(make: Callable[[], Declaration], message: str) -> None:
+def test_an_invalid_declaration_is_refused_and_named(make: Callable[[], Declaration], message: str) -> None:
     with pytest.raises(ModelError) as caught:
         type("Wrong", (Still,), {"first": Input("INT"), "speed": make()})
     assert str(caught.value).startswith("model Wrong: ")

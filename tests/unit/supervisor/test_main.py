@@ -182,7 +182,7 @@ def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(la
 
 
 def test_a_failed_supervisor_leaves_the_processes_for_the_next_one(launch: Launch) -> None:
-    """For any reason; here it writes its state to a pipe without a reader."""
+    """Here it fails because it writes its state to a pipe without a reader."""
     cell = launch([*CELL, ("press", "source", ["good", "unfit"])])
     cell.wait_state("running")
     before = cell.pids()
@@ -285,7 +285,7 @@ def test_a_closed_terminal_stops_the_instance_cleanly(launch: Launch, tmp_path: 
 
 
 def test_an_ignored_sighup_stays_ignored(launch: Launch) -> None:
-    """``nohup`` starts it like this."""
+    """``nohup`` starts programs with SIGHUP ignored."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         cell = launch()

@@ -149,7 +149,7 @@ def test_a_missing_heartbeat_while_running_is_a_hang(world: World) -> None:
     assert world.passes(100, quiet_s=LIMITS.hang_s - 0.001) is None, "only a missing heartbeat counts, not time"
     assert world.passes(0, quiet_s=LIMITS.hang_s) is Event.HANG
     assert (world.state(), world.last_action()) == (State.HUNG, Action.KILL)
-    assert world.passes(LIMITS.kill_s - 0.001, quiet_s=200) is None, "killed once"
+    assert world.passes(LIMITS.kill_s - 0.001, quiet_s=200) is None, "it is killed only once"
     world.happens(Event.EXIT, "killed by SIGKILL")
     assert world.life.note == "no heartbeat for 5 s, killed by SIGKILL"
 
@@ -180,7 +180,7 @@ def test_a_process_that_does_not_stop_is_killed_after_its_grace(world: World) ->
     assert world.passes(LIMITS.grace_s - 0.001, quiet_s=60) is None
     assert world.passes(0.001) is Event.ELAPSED
     assert world.last_action() is Action.KILL
-    assert world.passes(LIMITS.kill_s - 0.001) is None, "killed once"
+    assert world.passes(LIMITS.kill_s - 0.001) is None, "it is killed only once"
     world.happens(Event.EXIT)
     assert (world.state(), world.life.due_ns) == (State.STOPPED, None)
 
@@ -197,7 +197,7 @@ def test_a_process_that_sigkill_does_not_end_is_stuck_until_it_ends(world: World
     world.now_ns += round(LIMITS.kill_s * S)
     world.happens(Event.ELAPSED, "pid 7 lives on")
     assert (world.life.stuck, world.life.note, world.last_action()) == (True, "pid 7 lives on", Action.KILL)
-    assert world.passes(10_000) is None, "killed twice"
+    assert world.passes(10_000) is None, "it is killed only once"
     world.happens(Event.EXIT)
     assert (world.state(), world.life.killed, world.life.stuck) == (after, False, False)
 

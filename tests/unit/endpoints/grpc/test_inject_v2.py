@@ -287,7 +287,7 @@ def test_a_subscriber_that_does_not_read_loses_its_injection(segment: Segment, m
     with_plant(segment, test)
 
 
-def test_both_versions_meet_in_one_injection_chain(segment: Segment) -> None:
+def test_both_versions_share_an_injection_chain(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         inner = await laid(served, "cell/step/in", "s")
         stream = await served.subscriber("injector")

@@ -168,7 +168,7 @@ def test_undecodable_bytes_end_only_their_call(segment: Segment, size: int) -> N
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_subscriber_that_never_reads_costs_a_bounded_queue(segment: Segment, version: int) -> None:
+def test_a_subscriber_that_never_reads_has_a_bounded_queue(segment: Segment, version: int) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         connection = await http2.Connection.open(served.port)
         if version == 1:
@@ -184,7 +184,7 @@ def test_a_subscriber_that_never_reads_costs_a_bounded_queue(segment: Segment, v
             await polite.goes_on()
             if served.service.counters[1] > before:
                 break
-        assert served.service.counters[1] > before, "values were dropped for it alone"
+        assert served.service.counters[1] > before, "values were dropped for this subscriber only"
         assert 0 < served.service.waiting_bytes < BOUND_BYTES
         await connection.drop(reset=True)
 

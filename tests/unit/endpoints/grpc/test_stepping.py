@@ -574,7 +574,7 @@ def test_invalid_steps_are_refused(instance: str) -> None:
     simulate(instance, test)
 
 
-def test_a_subscriber_between_two_steps_sees_the_last_and_newer_values_with_the_next(instance: str) -> None:
+def test_a_subscriber_that_joins_between_two_steps_gets_the_last_step_first(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         await step(served)
         models["sim"].image[11] = 7

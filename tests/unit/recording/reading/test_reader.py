@@ -28,7 +28,7 @@ any_input = settings(max_examples=150, suppress_health_check=[HealthCheck.functi
 
 
 def look(file: Path) -> tuple[list[Message], bool]:
-    """What ``info`` and ``cat`` read; whether it was closed."""
+    """Return the messages that ``info`` and ``cat`` read, and whether the file was closed."""
     with Reader(file) as reader:
         found = survey(reader)
         for track in found.tracks.values():
@@ -42,7 +42,7 @@ def cut(file: Path) -> list[Message]:
     found = []
     with suppress(RecordingError), Reader(file) as reader:
         for message in reader.messages():
-            found.append(message)  # noqa: PERF402  what comes before the error counts
+            found.append(message)  # noqa: PERF402  keeps the messages before the error
     return found
 
 

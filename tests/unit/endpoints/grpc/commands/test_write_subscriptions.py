@@ -148,7 +148,7 @@ def test_a_subscriber_that_joins_during_a_write_sees_only_the_next_one(segment: 
 
 
 async def end(stream: Any) -> tuple[list[str], grpc.aio.AioRpcError]:
-    """All that still comes, and how the stream ends."""
+    """Return the remaining values, and the error that ends the stream."""
     values: list[str] = []
     while True:
         try:

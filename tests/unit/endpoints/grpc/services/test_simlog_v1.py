@@ -52,7 +52,7 @@ async def seen(stream: Any, wanted: str) -> None:
         pass
 
 
-def test_on_in_the_injector_gets_writes_and_the_device_gets_its_values(segment: Segment) -> None:
+def test_on_in_the_device_gets_injected_values_and_the_injector_gets_writes(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         originals = await laid(served, "cell/step/in", "cell/step/shadow")
         await publish(served, ("cell/step/in", "7"), ("cell/step", "7"), ("cell/step/in", "9"))
@@ -71,7 +71,7 @@ def test_on_in_the_injector_gets_writes_and_the_device_gets_its_values(segment: 
     with_plant(segment, test)
 
 
-def test_on_out_consumers_get_the_injectors_values_and_it_gets_the_sources(segment: Segment) -> None:
+def test_on_out_consumers_get_injected_values_and_the_injector_gets_originals(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         await publish(served, ("cell/step", "3"))
         consumer = served.subscribe("cell/step")
@@ -474,7 +474,7 @@ def test_the_number_of_injections_is_limited(segment: Segment, monkeypatch: pyte
     with_plant(segment, test)
 
 
-def test_a_program_can_inject_beneath_those_of_clients(segment: Segment) -> None:
+def test_a_program_can_inject_beneath_a_clients_injection(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         originals = await laid(served, "cell/step", "s")
         await value(originals)

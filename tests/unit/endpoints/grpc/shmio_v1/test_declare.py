@@ -153,7 +153,7 @@ def test_a_campaign_ends_when_all_its_injections_are_over(segment: Segment) -> N
         ({"target": "cell/secret/in"}, CommandError, "not writable"),
     ],
 )
-def test_one_invalid_declaration_lays_none(
+def test_one_invalid_declaration_refuses_all(
     segment: Segment, wrong: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:

@@ -205,7 +205,7 @@ def test_a_client_is_never_off_by_more_than_the_dead_band(
         ("STRING[3]", "0302 e461 00", Column.TEXT, "äa"),
     ],
 )
-def test_fixed_bytes(type_: str, raw: str, column: Column, value: Any) -> None:
+def test_fixed_bytes_of_each_type_decode_to_known_values(type_: str, raw: str, column: Column, value: Any) -> None:
     image = bytes.fromhex(raw)
     register = Register("a", type_, (), 0, 3 if type_ == "BOOL" else None, len(image), 1)
     columns = Columns([register], "big")

@@ -127,7 +127,7 @@ def test_a_model_replaced_by_a_reload_in_virtual_time_is_shown_step_by_step(inst
 
 
 def test_a_held_feed_skips_no_frames(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It reads the frames for its streams later: they are not too slow for any."""
+    """It gives the frames to its streams later, so no stream counts as slow."""
     monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
     monkeypatch.setattr(ringing, "REST_S", 0.001)
 

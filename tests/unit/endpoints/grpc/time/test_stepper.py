@@ -14,7 +14,7 @@ DONE = Step(1, 50, 50)
 
 
 class Block:
-    """A block whose doorbell has always rung again when the event loop's thread waits for it."""
+    """A block whose doorbell always rings while the event loop's thread waits for it."""
 
     @property
     def ring(self) -> Block:

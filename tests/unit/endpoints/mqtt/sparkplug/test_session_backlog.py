@@ -13,7 +13,7 @@ ROW = Metric(Register("row", "REAL", ((0, 999),), 0, None, 4000, 1000), 2)
 MOST_BYTES = 100_000
 
 
-def test_arrays_count_with_their_size() -> None:
+def test_the_size_of_arrays_counts_toward_the_bound() -> None:
     backlog = DeviceBacklog(MOST_BYTES)
     kept = []
     for at_ms in range(100):
