@@ -197,3 +197,8 @@ def test_the_soak_run_watches_all_processes_and_the_recording() -> None:
     )
     assert re.search(r"^the machine stood still .* of \d+ skipped cycles came without that", found, re.MULTILINE)
     assert re.search(r"^[1-9]\d* frames recorded in [1-9]\d* files", found, re.MULTILINE)
+
+
+def test_the_start_of_a_large_cell_is_measured() -> None:
+    found = re.findall(r"^(\w+) +\d+\.\d\d +\d+\.\d\d +\d+\.\d\d$", printed("large_cell"), re.MULTILINE)
+    assert found == ["up", "good", "attach", "get", "list"]
