@@ -65,6 +65,17 @@ def test_only_a_block_with_outputs_has_a_channel(segment: Segment) -> None:
     assert link_of(segment).model() is None
 
 
+def test_a_model_connects_while_every_process_slot_is_taken(segment: Segment) -> None:
+    slots = [slot.index for slot in (*segment.processes, *segment.processes.guests)]
+    assert slots[-1] == segment.header.process_capacity - 1
+    with (
+        Segment.open(segment.instance, writable=True) as others,
+        Segment.open(segment.instance, writable=True) as other,
+    ):
+        assert all(slot.take() for slot in (*others.processes, *others.processes.guests))
+        assert link_of(other).join("belt")
+
+
 def test_requests_are_matched_with_their_answers(segment: Segment) -> None:
     with Segment.open(segment.instance, writable=True) as other:
         source, model = link_of(segment), link_of(other)
