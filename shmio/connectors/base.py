@@ -62,6 +62,13 @@ class Connector(ABC):
     provenance: ClassVar[Provenance] = Provenance.LIVE
     """The provenance of the values that it reads."""
 
+    register_quality: ClassVar[bool] = False
+    """Whether the device gives each register a status and a time of its own.
+
+    Then the layout has a status area, and :class:`shmio.connectors.register_image.RegisterImage`
+    makes the images.
+    """
+
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:
         """Create the connector without connecting it.

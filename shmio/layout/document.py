@@ -18,6 +18,7 @@ from shmio.layout.model import (
     ALIASES,
     MAX_BLOCK_BYTES,
     MAX_ELEMENTS,
+    MAX_IMAGE_BYTES,
     MAX_REGISTERS,
     ByteOrder,
     Dims,
@@ -26,6 +27,7 @@ from shmio.layout.model import (
     array_size,
     element_type,
     shape_of,
+    status_bytes,
 )
 from shmio.layout.topic import check_canonical
 
@@ -35,10 +37,11 @@ MAX_JSON_BYTES = 128 << 20
 class _Layout(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     name: str
     number: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None
-    size: Annotated[int, msgspec.Meta(ge=0, le=MAX_BLOCK_BYTES)]
+    size: Annotated[int, msgspec.Meta(ge=0, le=MAX_IMAGE_BYTES)]
     optimized: bool
     registers: Annotated[tuple[Register, ...], msgspec.Meta(max_length=MAX_REGISTERS)]
     byte_order: ByteOrder = "big"
+    status_offset: Annotated[int, msgspec.Meta(ge=0)] | None = None
 
 
 _DECODER = msgspec.json.Decoder(_Layout)  # msgspec crashes if two threads use a type first
@@ -63,7 +66,10 @@ def load_layout(data: bytes) -> Layout:
         if not register.dims:
             msgspec.structs.force_setattr(register, "dims", ())
     _check(document)
-    layout = Layout(document.name, document.number, document.size, document.optimized, registers, document.byte_order)
+    layout = Layout(
+        document.name, document.number, document.size, document.optimized, registers,
+        document.byte_order, document.status_offset,
+    )  # fmt: skip
     vars(layout)["hash"] = hashlib.sha256(data).digest()  # to make the JSON anew would take longer than to read it
     return layout
 
@@ -85,8 +91,13 @@ def _check(document: _Layout) -> None:
             raise LayoutError(f"layout: {register.path!r} overlaps the register before it")
         end_bits = first + (1 if has_bit and not register.dims else size * 8)
         elements += count
-    if end_bits > document.size * 8 or elements > MAX_ELEMENTS:
-        raise LayoutError(f"layout: the registers do not fit the block of {document.size} bytes")
+    size = document.size if document.status_offset is None else document.status_offset
+    if end_bits > size * 8 or size > MAX_BLOCK_BYTES or elements > MAX_ELEMENTS:
+        raise LayoutError(f"layout: the registers do not fit the block of {size} bytes")
+    if document.status_offset is not None and document.size != size + status_bytes(len(document.registers)):
+        raise LayoutError(f"layout: the status area at {size} does not fit the image of {document.size} bytes")
+    if document.status_offset is not None and size % 8:
+        raise LayoutError(f"layout: the status area at {size} is not aligned to 8 bytes")
     paths = [register.path for register in document.registers]
     if len(set(paths)) < len(paths):
         twice = next(path for path, times in Counter(paths).items() if times > 1)

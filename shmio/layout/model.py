@@ -13,9 +13,9 @@ import math
 import re
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import msgspec
 
@@ -29,6 +29,7 @@ MAX_DEPTH = 32  # nested structures; Siemens allows 8
 MAX_STANDARD_BYTES = 65_536  # limit of an S7-1500 for a block with standard access
 MAX_BLOCK_BYTES = 1 << 20  # any block: optimized ones, and those of other sources
 MAX_REGISTERS = 100_000
+MAX_IMAGE_BYTES = MAX_BLOCK_BYTES + 12 * MAX_REGISTERS + 8  # with a status area
 MAX_ELEMENTS = 1 << 20  # of all registers together
 MAX_STRUCTURES = 200_000  # of a block, including structures without registers
 _MAX_STRING = 254
@@ -107,6 +108,7 @@ STRUCTURED = frozenset({"STRING", "WSTRING", "DATE_AND_TIME", "DTL"})  # made of
 INTEGERS = frozenset(
     ["BYTE", "WORD", "DWORD", "LWORD", "SINT", "USINT", "INT", "UINT", "DINT", "UDINT", "LINT", "ULINT"]
 )
+NUMBERS = INTEGERS | {"REAL", "LREAL"}
 _STRING = re.compile(r"(W?STRING)(?:\[([0-9]{1,5})\])?")
 
 
@@ -136,6 +138,9 @@ _Bound = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
 _Size = Annotated[int, msgspec.Meta(ge=0, le=MAX_BLOCK_BYTES)]
 _Bit = Annotated[int, msgspec.Meta(ge=0, le=7)]
 _Count = Annotated[int, msgspec.Meta(ge=1, le=MAX_ELEMENTS)]
+_Unit = Annotated[str, msgspec.Meta(max_length=64)]
+_Address = Annotated[str, msgspec.Meta(max_length=4096)]
+_Deadband = Annotated[float, msgspec.Meta(ge=0)]
 if TYPE_CHECKING:
     _Dims = Dims
 else:  # a scalar's JSON has null, which the reader of layouts replaces
@@ -157,6 +162,13 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
         initial: The source's text of the initial value.
         partial: Whether this is a slice of a row of bits, which begins at ``bit``; its first and
             last byte may hold bits of other registers.
+        unit: Unit of the value, such as ``mm/s``; "" if unknown.
+        address: Address in the device, in the notation of the source's connector; "" if the
+            position in the block is the address.
+        scale: (factor, offset) by which the connector computes the value from the device's number:
+            value = number * factor + offset. None: the value is the number.
+        deadband: Change of the value up to which the connector may keep the old value.
+        writable: Whether the tag table lets commands write the register.
 
     """
 
@@ -170,6 +182,11 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
     comment: str = ""
     initial: str | None = None
     partial: bool = False
+    unit: _Unit = ""
+    address: _Address = ""
+    scale: tuple[float, float] | None = None
+    deadband: _Deadband = 0.0
+    writable: bool = False
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -187,7 +204,14 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
 
 @dataclass(frozen=True)
 class Layout:
-    """A block's registers in address order. ``size`` is in bytes."""
+    """A block's registers in address order.
+
+    Attributes:
+        size: Size of an image of the block in bytes, with its status area.
+        status_offset: Where the image has its status area, which holds a status code and a source
+            time for each register: see :class:`shmio.model.statuses.StatusArea`. None: it has none.
+
+    """
 
     name: str
     number: int | None
@@ -195,6 +219,7 @@ class Layout:
     optimized: bool
     registers: tuple[Register, ...]
     byte_order: ByteOrder = "big"
+    status_offset: int | None = None
 
     @cached_property
     def by_path(self) -> Mapping[str, int]:
@@ -257,17 +282,31 @@ class Layout:
             size=register.element.size,
             count=1,
             comment=register.comment,
+            unit=register.unit,
         )
 
+    def with_statuses(self) -> Layout:
+        """Return the layout with a status area behind its registers."""
+        if self.status_offset is not None:
+            return self
+        start = -(-self.size // 8) * 8
+        return replace(self, status_offset=start, size=start + status_bytes(len(self.registers)))
+
     def describe(self) -> dict[str, object]:
-        """Return the layout as the object of ``shmio-layout --json``: JSON types, without ``byte_order``."""
-        return {
+        """Return the layout as the object of ``shmio-layout --json``: JSON types, without ``byte_order``.
+
+        What only tag tables and status areas have is left out of the layouts that have none.
+        """
+        described: dict[str, object] = {
             "name": self.name,
             "number": self.number,
             "size": self.size,
             "optimized": self.optimized,
             "registers": [_describe(register) for register in self.registers],
         }
+        if self.status_offset is not None:
+            described["status_offset"] = self.status_offset
+        return described
 
     def to_json(self) -> bytes:
         """Return canonical JSON: :meth:`describe` and ``byte_order``, keys in fixed order, no white space, UTF-8."""
@@ -276,6 +315,10 @@ class Layout:
     @cached_property
     def _json(self) -> bytes:
         return msgspec.json.encode(self.describe() | {"byte_order": self.byte_order})
+
+
+_OF_TAGS: Final = ("unit", "address", "scale", "deadband", "writable")
+_DEFAULTS: Final = {"unit": "", "address": "", "scale": None, "deadband": 0.0, "writable": False}
 
 
 def _describe(register: Register) -> Mapping[str, object]:
@@ -289,6 +332,7 @@ def _describe(register: Register) -> Mapping[str, object]:
         "count": register.count,
         "comment": register.comment,
         "initial": register.initial,
+        **{name: given for name in _OF_TAGS if (given := getattr(register, name)) != _DEFAULTS[name]},
     }
 
 
@@ -312,6 +356,11 @@ class _Sorted:
             if at < len(self._paths) and f"{self._paths[at]}/".startswith(f"{path}/"):
                 return self._indices[at]
         return None
+
+
+def status_bytes(registers: int) -> int:
+    """Return the size of a status area: a code of 4 and a time of 8 bytes for each register, aligned to 8."""
+    return -(-4 * registers // 8) * 8 + 8 * registers
 
 
 def shape_of(dims: Dims) -> tuple[int, ...]:

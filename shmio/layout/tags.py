@@ -5,7 +5,8 @@
     name = "cell"                 # optional: the file's name
     [registers]
     "joints/R3200/Link1/R/position" = "LREAL"
-    "joints/Kuka.j1/R" = { type = "LREAL", initial = 0.5, comment = "rad" }
+    "joints/Kuka.j1/R" = { type = "LREAL", initial = 0.5, unit = "rad" }
+    "pump/Speed" = { type = "REAL", address = "holding 100", scale = 0.1, writable = true }
     "lamps" = { type = "ARRAY[1..8] OF BOOL", initial = [true] }
     "safetyzones/Z1" = "SafetyZone"
 
@@ -13,6 +14,12 @@ Keys are paths as in topics. Types are those of S7, or structures of known shape
 become registers. Values lie in the order of the file, each at a multiple of its size, in the byte
 order ``byte_order`` (default: little, as on this machine); a single BOOL takes a byte of its own.
 The initial values of an array are one list, in the order of its elements.
+
+``address`` says where the device has the value, in the notation of the source's connector. With
+``scale = factor`` or ``scale = [factor, offset]``, the connector computes the value from the
+device's number: number * factor + offset. ``deadband`` is the change of the value up to which the
+connector may keep the old value. ``writable = true`` does what naming the register in the source's
+``writable`` does.
 """
 
 from __future__ import annotations
@@ -27,6 +34,7 @@ from pathlib import PurePath
 from typing import Annotated, Final, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from shmio.config.faults import MAX_PARTS, explain, explain_toml, too_long
 from shmio.errors import Diagnostic, PathError, ValueRangeError
@@ -35,6 +43,7 @@ from shmio.layout.model import (
     MAX_DIMENSIONS,
     MAX_ELEMENTS,
     MAX_REGISTERS,
+    NUMBERS,
     ByteOrder,
     Dims,
     ElementType,
@@ -68,6 +77,11 @@ class _Tag(msgspec.Struct, forbid_unknown_fields=True):
     type: str
     initial: _Scalar | list[_Scalar] | None = None
     comment: Annotated[str, msgspec.Meta(max_length=1000)] = ""
+    unit: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    address: Annotated[str, msgspec.Meta(max_length=4096)] = ""
+    scale: float | tuple[float, float] | None = None
+    deadband: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    writable: bool = False
 
 
 class _Table(msgspec.Struct, forbid_unknown_fields=True):
@@ -248,7 +262,7 @@ class _Placer:
         if tag.initial is not None:
             raise ValueError("initial: a structure has no initial value; list its members to give them values")
         for name, kind in inside.items():
-            self._place(key, f"{key}/{name}", _Tag(kind, None, tag.comment))
+            self._place(key, f"{key}/{name}", replace(tag, type=kind))
 
     def _place(self, key: str, name: str, tag: _Tag) -> None:
         path = canonical_path(name)
@@ -265,7 +279,11 @@ class _Placer:
         size, align = array_size(element, shape), _align(element)
         offset = -(-self._end // align) * align
         initial = None if tag.initial is None else _literal(tag.initial, element)
-        register = Register(path, element.name, dims, offset, bit, size, math.prod(shape), tag.comment, initial)
+        register = Register(
+            path, element.name, dims, offset, bit, size, math.prod(shape), tag.comment, initial,
+            unit=tag.unit, address=tag.address, scale=_scale(tag, element), deadband=_deadband(tag, element),
+            writable=tag.writable,
+        )  # fmt: skip
         if initial is not None:
             parse_literal(initial, register)
             _check_length(initial, shape)
@@ -273,6 +291,27 @@ class _Placer:
         self._keys[path] = key
         self._end = offset + size
         self._elements += register.count
+
+
+def _scale(tag: _Tag, element: ElementType) -> tuple[float, float] | None:
+    """Return (factor, offset), or None; ValueError if the type cannot be scaled."""
+    if tag.scale is None:
+        return None
+    factor, offset = tag.scale if isinstance(tag.scale, tuple) else (tag.scale, 0.0)
+    if element.base not in NUMBERS:
+        raise ValueError(f"scale: a {element.base} cannot be scaled, only numbers can")
+    if not factor or not math.isfinite(factor) or not math.isfinite(offset):
+        raise ValueError("scale: expected a finite factor other than 0, or [factor, offset]")
+    return factor, offset
+
+
+def _deadband(tag: _Tag, element: ElementType) -> float:
+    """Return the dead-band; ValueError if the type has none."""
+    if tag.deadband and element.base not in NUMBERS:
+        raise ValueError(f"deadband: a {element.base} has no dead-band, only numbers have")
+    if not math.isfinite(tag.deadband):
+        raise ValueError("deadband: expected a finite number")
+    return tag.deadband
 
 
 def _tag(key: str, given: object) -> _Tag:

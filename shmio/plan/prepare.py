@@ -158,9 +158,14 @@ def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
 
 
 def _spelled_source(source: Source, layout: Layout) -> Source:
+    """Return the source with its patterns spelled as the layout spells them.
+
+    Registers that a tag table makes writable join the patterns.
+    """
+    patterns = dict.fromkeys(block_path(pattern, layout) for pattern in source.writable)
     return replace(
         source,
-        writable=[block_path(pattern, layout) for pattern in source.writable],
+        writable=[*patterns, *(one.path for one in layout.registers if one.writable and one.path not in patterns)],
         allow_nonfinite=tuple(block_path(pattern, layout) for pattern in source.allow_nonfinite),
     )
 

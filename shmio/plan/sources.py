@@ -13,7 +13,7 @@ from shmio.config import Config, Source
 from shmio.config.faults import Faults, near
 from shmio.config.read import unknown_option
 from shmio.connectors import registry
-from shmio.connectors.base import Computed, Replayed
+from shmio.connectors.base import Computed, Connector, Replayed
 from shmio.connectors.models.simulation import Answer, Request, Simulation
 from shmio.errors import ConfigError, PathError, RecordingError, ShmioError, ValueRangeError
 from shmio.layout.document import load_layout
@@ -86,7 +86,10 @@ def _check_source(
         if options is not None:
             found.layouts[source.name], inputs[index] = _model(key, source, config, files)
         return
-    layout = found.layouts[source.name] = files.get(key, source, source.options.get("dbNumber"))
+    layout = files.get(key, source, source.options.get("dbNumber"))
+    if issubclass(connector, Connector) and connector.register_quality:
+        layout = layout.with_statuses()
+    found.layouts[source.name] = layout
     if options is None:  # its faults are reported, and so are those that the connector finds
         options = _filled(connector.Options, source)
         if options is None:

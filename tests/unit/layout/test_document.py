@@ -179,3 +179,32 @@ for thread in threads: thread.join()
     for _ in range(5):
         done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_columns_of_a_tag_table_are_in_the_json_where_they_say_something() -> None:
+    table = b"""[registers]
+    plain = "INT"
+    full = { type = "REAL", unit = "bar", address = "ns=2;s=p", scale = [0.1, -4], deadband = 0.5, writable = true }"""
+    layout = compile_sources([Source("x.toml", table)]).layouts[0]
+    plain, full = json.loads(layout.to_json())["registers"]
+    assert plain.keys().isdisjoint(full.keys() - {"path", "type", "offset", "size", *plain})
+    given = {key: full[key] for key in full.keys() - plain.keys()}
+    assert given == {"unit": "bar", "address": "ns=2;s=p", "scale": [0.1, -4.0], "deadband": 0.5, "writable": True}
+    assert load_layout(layout.to_json()) == layout
+
+
+def test_a_layout_with_a_status_area(layout: Layout) -> None:
+    wide = layout.with_statuses()
+    assert wide.status_offset == -(-layout.size // 8) * 8
+    assert wide.size == wide.status_offset + -(-4 * len(layout.registers) // 8) * 8 + 8 * len(layout.registers)
+    assert load_layout(wide.to_json()) == wide
+    assert wide.with_statuses() is wide
+    assert wide.hash != layout.hash
+
+
+@pytest.mark.parametrize(("key", "by"), [("size", 8), ("size", -8), ("status_offset", 8), ("status_offset", -1 << 10)])
+def test_a_status_area_that_does_not_fit_is_refused(layout: Layout, key: str, by: int) -> None:
+    document = json.loads(layout.with_statuses().to_json())
+    document[key] += by
+    with pytest.raises(LayoutError):
+        load_layout(json.dumps(document).encode())

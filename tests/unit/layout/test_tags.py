@@ -104,8 +104,8 @@ WRONG = {
     "[registers]\n'b/c' = 'INT'\n'b/c' = { type = 'ARRAY[1..2] OF INT', initial = [\n1,\n2] }\nd = 'INT'": "cell.toml"
     ":3:1: error: 'b/c': given twice",
     "[registers]\na = 'INT'\na.b = 'INT'\n": "3:1: error: a.b: given twice; write a path with a dot in",
-    "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: there is no 'b' here, only type, initial, comment; "
-    'write a path with a dot in quotes, "a.b"',
+    "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: there is no 'b' here, only type, "
+    'initial, comment, unit, address, scale, deadband, writable; write a path with a dot in quotes, "a.b"',
     "[registers]\na/b = 'INT'": "write a path in quotes",
     "name = 'a'\n[registers]\nb = 'INT'\n[registers.name]\ntype = 'INTEGER'": "4:1: error: name: there is no type",
 }
@@ -149,3 +149,30 @@ def test_anything_is_compiled_or_refused(data: str | bytes) -> None:
         except LayoutError:
             continue
         assert load_layout(layout.to_json()) == layout
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ('{ type = "BOOL", scale = 2 }', "a BOOL cannot be scaled"),
+        ('{ type = "REAL", scale = 0 }', "a finite factor other than 0"),
+        ('{ type = "REAL", scale = [1, inf] }', "a finite factor"),
+        ('{ type = "REAL", scale = [1, 2, 3] }', "scale"),
+        ('{ type = "STRING[4]", deadband = 1 }', "has no dead-band"),
+        ('{ type = "REAL", deadband = -1 }', "deadband"),
+        ('{ type = "REAL", deadband = inf }', "a finite number"),
+        ('{ type = "REAL", unit = "' + "m" * 65 + '" }', "unit"),
+        ('{ type = "REAL", writable = 1 }', "writable"),
+        ('{ type = "REAL", address = 4 }', "address"),
+    ],
+)
+def test_a_wrong_column_is_named_with_its_line(entry: str, message: str) -> None:
+    assert message in (text := refusal(f"[registers]\na = {entry}"))
+    assert text.startswith("cell.toml:2:1: error: a: ")
+
+
+def test_members_of_a_structure_share_its_columns() -> None:
+    (layout,) = compile_sources(
+        [Source("x.toml", b'[registers]\np = { type = "Point", unit = "mm", writable = true }')]
+    ).layouts
+    assert {(one.unit, one.writable) for one in layout.registers} == {("mm", True)}

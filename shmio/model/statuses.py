@@ -1,0 +1,233 @@
+"""The status area of an image: a status code and a source time for each register.
+
+An image of a layout with :attr:`Layout.status_offset` ends in this area, so that rings, recordings
+and replays carry it like all other bytes. It holds two little-endian arrays in the order of the
+layout's registers: the OPC UA status codes (u32, OPC 10000-4, section 7.39), padded to 8 bytes, and
+the source times (i64, ns since 1970 UTC; 0: unknown, the time of the frame counts).
+"""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_right
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+from shmio.layout.model import Layout, Register
+from shmio.model.values import Quality
+
+_CODE: Final = struct.Struct("<I")
+_TIME: Final = struct.Struct("<q")
+_QUALITIES: Final = (Quality.GOOD, Quality.UNCERTAIN, Quality.BAD, Quality.BAD)
+
+GOOD: Final = 0x00000000
+UNCERTAIN_LAST_USABLE_VALUE: Final = 0x40900000
+BAD_COMMUNICATION_ERROR: Final = 0x80050000
+BAD_WAITING_FOR_INITIAL_DATA: Final = 0x80320000
+BAD_NODE_ID_UNKNOWN: Final = 0x80340000
+BAD_OUT_OF_RANGE: Final = 0x803C0000
+BAD_TYPE_MISMATCH: Final = 0x80740000
+BAD_CONFIGURATION_ERROR: Final = 0x80890000
+BAD_NOT_CONNECTED: Final = 0x808A0000
+BAD_DEVICE_FAILURE: Final = 0x808B0000
+BAD_NO_DATA: Final = 0x809B0000
+
+_NAMES: Final = {  # OPC 10000-6, annex A.2: those that data sources give
+    0x00000000: "Good",
+    0x002D0000: "GoodSubscriptionTransferred",
+    0x002E0000: "GoodCompletesAsynchronously",
+    0x002F0000: "GoodOverload",
+    0x00300000: "GoodClamped",
+    0x00960000: "GoodLocalOverride",
+    0x00A50000: "GoodNoData",
+    0x00A90000: "GoodCallAgain",
+    0x00DC0000: "GoodEdited",
+    0x00E00000: "GoodDependentValueChanged",
+    0x04010000: "GoodCascadeInitializationAcknowledged",
+    0x04080000: "GoodInitiateFaultState",
+    0x40000000: "Uncertain",
+    0x406C0000: "UncertainReferenceOutOfServer",
+    0x408F0000: "UncertainNoCommunicationLastUsableValue",
+    0x40900000: "UncertainLastUsableValue",
+    0x40910000: "UncertainSubstituteValue",
+    0x40920000: "UncertainInitialValue",
+    0x40930000: "UncertainSensorNotAccurate",
+    0x40940000: "UncertainEngineeringUnitsExceeded",
+    0x40950000: "UncertainSubNormal",
+    0x40A40000: "UncertainDataSubNormal",
+    0x40C00000: "UncertainNotAllNodesAvailable",
+    0x40DE0000: "UncertainDominantValueChanged",
+    0x40E20000: "UncertainDependentValueChanged",
+    0x42090000: "UncertainSimulatedValue",
+    0x420A0000: "UncertainSensorCalibration",
+    0x80000000: "Bad",
+    0x80010000: "BadUnexpectedError",
+    0x80020000: "BadInternalError",
+    0x80030000: "BadOutOfMemory",
+    0x80040000: "BadResourceUnavailable",
+    0x80050000: "BadCommunicationError",
+    0x80060000: "BadEncodingError",
+    0x80070000: "BadDecodingError",
+    0x80080000: "BadEncodingLimitsExceeded",
+    0x80090000: "BadUnknownResponse",
+    0x800A0000: "BadTimeout",
+    0x800B0000: "BadServiceUnsupported",
+    0x800C0000: "BadShutdown",
+    0x800D0000: "BadServerNotConnected",
+    0x800E0000: "BadServerHalted",
+    0x800F0000: "BadNothingToDo",
+    0x80100000: "BadTooManyOperations",
+    0x80110000: "BadDataTypeIdUnknown",
+    0x80120000: "BadCertificateInvalid",
+    0x80130000: "BadSecurityChecksFailed",
+    0x801A0000: "BadCertificateUntrusted",
+    0x801F0000: "BadUserAccessDenied",
+    0x80200000: "BadIdentityTokenInvalid",
+    0x80210000: "BadIdentityTokenRejected",
+    0x80250000: "BadSessionIdInvalid",
+    0x80260000: "BadSessionClosed",
+    0x80310000: "BadNoCommunication",
+    0x80320000: "BadWaitingForInitialData",
+    0x80330000: "BadNodeIdInvalid",
+    0x80340000: "BadNodeIdUnknown",
+    0x80350000: "BadAttributeIdInvalid",
+    0x80360000: "BadIndexRangeInvalid",
+    0x80370000: "BadIndexRangeNoData",
+    0x80380000: "BadDataEncodingInvalid",
+    0x80390000: "BadDataEncodingUnsupported",
+    0x803A0000: "BadNotReadable",
+    0x803B0000: "BadNotWritable",
+    0x803C0000: "BadOutOfRange",
+    0x803D0000: "BadNotSupported",
+    0x803E0000: "BadNotFound",
+    0x803F0000: "BadObjectDeleted",
+    0x80400000: "BadNotImplemented",
+    0x80410000: "BadMonitoringModeInvalid",
+    0x80420000: "BadMonitoredItemIdInvalid",
+    0x80430000: "BadMonitoredItemFilterInvalid",
+    0x80440000: "BadMonitoredItemFilterUnsupported",
+    0x80450000: "BadFilterNotAllowed",
+    0x80460000: "BadStructureMissing",
+    0x80470000: "BadEventFilterInvalid",
+    0x80570000: "BadUserSignatureInvalid",
+    0x805B0000: "BadParentNodeIdInvalid",
+    0x80600000: "BadBrowseNameInvalid",
+    0x80730000: "BadWriteNotSupported",
+    0x80740000: "BadTypeMismatch",
+    0x80750000: "BadMethodInvalid",
+    0x80760000: "BadArgumentsMissing",
+    0x80770000: "BadTooManySubscriptions",
+    0x80780000: "BadTooManyPublishRequests",
+    0x80790000: "BadNoSubscription",
+    0x80830000: "BadTcpEndpointUrlInvalid",
+    0x80860000: "BadSecureChannelClosed",
+    0x80890000: "BadConfigurationError",
+    0x808A0000: "BadNotConnected",
+    0x808B0000: "BadDeviceFailure",
+    0x808C0000: "BadSensorFailure",
+    0x808D0000: "BadOutOfService",
+    0x808E0000: "BadDeadbandFilterInvalid",
+    0x809B0000: "BadNoData",
+    0x809D0000: "BadDataLost",
+    0x809E0000: "BadDataUnavailable",
+    0x80AB0000: "BadInvalidArgument",
+    0x80AC0000: "BadConnectionRejected",
+    0x80AD0000: "BadDisconnect",
+    0x80AE0000: "BadConnectionClosed",
+    0x80AF0000: "BadInvalidState",
+    0x80B00000: "BadEndOfStream",
+    0x80B10000: "BadNoDataAvailable",
+    0x80B80000: "BadRequestTooLarge",
+    0x80B90000: "BadResponseTooLarge",
+    0x80BF0000: "BadStateNotActive",
+    0x80DB0000: "BadTooManyMonitoredItems",
+    0x80E10000: "BadDominantValueChanged",
+    0x80E30000: "BadDependentValueChanged",
+    0x80E90000: "BadLocked",
+    0x810E0000: "BadLicenseExpired",
+    0x810F0000: "BadLicenseLimitsExceeded",
+    0x81100000: "BadLicenseNotAvailable",
+}
+
+
+class RegisterStatus(NamedTuple):
+    """The status that the source gave a register.
+
+    Attributes:
+        code: OPC UA status code.
+        source_ns: UTC time of the value at its origin, in ns since 1970; 0: that of the frame.
+    """
+
+    code: int
+    source_ns: int
+
+    @property
+    def quality(self) -> Quality:
+        """The severity of the code; the reserved severity counts as bad."""
+        return quality_of(self.code)
+
+    @property
+    def reason(self) -> str:
+        """Reason why the quality is not good; empty if it is."""
+        return "" if self.quality is Quality.GOOD else f"the device reports {describe(self.code)}"
+
+
+def describe(code: int) -> str:
+    """Return a status code as text: its name if it is known, and its number."""
+    name = _NAMES.get(code & 0xFFFF0000)  # the low half has flags
+    return f"{name} (0x{code:08X})" if name else f"status 0x{code:08X}"
+
+
+def quality_of(code: int) -> Quality:
+    """Return the severity of a status code; the reserved severity counts as bad."""
+    return _QUALITIES[code >> 30]
+
+
+class StatusArea:
+    """Finds, reads and writes the statuses in images of one layout, which must have a status area."""
+
+    def __init__(self, layout: Layout) -> None:
+        if layout.status_offset is None:
+            raise ValueError(f"{layout.name}: the layout has no status area")
+        self.codes_offset = layout.status_offset
+        """Where the codes begin."""
+        self.times_offset = layout.size - _TIME.size * len(layout.registers)
+        """Where the source times begin."""
+        self._first_bits = [8 * register.offset + (register.bit or 0) for register in layout.registers]
+
+    def index(self, register: Register) -> int:
+        """Return the index of the layout's register that contains this register, element or part."""
+        return bisect_right(self._first_bits, 8 * register.offset + (register.bit or 0)) - 1
+
+    def indices(self, registers: Iterable[Register]) -> list[int]:
+        """Return the index of each register, see :meth:`index`."""
+        return [self.index(register) for register in registers]
+
+    def code_range(self, index: int) -> tuple[int, int]:
+        """Return (offset, size) of a register's code in an image."""
+        return self.codes_offset + _CODE.size * index, _CODE.size
+
+    def get(self, image: bytes | bytearray, index: int) -> RegisterStatus:
+        """Return the status of the register at an index of the layout."""
+        (code,) = _CODE.unpack_from(image, self.codes_offset + _CODE.size * index)
+        (source_ns,) = _TIME.unpack_from(image, self.times_offset + _TIME.size * index)
+        return RegisterStatus(code, source_ns)
+
+    def quality(self, image: bytes | bytearray, index: int) -> Quality:
+        """Return the quality of the register at an index of the layout."""
+        return _QUALITIES[image[self.codes_offset + _CODE.size * index + 3] >> 6]
+
+    def put(self, image: bytearray, index: int, status: RegisterStatus) -> None:
+        """Write the status of the register at an index of the layout."""
+        _CODE.pack_into(image, self.codes_offset + _CODE.size * index, status.code)
+        _TIME.pack_into(image, self.times_offset + _TIME.size * index, status.source_ns)
+
+
+def status_area(layout: Layout) -> StatusArea | None:
+    """Return the status area of a layout, or None if it has none. The result is cached."""
+    if layout.status_offset is None:
+        return None
+    found: StatusArea | None = vars(layout).get("_status_area")
+    if found is None:
+        found = vars(layout)["_status_area"] = StatusArea(layout)
+    return found
