@@ -1,1 +1,1 @@
-"""Connectors: one class for each protocol, one loop for all, a process for each source."""
+"""Connectors read and write devices: a class for each protocol, and a process for each source."""

@@ -1,4 +1,4 @@
-"""The process of one source."""
+"""Runs the process of one source."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HANG_MARGIN_S = 30.0  # added to the time-out: a host name lookup has no time-ou
 
 
 class _LoopHandle(NamedTuple):
-    """A loop with the function that stops it and the time-out of its hooks in s."""
+    """A loop, the function that stops it, and the time-out in s of the source's methods."""
 
     loop: SourceLoop | SteppedLoop | ReplayLoop
     stop: Callable[[], None]
@@ -39,9 +39,9 @@ class _LoopHandle(NamedTuple):
 
 
 def run(worker: Worker) -> None:
-    """Run polling and commands in two threads, and report from this one.
+    """Run the poll loop and the commands in two threads, and send reports from this thread.
 
-    A hook that blocks delays neither commands nor reports.
+    A source method that blocks therefore delays neither commands nor reports.
     """
     sys.setswitchinterval(SWITCH_S)
     part = _loop_of(worker)
@@ -83,7 +83,7 @@ def _loop_of(worker: Worker) -> _LoopHandle:
     if issubclass(found, Replayed):
         return _replay_loop(worker, options)
     source = found(options, segment.blocks[worker.name].layout)
-    writer = segment.writer(worker.name)  # after the source: a configuration error changes nothing
+    writer = segment.writer(worker.name)  # after the source: a configuration error must not change the segment
     schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
     owner_of, blocks = partial(_owner_of, segment), partial(_blocks, segment)
     writable, allow = worker.config["writable"], worker.config["allow_nonfinite"]
@@ -137,9 +137,9 @@ def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
 
 
 def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs | None:
-    """Create the reader of a source's connections, on its own mapping of the segment.
+    """Return a reader of the source's connected inputs; None if no input is connected.
 
-    None if it has none.
+    The reader opens the segment a second time, because it follows reloads by itself.
     """
     own, sources = writer.block.source, segment.blocks
     topics = {path: parse_topic(topic, sources, own) for path, topic in source.connections.items()}
@@ -147,7 +147,7 @@ def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs |
 
 
 def _owner_of(segment: Segment, writer: int) -> Owner | None:
-    """Return the process that has a command queue at present."""
+    """Return the process that uses a command queue at present; None if no live process does."""
     segment.refresh()
     for slot in (*segment.processes, *segment.processes.guests):
         if slot.writer == writer and slot.alive():

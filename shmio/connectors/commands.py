@@ -1,8 +1,9 @@
-"""Accepts or rejects the commands toward a source, and carries out accepted ones with the next cycle.
+"""Accepts or rejects the commands to a source, and carries out accepted ones in the next cycle.
 
-A separate thread takes the commands, so that a device that does not answer delays no decision. The
-loop's thread carries them out before it reads, so that the next frame shows them. It combines the
-accepted items of a cycle into one batch of writes, and derives each item's outcome.
+A separate thread accepts and rejects commands, so that a slow device does not delay the decision.
+The loop's thread writes to the device before it reads, so that the next frame shows the new values.
+It combines all items accepted for a cycle into one batch, and derives the outcome of each item from
+the outcomes of the writes.
 """
 
 from __future__ import annotations
@@ -27,40 +28,43 @@ from shmio.layout.values.write import Write, apply, cover, merge, path_at
 from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
 
 MAX_WAITING: Final = 256
-"""Most items that wait for a cycle.
+"""The largest number of items that may wait for a cycle; further commands stay in their queues.
 
-A single command may have more; further commands stay in their queue.
+A single command may have more items if none is waiting.
 """
 MAX_WAITING_BLOCKS: Final = 4
-"""The same limit in bytes, as a multiple of the block's size."""
+"""The largest number of bytes that may wait for a cycle, as a multiple of the block's size."""
 FAR_NS: Final = 1 << 62
-"""Deadline of a write that a delay held: effectively none."""
+"""Deadline of a write that an injection has delayed: so late that it never expires."""
 TELL_NS: Final = 1_000_000_000
-"""Shortest time between two events about garbage from the same writer."""
+"""Shortest time between two reports of malformed commands from the same writer."""
 
 _UNARMED: Final = "an injection toward a device needs `armed = true` in the source's configuration"
 _SUPERSEDED: Final = "superseded by a later write of the same cycle"
 _EXPONENTS: Final = {"REAL": b"\x7f\x80\0\0", "LREAL": b"\x7f\xf0\0\0\0\0\0\0"}
-"""The exponent bits, most significant byte first. A number with all of them set is not finite."""
+"""The exponent bits by type, most significant byte first.
+
+A number is not finite if all its exponent bits are set.
+"""
 
 End = tuple[EventKind, str]
-"""The event that ends an item, and its text."""
+"""The kind and the text of the last event about an item."""
 _Outcome = TypeVar("_Outcome", str, str | Lost)
 
 log = logging.getLogger("shmio.source")
 
 
-# -- values that a device does not expect ------------------------------------------------------------------------------
+# -- NaN and infinities ------------------------------------------------------------------------------------------------
 
 
 class FiniteCheck:
-    """Refuses NaN and infinities for REAL and LREAL registers without an exemption.
+    """Refuses to write NaN and infinities to REAL and LREAL registers that are not exempt.
 
-    The arithmetic of a device does not expect them.
+    Programs in devices seldom handle such values.
     """
 
     def __init__(self, layout: Layout, allowed: Iterable[str]) -> None:
-        """Create the check; ``allowed`` are patterns of registers that may take any value."""
+        """Create the check. ``allowed`` are patterns of the exempt registers."""
         self._layout = layout
         allowed_bits = np.frombuffer(cover(layout, allowed), np.uint8)
         self._exponents = np.zeros(layout.size, np.uint8)
@@ -75,10 +79,10 @@ class FiniteCheck:
         self._guarded = (self._exponents != 0).tobytes()
 
     def refusal(self, writes: Iterable[Write]) -> str:
-        """Return why these writes are refused, naming one register; empty if they are fine.
+        """Return why these writes are refused, naming one register; empty if they are allowed.
 
-        A write of a part of a number must not set all exponent bits in that part either. So no
-        sequence of writes can set them all.
+        A write of some bytes of a number is refused if it sets every exponent bit in those bytes.
+        Otherwise several such writes together could make the number non-finite.
         """
         for offset, mask, data in writes:
             stop = offset + len(data)
@@ -97,7 +101,7 @@ class FiniteCheck:
 
 
 def _starts_of(layout: Layout, kind: str) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
-    """Return the offsets of all values of a type, those of arrays included."""
+    """Return the offsets of all values of a type, including the elements of arrays."""
     found = [register for register in layout.registers if register.type == kind]
     arrays = (one.offset + np.arange(one.count) * one.element.stride for one in found if one.dims)
     scalars = np.array([one.offset for one in found if not one.dims], np.int32)
@@ -108,25 +112,28 @@ def _starts_of(layout: Layout, kind: str) -> np.ndarray[tuple[int], np.dtype[np.
 
 
 class Item(NamedTuple):
-    """One accepted write of a command."""
+    """One accepted write of a command; ``place`` is its index in the command."""
 
     command: Command
     place: int
     bits: bytes | None = None
-    """The write's bits that go to the device, if injections took the others."""
+    """Mask of the bits to send to the device; None: all bits of the write.
+
+    Injections have taken the other bits.
+    """
     data: bytes | None = None
-    """The item's values, if injections have changed some."""
+    """The values after injections have changed them; None if they are unchanged."""
     changed_by: str = ""
-    """The injection that changed the values last."""
+    """Name or number of the injection that changed the values last; empty if none did."""
 
     @property
     def write(self) -> Write:
-        """The write, with the values that injections have changed."""
+        """The write, after injections have changed its values."""
         write = self.command.writes[self.place]
         return write if self.data is None else write._replace(data=self.data)
 
     def parts(self) -> list[Write]:
-        """Return the parts of the write that go to the device."""
+        """Return the parts of the write to send to the device."""
         offset, _, data = self.write
         if self.bits is None:
             return [self.write]
@@ -134,20 +141,21 @@ class Item(NamedTuple):
 
 
 def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
-    """Merge items into writes so that the last value of each bit wins.
+    """Merge items into writes; if several items write a bit, the last value is written.
 
-    Neighbours are joined only within a command, because its client wanted all of it or nothing.
+    Adjacent bytes become one write only within a command. If the device refuses a write, no item of
+    another command is refused with it.
 
     Args:
         items: Accepted items, oldest first.
         size: Size of the block in bytes.
 
     Returns:
-        The writes, and the indices of items that later ones superseded completely.
+        The writes, and the indices of the items of which later items overwrite every bit.
 
     """
     taken = bytearray(size)
-    kept: list[tuple[Item, bytes]] = []  # last first, with the bits that no later item writes
+    kept: list[tuple[Item, bytes]] = []  # the last item first, each with the bits that no later item writes
     superseded = set()
     for place in reversed(range(len(items))):
         offset, mask, data = items[place].write
@@ -179,12 +187,12 @@ def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
 def ends(
     items: Sequence[Item], writes: Sequence[Write], superseded: set[int], outcomes: Sequence[str | Lost], error: str
 ) -> list[End]:
-    """Return the end of each item.
+    """Return for each item the kind and text of its last event.
 
     Args:
         items: The items of the batch.
         writes: The writes from :func:`coalesce`.
-        superseded: The superseded indices from :func:`coalesce`.
+        superseded: The indices of overwritten items from :func:`coalesce`.
         outcomes: The outcome of each write.
         error: Why some outcomes were lost.
 
@@ -195,17 +203,17 @@ def ends(
     for place, item in enumerate(items):
         if found[place][0] is not EventKind.WRITTEN:
             continue
-        if place in superseded:  # the later write was written
+        if place in superseded:  # the item that superseded it was written
             found[place] = EventKind.WRITTEN, _SUPERSEDED
         elif item.changed_by:
-            found[place] = EventKind.WRITTEN, f"with what the injection {item.changed_by!r} made of it"
+            found[place] = EventKind.WRITTEN, f"after the injection {item.changed_by!r} changed its value"
     return found
 
 
 class _WriteOutcomes:
-    """Finds the outcomes of writes by their place in the block; thousands may have been refused.
+    """Finds the outcomes of writes by byte range; a binary search keeps this fast for thousands.
 
-    Confirmed writes may be left out unless some were lost.
+    The caller may leave out confirmed writes, unless the outcome of some write was lost.
     """
 
     def __init__(self, known: Iterable[tuple[Write, str | Lost]]) -> None:
@@ -221,7 +229,7 @@ class _WriteOutcomes:
 
 
 def _end_of(outcomes: Sequence[str | Lost], error: str) -> End:
-    """Return the end of an item from the outcomes of its writes."""
+    """Return the kind and text of an item's last event, from the outcomes of its writes."""
     refusal = next((outcome for outcome in outcomes if outcome and isinstance(outcome, str)), "")
     lost = Lost.UNSENT in outcomes
     if Lost.UNKNOWN in outcomes or (lost and "" in outcomes):  # partly written
@@ -250,7 +258,10 @@ def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[
 
 
 def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
-    """Yield the events about the ends of items; neighbours that ended alike share one."""
+    """Yield the last events of items.
+
+    Consecutive items of a command share one event if its kind and text are the same.
+    """
     both = zip(items, ends, strict=True)
     for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
         for first, count in _runs([item for item, _ in group]):
@@ -259,7 +270,7 @@ def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
 
 
 def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
-    """Consecutive places of one command as (first, count)."""
+    """Group items of one command by consecutive places; yield the first item and the count."""
     first, count = items[0], 1
     for item in items[1:]:
         if item.place == first.place + count:
@@ -276,7 +287,7 @@ def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
 class CommandProcessor:
     """Processes the commands of one block.
 
-    A thread of its own calls :meth:`run`; the loop's thread calls the other methods.
+    The command thread calls :meth:`run`. The loop's thread calls the other methods.
     """
 
     def __init__(
@@ -299,9 +310,9 @@ class CommandProcessor:
             now_ns: The loop's clock.
             allow_nonfinite: Patterns of registers that may be written NaN and infinities.
             armed: Whether injections may reach the device.
-            owner_of: Finds the process that has a command queue.
-            blocks: Returns the blocks of all sources, for conditions; default: this source's alone.
-            accepted: Called when items wait.
+            owner_of: Returns the process that uses a command queue.
+            blocks: Returns the blocks of all sources, for conditions. Default: only this source's.
+            accepted: Called when accepted items begin to wait for a cycle.
 
         """
         self._writer = output.writer
@@ -317,20 +328,20 @@ class CommandProcessor:
         blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
         self._injections = InjectionProcessor(output, self._writable, refuse_in, owner_of, blocks)
         self._turn = threading.Lock()
-        self._verdict = threading.Lock()  # held while acceptance is published and until the items wait
+        self._verdict = threading.Lock()  # held from the publication of acceptances until the items are in _items
         self._closed = "the source is not connected yet"
         self._items: list[Item] = []
-        self._held: Command | None = None  # taken from its queue, waits for room until the next cycle
+        self._held: Command | None = None  # already taken from its queue, but waits until there is room
         self._garbage_ns: dict[int, int] = {}
         self._stopped = False
 
     def open(self) -> None:
-        """Start accepting: the device is connected and its block matches the layout."""
+        """Start accepting commands: the device is connected and its block matches the layout."""
         with self._turn:
             self._closed = ""
 
     def close(self, reason: str) -> None:
-        """Stop accepting: the device is gone. Waiting items expire."""
+        """Stop accepting commands, because the connection was lost. Waiting items expire."""
         with self._turn:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
@@ -339,26 +350,26 @@ class CommandProcessor:
         self._make_room()
 
     def settle(self) -> None:
-        """Wait until every item whose acceptance was published is in :attr:`waiting`."""
+        """Wait until every item whose acceptance was published is ready for :meth:`carry_out`."""
         with self._verdict:
             pass
 
     def release(self, cycle: int) -> None:
-        """Send on the writes whose delay over ``/in`` is over; call it before :meth:`carry_out`."""
+        """Accept the writes whose delay by an injection is over; call it before :meth:`carry_out`."""
         for layer, write in self._injections.declared.release(cycle):
             command = Command(NO_WRITER, layer.id, self._writer.incarnation, FAR_NS, (write,))
             self._accept(command, layer)
 
     @property
     def waiting(self) -> bool:
-        """Whether items wait to be carried out."""
+        """True if items wait for :meth:`carry_out`."""
         return bool(self._items)
 
     def carry_out(self, write: Callable[[Sequence[Write]], list[str]]) -> None:
         """Write all waiting items in one batch and publish the outcome of each.
 
-        The order of acceptance holds: of two values for a bit the later one is written. Exceptions
-        from ``write`` pass through after the outcomes were published.
+        If two items have a value for the same bit, the value of the item accepted later is written.
+        If ``write`` raises an exception, the outcomes are published before it is raised again.
         """
         items = self._take(lambda _: True)
         now_ns = self._now_ns()
@@ -388,7 +399,7 @@ class CommandProcessor:
             self._end(items, ends(items, writes, superseded, outcomes, error))
 
     def run(self) -> None:
-        """Take commands until :meth:`stop`."""
+        """Accept and reject commands until :meth:`stop` is called."""
         queues = self._writer.block.commands
         while not self._stopped:
             seen = queues.bell()
@@ -419,10 +430,7 @@ class CommandProcessor:
         self._end(items, [(EventKind.EXPIRED, "no cycle began before its deadline")] * len(items))
 
     def _patience_ns(self) -> int:
-        """Return the time until the next deadline or regular check, in ns.
-
-        Negative if there is none.
-        """
+        """Return the time in ns until the next deadline or regular check; negative if none is due."""
         with self._turn:
             deadlines = [item.command.deadline_ns for item in self._items]
         waits = [max(0, min(deadlines) - self._now_ns()) + 1_000_000] if deadlines else []
@@ -430,12 +438,15 @@ class CommandProcessor:
         return min(waits, default=-1)
 
     def _make_room(self) -> None:
-        """Wake the command thread so that it judges the held command again."""
+        """Wake the command thread to try the held command again."""
         if self._held is not None:
             self._writer.block.commands.wake()
 
     def _take_one(self, writer: int) -> bool:
-        """Judge the held command, or else the writer's oldest one; return False if there is none, or it must wait."""
+        """Accept or reject the held command if there is one, else the oldest one of a writer.
+
+        Return False if there is no command, or if the command must wait for room.
+        """
         if self._held is not None:
             command, self._held = self._held, None
             return self._judge(command)
@@ -450,7 +461,7 @@ class CommandProcessor:
         return self._judge(command)
 
     def _garbage(self, writer: int, error: ValueError) -> None:
-        """Report a writer that sends malformed commands, at most once per ``TELL_NS``."""
+        """Report a malformed command, at most once per writer and ``TELL_NS``."""
         now_ns = time.monotonic_ns()
         if now_ns - self._garbage_ns.get(writer, -TELL_NS) >= TELL_NS:
             self._garbage_ns[writer] = now_ns
@@ -458,7 +469,7 @@ class CommandProcessor:
             self._writer.event(Record(EventKind.REJECTED, f"invalid command: {error}", writer))
 
     def _judge(self, command: Command) -> bool:
-        """Accept or reject a command; return False if it must wait for room."""
+        """Accept or reject a command. Return False if the command must wait for room."""
         layer = self._injections.toward_device(command)
         write = command.kind is CommandKind.WRITE or layer is not None
         reason = self._refusal(command)
@@ -487,13 +498,13 @@ class CommandProcessor:
         return True
 
     def _accept(self, command: Command, layer: Layer | None) -> None:
-        """Apply the injections below ``layer`` to a command, and queue the rest for the cycle."""
+        """Apply the injections below ``layer`` to a command, and queue what is left for the cycle."""
         left, taken = _divert(self._output, command, layer)
         left = [pair for pair in left if not self._made_unfit(pair[0])]
-        self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # every DIVERTED event was published before
+        self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # _divert has published every DIVERTED event
         items = [item for item, _ in left]
         with self._verdict:
-            for item, source in left:  # outside the other lock, which the loop takes
+            for item, source in left:  # not under _turn, which the loop's thread needs
                 for part in pieces(EventKind.ACCEPTED, command, item.place, item.parts(), source):
                     self._writer.event(part)
             with self._turn:
@@ -506,7 +517,7 @@ class CommandProcessor:
             self._accepted()
 
     def _made_unfit(self, item: Item) -> bool:
-        """Return whether injections made the item's value non-finite; if so, refuse it."""
+        """Refuse the item if injections made its value non-finite; return whether they did."""
         reason = "" if item.data is None else self._finite.refusal(item.parts())
         if reason:
             self._end([item], [(EventKind.REFUSED, f"the injection {item.changed_by!r} changes it: {reason}")])
@@ -521,7 +532,7 @@ class CommandProcessor:
         return len(items) + len(command.writes) <= MAX_WAITING and size <= self._most_bytes
 
     def _refusal(self, command: Command) -> str:
-        """Return why a command is not accepted; empty if it is."""
+        """Return why a command came for the wrong process or too late; empty if it did not."""
         if command.incarnation != self._writer.incarnation:
             return "it was for an earlier process of the source, which has ended: try again"
         late_ns = self._now_ns() - command.deadline_ns
@@ -530,7 +541,7 @@ class CommandProcessor:
         return ""
 
     def _unwritable(self, command: Command) -> str:
-        """Return why these bytes cannot be written to the device; empty if they can."""
+        """Return why the command's bytes cannot be written to the device; empty if they can."""
         if self._cannot:
             return self._cannot
         if self._closed:
@@ -545,7 +556,7 @@ class CommandProcessor:
         return self._finite.refusal(command.writes)
 
     def _end(self, items: Sequence[Item], ends: Sequence[End]) -> None:
-        """Publish the ends of accepted items, one event for neighbours that ended alike."""
+        """Publish the last events of accepted items, as :func:`records` groups them."""
         for record in records(items, ends):
             self._writer.event(record)
 
@@ -553,11 +564,11 @@ class CommandProcessor:
 def _divert(
     output: Output, command: Command, above: Layer | None
 ) -> tuple[list[tuple[Item, Layer | None]], list[Item]]:
-    """Pass a command's items through the layers below ``above``, and publish what these change.
+    """Apply the layers below ``above`` to a command's items, and publish what the layers changed.
 
     Returns:
-        The items with bits left for the device, each with the layer that sent or changed it last;
-        and the items of which nothing is left.
+        The items with bits left for the device, each with the layer that changed it last (``above``
+        if none did); and the items with no bit left.
 
     """
     left: list[tuple[Item, Layer | None]] = []

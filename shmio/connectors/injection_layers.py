@@ -1,8 +1,9 @@
-"""The injections of a source as layers over its block: what becomes of images and writes. No I/O.
+"""Applies the injections of a source to its images and writes. No I/O.
 
-Images on ``/out`` pass the layers from the innermost to the outermost, writes on ``/in`` the other
-way. The layer with the highest priority is outermost; of equal priorities the newest. The values of
-a layer come from a client, or from the operation of a declared injection.
+Each injection is a layer over the source's block. Images on ``/out`` pass the layers from the
+innermost to the outermost; writes on ``/in`` pass them from the outermost to the innermost. The
+layer with the highest priority is outermost. Of layers with the same priority, the newest is
+outermost. A client or the operation of a declared injection supplies a layer's values.
 """
 
 from __future__ import annotations
@@ -25,23 +26,23 @@ from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Direction
 
 MAX_INJECTIONS: Final = 64
-"""Most injections on one source at a time."""
+"""The largest number of injections on one source at a time."""
 MAX_HELD: Final = 256
-"""Writes that one delay over ``/in`` holds before further writes are rejected."""
+"""The number of writes that one injection may delay; further writes are rejected."""
 
 Bits = np.ndarray[Any, np.dtype[np.uint8]]
 
 
 @dataclass(frozen=True)
 class Owner:
-    """The owner of an injection: a command queue, and the process that had it at that time."""
+    """The owner of an injection: a command queue, and the process that used it at that time."""
 
     writer: int
     pid: int
 
 
 class CycleImage(NamedTuple):
-    """The image of a cycle as the device delivered it, with its instance time in ns."""
+    """The image that the device delivered in a cycle, and the cycle's instance time in ns."""
 
     cycle: int
     time_ns: int
@@ -50,9 +51,9 @@ class CycleImage(NamedTuple):
 
 @dataclass
 class Layer:
-    """One injection as it runs in its source's process.
+    """One injection that runs in its source's process.
 
-    ``cover`` is an image of the block in which the covered bits are set.
+    ``cover`` is an array of the block's size in which the covered bits are set.
     """
 
     id: int
@@ -63,58 +64,58 @@ class Layer:
     owner: Owner
     cover: Bits
     values: Bits
-    """The values of the covered bits of ``/out`` for consumers."""
+    """The values that readers of ``/out`` see in the covered bits."""
 
     @property
     def given(self) -> bool:
-        """Whether it covers ``/out`` and a client gives its values.
+        """True if the layer covers ``/out`` and a client supplies its values.
 
-        The client is sent the values from further in.
+        That client receives the values from the device or the next inner layer.
         """
         return self.direction is Direction.OUT
 
     @property
     def active(self) -> bool:
-        """Whether it changes the covered bits at present."""
+        """True if the layer changes the covered bits at present."""
         return True
 
-    def show(self, image: Bits, now: CycleImage) -> None:  # noqa: ARG002  its values do not depend on time
-        """Put the layer's values of ``/out`` into an image, in place."""
+    def show(self, image: Bits, now: CycleImage) -> None:  # noqa: ARG002  the values do not depend on time
+        """Write the layer's values of ``/out`` into an image, in place."""
         image ^= (image ^ self.values) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:  # noqa: ARG002
-        """Apply the layer to bits of a write toward the device.
+        """Apply the layer to some bits of a write to the device.
 
         Returns:
-            The data, the same object if unchanged; None if the write ends here.
+            The new data, or the same object if unchanged; None if the layer takes the write.
 
         """
         return None
 
 
 class DivertedWrite(NamedTuple):
-    """The result of passing a write through the layers toward the device."""
+    """A write to the device after all layers were applied to it."""
 
     met: list[tuple[Layer, list[Write]]]
-    """The layers that took or changed the write, each with the parts that reached it."""
+    """The layers that took or changed the write, each with the parts that it received."""
     left: bytes
-    """The bits of the write that go to the device."""
+    """Mask of the bits that are left for the device."""
     data: bytes
-    """Their values."""
+    """The values of the write, after the layers have changed them."""
     by: Layer | None
-    """The last layer that changed some of the values."""
+    """The layer that changed the values last; None if no layer did."""
 
 
 @dataclass
 class LayerStack:
-    """All layers of one block of ``size`` bytes, the innermost first."""
+    """All layers over one block of ``size`` bytes, from the innermost to the outermost."""
 
     size: int
     layers: list[Layer] = field(default_factory=list)
     now: CycleImage = field(default_factory=lambda: CycleImage(-1, 0, b""))
 
     def lay(self, injection: Layer) -> str:
-        """Add a layer; return why not, or ""."""
+        """Add a layer; return why it cannot be added, or "" if it was added."""
         if any(layer.id == injection.id for layer in self.layers):
             return f"there is an injection {injection.id} already"
         if len(self.layers) >= MAX_INJECTIONS:
@@ -124,7 +125,7 @@ class LayerStack:
         return ""
 
     def find(self, number: int) -> Layer | None:
-        """Return the layer with this injection number."""
+        """Return the layer with this injection number; None if there is none."""
         return next((layer for layer in self.layers if layer.id == number), None)
 
     def lift(self, which: Callable[[Layer], bool]) -> list[Layer]:
@@ -134,7 +135,7 @@ class LayerStack:
         return lifted
 
     def effective(self, raw: bytes) -> bytes | None:
-        """Return what consumers see of the image of ``now``.
+        """Return the image that readers see instead of ``raw``.
 
         None if no active layer covers ``/out``.
         """
@@ -142,34 +143,34 @@ class LayerStack:
         return self.seen(raw, layers).tobytes() if layers else None
 
     def seen(self, raw: bytes, inner: Iterable[Layer]) -> Bits:
-        """Return an image after these layers over ``/out``."""
+        """Return a copy of the image ``raw`` to which these layers over ``/out`` were applied."""
         image = np.frombuffer(raw, np.uint8).copy()
         for layer in inner:
             layer.show(image, self.now)
         return image
 
     def before(self, raw: bytes, layer: Layer) -> Bits:
-        """Return an image after the layers over ``/out`` that are further in than ``layer``."""
+        """Return a copy of ``raw`` to which the active layers inside ``layer`` were applied."""
         return self.seen(raw, self.inner(layer))
 
     def inner(self, layer: Layer) -> list[Layer]:
-        """Return the active layers over ``/out`` that are further in than ``layer``."""
+        """Return the active layers over ``/out`` inside ``layer``."""
         inner = self.layers[: self.layers.index(layer)]
         return [other for other in inner if other.direction is Direction.OUT and other.active]
 
     def outer(self, layer: Layer) -> list[Layer]:
-        """Return the layers further out to which clients give values.
+        """Return the layers outside ``layer`` for which clients supply the values.
 
-        None for a layer over ``/in``.
+        The list is empty if ``layer`` covers ``/in``.
         """
         if layer.direction is Direction.IN:
             return []
         return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.given]
 
     def inner_values(self, raw: bytes, layer: Layer) -> list[Write]:
-        """Return the values that a layer over ``/out`` gets from layers further in.
+        """Return the values in the bits of ``layer`` that come from inner layers over ``/out``.
 
-        Its other bits come from the device.
+        The values in its other bits come from the device; the result does not include them.
         """
         inner = self.inner(layer)
         bits = np.zeros(self.size, np.uint8)
@@ -178,9 +179,9 @@ class LayerStack:
         return merge(self.seen(raw, inner).tobytes(), bits.tobytes(), [(0, self.size)] if inner else [])
 
     def onward(self, raw: bytes, layer: Layer, write: Write) -> list[tuple[Layer, list[Write]]]:
-        """Return the parts of a write over ``/out`` that go to clients' layers further out.
+        """Return the parts of a client's values over ``/out`` that outer layers hide from readers.
 
-        Consumers do not see these values. Layers in between have been applied to them.
+        The clients of those layers receive them, after the layers in between were applied.
         """
         taken: list[tuple[Layer, list[Write]]] = []
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
@@ -194,12 +195,12 @@ class LayerStack:
         return taken
 
     def divert(self, write: Write, above: Layer | None) -> DivertedWrite:
-        """Pass a write through the layers toward the device.
+        """Apply the layers over ``/in`` to a write, from the outermost to the innermost.
 
         Args:
             write: The write.
-            above: The layer that sends the write; only layers below it apply. None for a client's
-                write.
+            above: The layer that sends the write; only layers inside it apply. None for a write
+                that does not come from a layer.
 
         """
         met: list[tuple[Layer, list[Write]]] = []
@@ -225,7 +226,7 @@ class LayerStack:
 
 
 def shadow(injection: Layer, writes: Sequence[Write]) -> str:
-    """Set values of covered bits of ``/out``; return why not, or ""."""
+    """Set the values of a layer over ``/out``; return why it does not cover them, or ""."""
     if reason := uncovered(injection, writes):
         return reason
     for write in writes:
@@ -234,7 +235,7 @@ def shadow(injection: Layer, writes: Sequence[Write]) -> str:
 
 
 def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
-    """Return why the layer may not set these values; empty if it covers them all."""
+    """Return which bytes the layer does not cover, as a message; empty if it covers all."""
     for write in writes:
         cover = injection.cover[write.offset : write.offset + len(write.data)]
         if len(cover) < len(write.data) or (~cover & (write.mask or 0xFF)).any():
@@ -244,7 +245,7 @@ def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
 
 
 def covering(size: int, writes: Sequence[Write]) -> Bits:
-    """Return the bits that the items of an INJECT command cover, as an image of the block.
+    """Return the bits that an INJECT command covers, as an array of the block's size.
 
     Raises:
         ValueError: An item lies outside the block.
@@ -259,7 +260,7 @@ def covering(size: int, writes: Sequence[Write]) -> Bits:
 
 
 def parts_of(write: Write, bits: Bits) -> list[Write]:
-    """Return the parts of a write that consist of these bits."""
+    """Return those parts of a write whose bits are set in the mask ``bits``."""
     return [
         Write(write.offset + part.offset, part.mask, part.data)
         for part in merge(write.data, bits.tobytes(), [(0, len(write.data))])
@@ -270,7 +271,7 @@ def parts_of(write: Write, bits: Bits) -> list[Write]:
 
 
 class DelayedWrite(NamedTuple):
-    """A write that a delay holds, with the cycle and the instance time at which it came."""
+    """A delayed write, with the cycle and the instance time at which it came."""
 
     write: Write
     cycle: int
@@ -281,7 +282,8 @@ class DelayedWrite(NamedTuple):
 class DeclaredLayer(Layer):
     """The layer of one declared injection.
 
-    ``writes`` counts writes over ``/in`` in this activation.
+    ``writes`` counts the writes over ``/in`` since the injection became active. ``held`` are the
+    writes that it delays at present.
     """
 
     program: Program
@@ -295,42 +297,42 @@ class DeclaredLayer(Layer):
 
     @property
     def given(self) -> bool:
-        """False: no client gives it values."""
+        """False, because no client supplies the values of a declared injection."""
         return False
 
     @property
     def active(self) -> bool:
-        """Whether it changes the covered bits at present."""
+        """True if the injection is active at present."""
         return self.activation.state is State.ACTIVE
 
     @property
     def configured(self) -> bool:
-        """Whether the configuration declares it."""
+        """True if the configuration declares the injection; False if a client does."""
         return self.owner.writer == NO_WRITER
 
     @property
     def full(self) -> bool:
-        """Whether its delay holds as many writes as it may."""
+        """True if the injection delays ``MAX_HELD`` writes, and cannot take more."""
         return len(self.held) >= MAX_HELD
 
     @property
     def running(self) -> Running[Declaration]:
-        """Its present state, as published in the segment."""
+        """The injection's present state, as published in the segment."""
         now = self.activation
         declaration = self.program.declaration
         return Running(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
 
     def resume(self, running: Running[Declaration], seen: Bits) -> None:
-        """Restore the state of the previous process; ``seen`` is the image that consumers saw last."""
+        """Restore the state of the previous process; ``seen`` is the image that readers saw last."""
         state = State(running.state)
         self.activation = Activation(self.program.window, state, running.runs, running.cycle, running.time_ns)
         if self.active and self.direction is Direction.OUT:
             self.operation.resume(seen)
 
     def advance(self, now: CycleImage, values: Sequence[Number | None]) -> bool:
-        """Advance to the next image, given the values of its condition.
+        """Evaluate the condition for the next image, and return whether the state changed.
 
-        Return whether its state changed.
+        ``values`` are the values that the condition reads.
         """
         condition = self.program.condition
         holds = condition is None or condition.expression.holds(values, self.memory)
@@ -352,10 +354,10 @@ class DeclaredLayer(Layer):
         image ^= (image ^ changed) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:
-        """Apply the operation to bits of a write toward the device.
+        """Apply the operation to some bits of a write to the device.
 
         Returns:
-            The new data; None if the write is dropped, or delayed and sent later.
+            The new data; None if the operation drops or delays the write.
 
         """
         at = self._moment(self.writes, now)
@@ -377,7 +379,7 @@ class DeclaredLayer(Layer):
     def due(self, now: CycleImage) -> list[Write]:
         """Remove and return the writes whose delay is over.
 
-        ``now`` is the cycle that is about to write.
+        ``now`` describes the cycle that is about to write.
         """
         due: list[Write] = []
         if not isinstance(self.operation, Delay):
@@ -385,7 +387,7 @@ class DeclaredLayer(Layer):
         at = self._moment(0, now)
         while self.held:
             write, cycle, time_ns = self.held[0]
-            # Without the delay, the cycle after the one that it came in would have written it.
+            # Delay is measured from the next cycle, which would have written an undelayed write.
             if at.cycle <= cycle or not self.operation.due(cycle + 1, time_ns, at):
                 break
             due.append(write)
@@ -401,7 +403,7 @@ class DeclaredLayer(Layer):
 
 
 def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bool) -> DeclaredLayer:
-    """Create the layer of a new declared injection."""
+    """Create the layer of a declared injection that has just been added."""
     declaration = program.declaration
     draw = SeededRandom(seed, declaration.name)
     return DeclaredLayer(

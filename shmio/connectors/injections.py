@@ -1,4 +1,4 @@
-"""Carries out commands about injections, and advances the declared ones with each cycle."""
+"""Carries out commands about injections, and evaluates declared injections in each cycle."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.standing_injections import StandingInjection
 
 LOOK_NS: Final = 400_000_000
-"""How often the owners are checked; an injection ends within a second of its client."""
+"""Period at which owners are checked, so that an injection ends within 1 s after its client."""
 SEED_BITS: Final = 53
-"""Length of a generated seed in bits; every JSON reader keeps that many exactly."""
+"""Length of a generated seed in bits; every JSON reader can represent such integers exactly."""
 CONFIGURED: Final = Owner(NO_WRITER, 0)
 """The owner of injections that the configuration declares."""
 
 Blocks = Callable[[], Mapping[str, Block]]
-"""Returns the present blocks of the instance by source."""
+"""Returns the present blocks of the instance by source name."""
 OwnerOf = Callable[[int], Owner | None]
-"""Returns the process that has a command queue at present, or None."""
+"""Returns the process that uses a command queue at present; None if no live process does."""
 
 _DECODER: Final = msgspec.json.Decoder(Declaration)
 
@@ -61,11 +61,11 @@ log = logging.getLogger("shmio.source")
 
 
 class ConditionValues:
-    """The register values that conditions read, as of one cycle.
+    """Reads the register values that conditions need in one cycle.
 
-    Each image is fetched once, and only if a condition needs it. All images are without injections,
-    so that no injection feeds back into its own condition. The values of a source with bad quality
-    are unknown.
+    Each image is fetched once, and only if a condition needs it. No injection is applied to these
+    images, so that an injection cannot influence its own condition. The values of a source with bad
+    quality are unknown.
     """
 
     def __init__(self, own: str, image: Image, blocks: Mapping[str, Block], before: int | None) -> None:
@@ -75,8 +75,8 @@ class ConditionValues:
             own: The source whose next image this is.
             image: That image.
             blocks: The blocks of all sources.
-            before: The present step, or None outside steps. Of other sources that take part in the
-                step, the image before it is read, whichever source is faster.
+            before: The present step; None outside steps. Other sources that take part in the step
+                are read as they were before it, even if they have completed it already.
 
         """
         self._blocks = blocks
@@ -85,7 +85,7 @@ class ConditionValues:
         self._images: dict[str, bytes | None] = {own: image.raw if known else None}
 
     def of(self, program: Program) -> Sequence[Number | None]:
-        """Return the values that the program's condition reads; None for an unknown value."""
+        """Return the values that the program's condition reads; each unknown value is None."""
         if program.condition is None:
             return ()
         values: list[Number | None] = []
@@ -110,9 +110,10 @@ class ConditionValues:
 
 
 def newest(block: Block, before: int | None) -> Frame | None:
-    """Return the newest frame of a block; with a step, the newest that did not come with that step.
+    """Return the newest frame of a block, or the newest one from before the step ``before``.
 
-    Thus a source sees the same frames of others whichever of them is faster (the Jacobi method).
+    So a source sees the same frames of others in each run, whichever source completes the step
+    first (the Jacobi method).
     """
     frame = block.latest()
     while frame is not None and before is not None and block.came_with(frame, before):
@@ -121,9 +122,9 @@ def newest(block: Block, before: int | None) -> Frame | None:
 
 
 class DeclaredInjections:
-    """The declared injections of one source.
+    """Adds, evaluates and lifts the declared injections of one source.
 
-    The loop's thread calls :meth:`release` and :meth:`forget`; the command thread calls the other
+    The loop's thread calls :meth:`release` and :meth:`forget`. The command thread calls the other
     methods.
     """
 
@@ -138,24 +139,24 @@ class DeclaredInjections:
 
     @property
     def overload(self) -> str:
-        """Why no write can be accepted at present; empty if writes can be accepted."""
+        """Reason why no write can be accepted at present; empty if writes can be accepted."""
         full = next((layer for layer in self._layers if layer.full), None)
-        return f"the delay of injection {full.name} holds {MAX_HELD} values already" if full else ""
+        return f"the injection {full.name} delays {MAX_HELD} writes already, the maximum" if full else ""
 
     @property
     def reads_other_sources(self) -> bool:
-        """Whether a condition reads other sources, which a reload may change."""
+        """True if a condition reads registers of other sources, which a reload may change."""
         return any(layer.program.foreign for layer in self._layers)
 
     def seen(self, frame: Frame) -> None:
-        """Take the last frame of the previous process as the present one."""
+        """Start from the last frame of the previous process."""
         time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
         self._publisher.injections.now = CycleImage(frame.cycle, time_ns, frame.raw)
 
     def resume(self, standing: StandingInjection, running: Running[Declaration], seen: Bits) -> None:
         """Resume an injection of the previous process.
 
-        ``seen`` is the image that consumers saw last.
+        ``seen`` is the image that readers saw last.
         """
         owner = Owner(standing.writer, standing.pid)
         try:
@@ -163,13 +164,13 @@ class DeclaredInjections:
             layer = declared(standing.number, program, owner, running.seed, keep=standing.keep)
             layer.resume(running, seen)
         except (ConfigError, ValueError) as error:
-            log.warning("injection %s is not continued: %s", standing.name, error)
+            log.warning("injection %s cannot be resumed: %s", standing.name, error)
             return
         self._publisher.restore(layer)
         self._settle()
 
     def declare(self, command: Command, owner: Owner) -> str:
-        """Apply the injection that a command declares; return why not, or ""."""
+        """Add the injection that a command declares; return why it cannot be added, or ""."""
         try:
             declaration = _DECODER.decode(b"".join(write.data for write in command.writes))
             for complaint in contradictions(declaration):
@@ -181,7 +182,10 @@ class DeclaredInjections:
         return self._lay(layer, command)
 
     def lift(self, layer: DeclaredLayer, command: Command) -> str:
-        """Lift an injection of the configuration until that changes; return why not, or ""."""
+        """Lift an injection of the configuration until its declaration changes.
+
+        Return why it cannot be lifted, or "".
+        """
         if layer.activation.state is State.LIFTED:
             return f"the injection {layer.name} was lifted already"
         with self._output.turn:
@@ -192,7 +196,7 @@ class DeclaredInjections:
         return ""
 
     def follow(self) -> None:
-        """Apply the changes of the configuration's declarations."""
+        """Add, replace and lift injections after the configuration has changed."""
         sequence = self._own.declared.sequence
         if sequence == self._configuration or sequence % 2:  # odd: a write is in progress, and a wake-up follows
             return
@@ -200,9 +204,7 @@ class DeclaredInjections:
         wanted = {declaration.name: declaration for declaration in self._own.declared.read()}
         stale = {x.id for x in self._layers if x.configured and wanted.get(x.name) != x.program.declaration}
         if stale:
-            self._publisher.lift(
-                lambda layer: layer.id in stale, "the configuration no longer has it, or has changed it"
-            )
+            self._publisher.lift(lambda layer: layer.id in stale, "the configuration has removed or changed it")
             self.settle()
         there = {layer.name for layer in self._layers if layer.configured}
         for declaration in wanted.values():
@@ -234,11 +236,11 @@ class DeclaredInjections:
         with self._output.turn:
             if reason := self._publisher.lay(layer):
                 return reason
-            if self._output.advance is None:  # it advances from the next cycle on
+            if self._output.advance is None:  # evaluate the injection from the next cycle on
                 injections = self._publisher.injections
                 injections.now = injections.now._replace(cycle=self._output.cycle)
             self._settle()
-            for record in _injected_events(layer, command):  # it changes nothing yet, so no frame must precede them
+            for record in _injected_events(layer, command):  # before any frame: the layer changes nothing yet
                 self._output.writer.event(record)
         return ""
 
@@ -258,7 +260,7 @@ class DeclaredInjections:
         return program
 
     def rebind(self) -> None:
-        """Compile conditions again if a reload has changed the sources that they read."""
+        """Compile a condition again if a reload has changed a source that it reads."""
         if not self.reads_other_sources:
             return
         blocks = dict(self._blocks_of())
@@ -276,13 +278,13 @@ class DeclaredInjections:
                 layer.program = replace(layer.program, condition=condition)
                 layer.memory.seen.clear()
 
-    # -- in the loop's thread ------------------------------------------------------------------------------------------
+    # -- called by the loop's thread -----------------------------------------------------------------------------------
 
     def _advance(self, image: Image) -> list[Record]:
-        """Advance all layers to the next image, and return the events about what changed.
+        """Evaluate all declared injections for the next image, and return events about the changes.
 
-        The output's ``turn`` is held. Only the first image of a cycle counts, because the number of
-        the others depends on how fast their writers were.
+        The caller holds the output's ``turn``. Only the first image of a cycle counts: how many
+        more a cycle has depends on timing, which must not change the result.
         """
         looked = self._publisher.injections.now.cycle
         time_ns = image.at.clock_ns if image.at else self._time_ns(image.cycle)
@@ -300,7 +302,7 @@ class DeclaredInjections:
         return [*self._publisher.computed(image.base), *turned, *self._lift_finished()]
 
     def _lift_finished(self) -> list[Record]:
-        """Lift the injections that are over, and return the events."""
+        """Lift the injections that are over, and return the events about them."""
         over = {layer.id for layer in self._layers if _finished(layer)}
         if not over:
             return []
@@ -309,7 +311,7 @@ class DeclaredInjections:
         return records
 
     def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
-        """Return the writes whose delay over ``/in`` ends before ``cycle`` writes."""
+        """Return the delayed writes that are due in ``cycle``, each with its layer."""
         if not any(layer.held for layer in self._layers):
             return []
         now = CycleImage(cycle, self._time_ns(cycle), b"")
@@ -317,7 +319,7 @@ class DeclaredInjections:
             return [(layer, write) for layer in self._layers for write in layer.due(now)]
 
     def forget(self, reason: str) -> None:
-        """Discard the writes that delays hold, because the device is gone."""
+        """Discard all delayed writes, because the connection to the device was lost."""
         if any(layer.held for layer in self._layers):
             with self._output.turn:
                 records = [record for layer in self._layers for record in lost(layer, reason)]
@@ -325,7 +327,7 @@ class DeclaredInjections:
                 self._output.writer.event(record)
 
     def _time_ns(self, cycle: int) -> int:
-        """Return the instance time of a cycle; in wall time as scheduled, not as it really ran."""
+        """Return the instance time of a cycle in ns; in wall time, its scheduled time."""
         state = self._own.clock.read()
         if state.virtual:
             return state.time_ns
@@ -340,7 +342,10 @@ def _seed(declaration: Declaration) -> int:
 
 
 def _finished(layer: DeclaredLayer) -> bool:
-    """Return whether the layer can be lifted. Those of the configuration stay listed."""
+    """Return whether the injection is over and can be lifted.
+
+    Injections of the configuration stay listed when they are over.
+    """
     return layer.activation.state is State.OVER and not layer.configured and not layer.held
 
 
@@ -350,7 +355,7 @@ def _activation_event(layer: DeclaredLayer) -> Record:
 
 
 def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[Record]:
-    """Return the events of a new injection: its declaration with its seed, in parts."""
+    """Return the events of a new injection, which contain its declaration and its seed in parts."""
     document = msgspec.json.encode(msgspec.structs.replace(layer.program.declaration, seed=layer.seed))
     return in_parts(layer_event(EventKind.INJECTED, layer, layer.name, command), document)
 
@@ -359,7 +364,7 @@ def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[
 
 
 class InjectionProcessor:
-    """Adds, feeds and lifts the injections of one source."""
+    """Adds and lifts the injections of one source, and sets their values."""
 
     def __init__(self, output: Output, writable: bytes, refuse_in: str, owner_of: OwnerOf, blocks: Blocks) -> None:
         """Create the processor, and resume the injections of the previous process.
@@ -368,14 +373,14 @@ class InjectionProcessor:
             output: Publishes the source's images and events.
             writable: The bits that commands may write, as an image of the block.
             refuse_in: Why no injection may cover ``/in``; empty if it may.
-            owner_of: Finds the process that has a command queue.
+            owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
 
         """
         self._output = output
         self._writer = output.writer
         self._owner_of = owner_of
-        self._look_ns = 0  # of CLOCK_MONOTONIC, independent of the source's clock
+        self._look_ns = 0  # time of the next check by CLOCK_MONOTONIC
         self._publisher = LayerPublisher(output, writable, refuse_in)
         self.declared = DeclaredInjections(self._publisher, blocks)
         self._resume()
@@ -388,24 +393,30 @@ class InjectionProcessor:
 
     @property
     def patience_ns(self) -> int:
-        """Time until :meth:`look` has work, in ns; negative if it has none."""
+        """Time in ns until :meth:`look` must be called; negative if no call is needed."""
         if all(layer.keep for layer in self.injections.layers) and not self.declared.reads_other_sources:
             return -1
         return max(0, self._look_ns - time.monotonic_ns())
 
     def toward_device(self, command: Command) -> Layer | None:
-        """Return the injection over ``/in`` whose values the command carries, if it does."""
+        """Return the injection over ``/in`` for which the command sends values to the device.
+
+        None for any other command.
+        """
         layer = self.injections.find(command.injection) if command.kind is CommandKind.SHADOW else None
         if layer is None or layer.direction is not Direction.IN or isinstance(layer, DeclaredLayer):
             return None
         return layer
 
     def take(self, command: Command) -> str:
-        """Carry out INJECT, DECLARE, LIFT, or SHADOW over ``/out``; return why not, or ""."""
+        """Carry out an INJECT, DECLARE or LIFT command, or a SHADOW command over ``/out``.
+
+        Return why the command is rejected, or "".
+        """
         if command.kind in (CommandKind.INJECT, CommandKind.DECLARE):
             owner = self._owner_of(command.writer)
             if owner is None:
-                return "the command queue that it came by has no owner"
+                return "no live process owns its command queue"
             if command.kind is CommandKind.DECLARE:
                 return self.declared.declare(command, owner)
             return self._lay(command, owner)
@@ -421,10 +432,10 @@ class InjectionProcessor:
         return ""
 
     def look(self) -> None:
-        """Follow the configuration, and at most every ``LOOK_NS`` check owners and conditions.
+        """Apply changes of the configuration, and every ``LOOK_NS`` check owners and conditions.
 
-        Injections without ``keep`` are lifted once their client is gone. Conditions on changed
-        sources are compiled again.
+        The check lifts each injection without ``keep`` whose client is gone, and compiles the
+        conditions that read changed sources again.
         """
         self.declared.follow()
         if self.patience_ns != 0:
@@ -478,10 +489,7 @@ class InjectionProcessor:
         return ""
 
     def _resume(self) -> None:
-        """Resume the injections of the previous process.
-
-        Consumers continue to see the same values.
-        """
+        """Resume the injections of the previous process. Readers continue to see the same values."""
         block = self._writer.block
         last = block.latest()
         raw, image = (last.raw, last.image) if last else (bytes(block.layout.size),) * 2
@@ -506,9 +514,10 @@ class InjectionProcessor:
                 layer.values ^= (layer.values ^ self._given(layer, raw)) & hidden
 
     def _given(self, layer: Layer, raw: bytes) -> Bits:
-        """Return the values that a client gave, where layers further out hide them from consumers.
+        """Return the image below ``layer``, with the values that its client has sent.
 
-        They are taken from the events, as far as these go back.
+        These values are read from the events that are still in the segment, because the last image
+        does not show values that outer layers hide.
         """
         values = self.injections.before(raw, layer)
         events = self._writer.block.events

@@ -1,6 +1,6 @@
-"""Finds connectors by name: the built-in ones, and entry points of the group ``shmio.connectors``.
+"""Finds connectors by name: built-in ones, and entry points of the group ``shmio.connectors``.
 
-Most connectors reach a device. Others compute their values or play a recording, and follow the
+Most connectors read a device. The others compute their values or play a recording, and follow the
 instance clock.
 """
 
@@ -36,7 +36,7 @@ def names() -> list[str]:
 
 
 def _offered() -> EntryPoints:
-    from importlib.metadata import entry_points  # noqa: PLC0415  ours are found without it
+    from importlib.metadata import entry_points  # noqa: PLC0415  built-in connectors do not need it
 
     return entry_points(group=GROUP)
 
@@ -66,20 +66,21 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
 
 
 def options_type(name: str) -> type[msgspec.Struct]:
-    """Return the type of the connector's own keys."""
+    """Return the struct type of the connector's own configuration keys."""
     return load(name).Options
 
 
 def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str] | None = None) -> msgspec.Struct:
-    """Check and convert a source's own keys.
+    """Check the connector's own keys of a source, and convert them to its options struct.
 
     Args:
         name: The connector's name.
-        options: The keys as TOML has them.
-        texts: More keys as texts from a properties file, converted to their types.
+        options: The keys and values from the TOML file.
+        texts: Keys and values from a properties file. Values are texts, which are converted.
 
     Raises:
-        ConfigError: A key is wrong. The message begins with the key, without the place in the file.
+        ConfigError: A key is invalid. The message begins with the key, without the place in the
+            file.
 
     """
     for fault in option_faults(name, options, texts or {}):
@@ -92,7 +93,7 @@ def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str]
 
 
 def option_faults(name: str, options: Mapping[str, Any], texts: Mapping[str, str]) -> Iterator[str]:
-    """Yield every fault in a source's own keys, checked one by one; each begins with the key."""
+    """Yield a message for every invalid or missing key; each message begins with the key."""
     kind = options_type(name)
     read: dict[str, Any] = {}
     for field in msgspec.structs.fields(kind):

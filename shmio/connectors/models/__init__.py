@@ -1,1 +1,1 @@
-"""Sources without a device: their registers are computed by a model, here or elsewhere."""
+"""Sources without a device; a model computes their registers, in the source or in a client."""

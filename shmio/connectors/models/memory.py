@@ -1,4 +1,4 @@
-"""A source without a device: its registers hold what was last written to them."""
+"""A source without a device; each register keeps the value last written to it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from shmio.layout.values.write import Write, apply
 
 
 class Memory(Computed):
-    """``connector = "memory"``: what is written to ``/in`` appears on ``/out`` at once.
+    """``connector = "memory"``: a value written to ``/in`` appears on ``/out`` at once.
 
-    It begins with the initial values of the layout; a restarted process continues with the last
-    values. It serves programs that publish signals of their own: a remote simulator, an operator
-    panel, a test.
+    The registers begin with the initial values of the layout. A restarted process continues with
+    the last values. Use it for programs that publish signals, such as a remote simulator, an
+    operator panel or a test.
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """The connector has no keys of its own."""
+        """Keys of the source; this connector has none."""
 
     prompt = True
 
-    def __init__(self, options: Options, layout: Layout) -> None:  # noqa: ARG002  it has none
+    def __init__(self, options: Options, layout: Layout) -> None:  # noqa: ARG002  there are no keys
         self._image, _ = initial_frame(layout)
 
     def resume(self, image: bytes) -> None:
@@ -37,7 +37,7 @@ class Memory(Computed):
         return bytes(self._image)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Change registers; every write succeeds."""
+        """Write registers; every write succeeds."""
         for write in writes:
             apply(write, self._image)
         return [""] * len(writes)

@@ -1,4 +1,4 @@
-"""A source whose registers a program elsewhere computes, step by step."""
+"""A source whose registers a connected program computes step by step."""
 
 from __future__ import annotations
 
@@ -19,23 +19,24 @@ from shmio.segment.model_channel import ConnectedModel, ModelAnswer, ModelChanne
 from shmio.simulation.images import Images
 
 TURN_NS: Final = 50_000_000
-"""How often to check the model while waiting: a process that dies causes no wake-up."""
+"""Period at which a waiting source checks the model, because a process that dies wakes nobody."""
 STOPPED: Final = "the source was stopped"
 
 
 class Remote(Computed):
-    """``connector = "remote"``: asks the model connected by Simulate of shmio.v1 for each step.
+    """``connector = "remote"``: a program connected by Simulate of shmio.v1 computes each step.
 
-    Without a model a step fails at once; with one that does not answer, after ``timeout_ms``.
-    Registers that the model does not compute show what is commanded or connected, from the next
-    step on.
+    Without such a program, a step fails at once. If the program does not answer, the step fails
+    after ``timeout_ms``. A register that the program does not compute keeps its commanded or
+    connected value; a new value shows from the next step on.
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """Its keys. ``outputs`` and ``inouts`` are patterns; ``timeout_ms`` is real time.
+        """Keys of the source.
 
-        At least one pattern is needed. The limit of ``timeout_ms`` is below the 10 s that a step
-        waits for its sources.
+        ``outputs`` and ``inouts`` are patterns of the registers that the model computes; at least
+        one is needed. ``timeout_ms`` is in real time, and less than the 10 s that a step waits for
+        its sources.
         """
 
         outputs: list[str] = []
@@ -47,7 +48,7 @@ class Remote(Computed):
         """Create the source.
 
         Raises:
-            ConfigError: Nothing is computed, or the layout has no such registers.
+            ConfigError: There is no pattern, or a pattern matches no register of the layout.
 
         """
         if not options.outputs and not options.inouts:
@@ -66,21 +67,21 @@ class Remote(Computed):
         self._options = options
         self.timeout_s = options.timeout_ms / 1000
         self._doubt = ""
-        self._last_model: ConnectedModel | None = None  # the model connected when begin() or step() last looked
+        self._last_model: ConnectedModel | None = None  # as last seen by begin() or step()
         self._stopped = False
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """The connections as configured."""
+        """The topic of each connected input, by the input's path, as configured."""
         return self._options.connections
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The paths of all registers except outputs."""
+        """The paths of all registers that are not outputs."""
         return self._inputs
 
     def attach(self, writer: BlockWriter) -> None:
-        """Find the channel to the model."""
+        """Find the link to the model in the source's block."""
         link = writer.block.model_channel
         if link is None:
             raise SegmentError(f"source {writer.block.source}: its block has no link to a model")
@@ -89,7 +90,7 @@ class Remote(Computed):
         self._link.asked.begin()
 
     def connect(self, values: Mapping[str, Value], doubt: str) -> None:
-        """Command the connected registers."""
+        """Write the values of connected inputs into their registers."""
         self._doubt = doubt
         for path, value in values.items():
             try:
@@ -98,7 +99,7 @@ class Remote(Computed):
                 raise ConnectorError(f"input {path}: {error}") from None
 
     def resume(self, image: bytes) -> None:
-        """Continue from the registers. The model itself keeps its other state."""
+        """Continue from the last image. The model keeps its other state in its own program."""
         self._images.resume(image)
 
     def begin(self) -> bytes:
@@ -113,19 +114,19 @@ class Remote(Computed):
         return bytes(self._images.shown)
 
     def news(self) -> bool:
-        """Return whether a model has connected, changed or left."""
+        """Return whether a model has connected, disconnected or been replaced."""
         return self._link.model() != self._last_model
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Command registers; outputs refuse."""
+        """Write registers; writes to outputs are refused."""
         return self._images.write(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
-        """Have the model compute a step.
+        """Request a step from the model, and return the new image.
 
         Raises:
-            ConnectorError: There is no model, or it does not answer.
-            ModelError: The model failed.
+            ConnectorError: No model is connected, or it does not answer.
+            ModelError: The model reported a failure.
 
         """
         self._last_model = self._link.model()
@@ -149,8 +150,8 @@ class Remote(Computed):
         if model is None:
             source = self._writer.block.source
             raise ConnectorError(
-                f'no model is connected: a program joins by simulate("{source}", …) of shmio.client, or Simulate of '
-                "shmio.v1"
+                f'no model is connected: connect one with simulate("{source}", …) of shmio.client, or with Simulate '
+                "of shmio.v1"
             )
         return model
 
@@ -158,8 +159,8 @@ class Remote(Computed):
         """Wait for the answer to a request."""
         link = self._link
         while True:
-            seen = link.answered.doorbell()  # before looking
-            gone = link.model() != model  # before looking, too: it may answer, and leave
+            seen = link.answered.doorbell()  # before the check, so that no wake-up is missed
+            gone = link.model() != model  # before the check: a model may answer, then disconnect
             answer = link.answer_to(number)
             if answer is not None:
                 return answer
@@ -172,7 +173,7 @@ class Remote(Computed):
             rest_ns = until_ns - time.monotonic_ns()
             if rest_ns <= 0:
                 raise ConnectorError(
-                    f"model {model.name!r} did not answer within {self._options.timeout_ms:g} ms: see whether it "
+                    f"model {model.name!r} did not answer within {self._options.timeout_ms:g} ms: check whether it "
                     "hangs, or raise timeout_ms"
                 )
             link.answered.wait(seen, min(rest_ns, TURN_NS))

@@ -1,7 +1,8 @@
-"""A source whose registers a model computes in its process.
+"""A source whose registers a model computes inside the source's process.
 
-As a program (``python -m``) it describes a model for the supervisor, because a model is foreign code
-and may have changed. It reads a ``Request`` from standard input and writes an ``Answer``, both JSON.
+The supervisor also runs this module as a program (``python -m``) to describe a model: it imports
+the user's code in a fresh process. The program reads a ``Request`` from standard input and writes
+an ``Answer`` to standard output, both as JSON.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ class Simulation(Computed):
     """``connector = "simulation"``: runs one model on the instance clock."""
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """Its keys.
+        """Keys of the source.
 
-        ``model``: ``package.module:Class``; ``folder``: where to look for uninstalled modules.
+        ``model`` is ``package.module:Class``. ``folder`` is searched for modules that are not
+        installed.
         """
 
         model: str
@@ -42,7 +44,7 @@ class Simulation(Computed):
         """Create the model.
 
         Raises:
-            ConfigError: There is no such model, or it does not fit the layout or the parameters.
+            ConfigError: The model does not exist, or does not fit the layout or the parameters.
 
         """
         self._runner = make(options, layout)
@@ -50,37 +52,39 @@ class Simulation(Computed):
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """The connections as configured."""
+        """The topic of each connected input, by the input's path, as configured."""
         return self._connections
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The inputs that the model declares."""
+        """The paths of the inputs that the model declares."""
         return self._runner.inputs
 
-    def connect(self, values: Mapping[str, Value], doubt: str) -> None:  # noqa: ARG002  no model asks for it
+    def connect(self, values: Mapping[str, Value], doubt: str) -> None:  # noqa: ARG002  models do not use it
         """Set the values of inputs."""
         self._runner.connect(values)
 
     def resume(self, image: bytes) -> None:
-        """Continue from the registers. Other state of the model is lost with its process."""
+        """Continue from the last image. A restart of the process loses the model's other state."""
         self._runner.resume(image)
 
     def begin(self) -> bytes:
-        """Start the model; return its first image."""
+        """Start the model, and return its first image."""
         return self._runner.begin()
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Command registers; outputs refuse."""
+        """Write registers; writes to outputs are refused."""
         return self._runner.write(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
-        """Have the model compute a step."""
+        """Let the model compute a step, and return the new image."""
         return self._runner.step(time_ns, dt_ns)
 
 
 def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
-    """Create the model of these options, on a layout or on the one that it declares.
+    """Create the model that the options name.
+
+    ``layout`` is the layout of its block; None if the model declares its registers itself.
 
     Raises:
         ConfigError: The model cannot be created. The message begins with the key.
@@ -98,9 +102,9 @@ def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
 
 
 class Request(msgspec.Struct):
-    """The model to describe.
+    """A request to describe a model.
 
-    ``layout`` is the JSON document of a layout, if the model is to run on one.
+    ``layout`` is the JSON document of the layout of its block; None if the model declares one.
     """
 
     options: Simulation.Options
@@ -108,7 +112,7 @@ class Request(msgspec.Struct):
 
 
 class Answer(msgspec.Struct):
-    """The block's layout as a document and the inputs that can be connected, or an error."""
+    """The layout of the model's block as JSON and the inputs that can be connected, or an error."""
 
     layout: str = ""
     inputs: tuple[str, ...] = ()
@@ -116,9 +120,9 @@ class Answer(msgspec.Struct):
 
 
 def main() -> int:
-    """Answer one request; return the exit status."""
+    """Answer one request, and return the exit status."""
     answer_fd = os.dup(1)
-    os.dup2(2, 1)  # what a model prints is no answer
+    os.dup2(2, 1)  # standard output is for the answer: redirect what the model prints
     request = msgspec.json.decode(sys.stdin.buffer.read(), type=Request)
     try:
         runner = make(request.options, None if request.layout is None else load_layout(request.layout.encode()))

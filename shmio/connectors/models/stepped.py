@@ -1,6 +1,7 @@
 """The loop that runs computed sources, and the inputs that they read from other sources.
 
-In wall time it follows the schedule, in virtual time it computes step by step.
+In wall time, the loop computes each cycle of the source's schedule. In virtual time, it computes
+each step that is requested.
 """
 
 from __future__ import annotations
@@ -28,17 +29,18 @@ RESTARTED: Final = "its process was restarted during this step; it continues wit
 
 
 class Inputs:
-    """Reads the connected inputs of one source: registers of other sources. For one thread.
+    """Reads the registers of other sources that are connected to one source's inputs.
 
-    From a block that takes part in steps it reads the frame before the present step, whichever
-    source is faster (the Jacobi method). From any other block it reads the newest frame.
+    If the other source takes part in steps, it reads the last frame from before the present step,
+    even if that source has completed the step already (the Jacobi method). Otherwise it reads the
+    newest frame. Use an object in one thread only.
     """
 
     def __init__(self, segment: Segment, connections: Mapping[str, Topic]) -> None:
         """Create the inputs.
 
         Args:
-            segment: A segment for this object alone, because it follows reloads.
+            segment: A segment that no other object uses, because this one follows reloads.
             connections: The topic of each input, by the input's path.
 
         """
@@ -47,9 +49,9 @@ class Inputs:
         self._found: dict[str, tuple[Block, RegisterCodec]] = {}
 
     def read(self, step: int | None) -> tuple[dict[str, Value], str]:
-        """Return the good values by input, and why others are missing.
+        """Return the values by input path, and why the other inputs have none; empty if all have.
 
-        ``step`` is None in wall time.
+        ``step`` is the present step; None in wall time.
         """
         if self._segment.refresh():
             self._found = {}
@@ -84,7 +86,7 @@ class Inputs:
 
 
 def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
-    """Return the frame to read, or None and why it cannot be trusted."""
+    """Return the frame to read, or None and why there is no usable frame."""
     frame = newest(block, step)
     if frame is None:
         return None, NO_DATA
@@ -95,15 +97,15 @@ def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
 
 
 class StepClock(Protocol):
-    """The loop's view of time and wake-ups; tests provide their own."""
+    """The protocol through which the loop reads time and waits; tests implement it themselves."""
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC in ns."""
 
     def wait_ns(self, duration_ns: int | None) -> bool:
-        """Wait for a wake-up, at most ``duration_ns``.
+        """Wait for a wake-up, at most ``duration_ns`` (None: without limit).
 
-        Return True as soon as the loop is to stop.
+        Return True if the loop must stop, else False.
         """
 
     def nudge(self) -> None:
@@ -111,7 +113,7 @@ class StepClock(Protocol):
 
 
 class PageClock:
-    """The loop's clock in a live instance. The clock page has a wake-up for each process."""
+    """The loop's clock in a running instance; it waits on the process's doorbell in shared memory."""
 
     def __init__(self, page: ClockPage, slot: int) -> None:
         self._bell = page.slot_bell(slot)
@@ -123,9 +125,10 @@ class PageClock:
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int | None) -> bool:
-        """Wait for a wake-up, at most ``duration_ns``; return True as soon as the loop is to stop.
+        """Wait for a wake-up, at most ``duration_ns`` (None: without limit).
 
-        A wake-up that comes while the loop works ends the next wait.
+        Return True if the loop must stop, else False. If a wake-up comes while the loop is busy,
+        the next wait returns at once.
         """
         if not self._stopped and (duration_ns is None or duration_ns > 0):
             self._seen = self._bell.wait(self._seen, -1 if duration_ns is None else duration_ns)
@@ -142,9 +145,10 @@ class PageClock:
 
 
 class SteppedLoop:
-    """Runs one computed source: publishes its frames and carries out writes.
+    """Runs one computed source: computes and publishes its frames, and carries out writes.
 
-    In virtual time every step publishes a frame; a bad one says why the step failed.
+    In virtual time every step publishes a frame. If a step fails, the frame is bad and gives the
+    reason.
     """
 
     def __init__(
@@ -165,12 +169,12 @@ class SteppedLoop:
         Args:
             source: The computed source.
             writer: The writing side of the source's block.
-            schedule: When cycles are due in wall time.
+            schedule: The times at which cycles are due in wall time.
             clock: The loop's clock.
             writable: Patterns of the registers that commands may write.
             allow_nonfinite: See :class:`CommandProcessor`.
-            inputs: The source's connections, if it has any.
-            owner_of: Finds the process that has a command queue.
+            inputs: The reader of the source's connected inputs; None if there are none.
+            owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
 
         """
@@ -180,28 +184,28 @@ class SteppedLoop:
         self._page = writer.block.clock
         writer.utc_ns = self._page.utc_ns
         self._from_start = self._schedule = schedule
-        self._basis = Clock().basis  # the zero of the schedule
+        self._basis = Clock().basis  # the clock's basis to which the schedule belongs
         self._clock = clock
         self._inputs = inputs
         self._output = Output(writer, clock.now_ns)
-        # Injections here reach no device, so arming is not needed.
+        # Injections cannot reach a device here, so `armed` is not required.
         self.commands = CommandProcessor(
             self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
             blocks=blocks, accepted=clock.nudge,
         )  # fmt: skip
         self._quality_log = QualityLog(writer)
         self._handled = 0  # the last step computed or skipped
-        self._time_ns: int | None = None  # the instance's clock at what was computed last
+        self._time_ns: int | None = None  # instance time of the image computed last
         self._published = False
         self.counters = Counters()
 
     @property
     def note(self) -> str:
-        """Why quality is not good; empty if it is."""
+        """Reason why the quality is not good; empty if it is good."""
         return self._quality_log.note
 
     def run(self) -> None:
-        """Compute until the clock says stop, then publish the end of the source."""
+        """Compute cycles and steps until the clock stops the loop, then publish a last bad frame."""
         try:
             self._begin()
             while not (self._live() if self._page.read().virtual else self._free_run()):
@@ -214,7 +218,7 @@ class SteppedLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def _begin(self) -> None:
-        """Continue from what the previous process has left."""
+        """Continue from the last image of the previous process, if there is one."""
         last = self._writer.block.latest()
         if self._output.source_ns:
             self._source.resume(self._output.raw)
@@ -236,7 +240,7 @@ class SteppedLoop:
     # ---- wall time -----------------------------------------------------------------------------------------------
 
     def _free_run(self) -> bool:
-        """Wait for the next cycle of the schedule and compute it; return True if told to stop."""
+        """Wait for the next cycle of the schedule and compute it. Return True if the loop must stop."""
         state = self._page.last_written()
         if state.virtual:
             return False
@@ -259,7 +263,7 @@ class SteppedLoop:
                 return False
         if self._clock.wait_ns(0):
             return True
-        if self._page.last_written().basis != self._basis:  # read after the time: see Coordinator.take_over
+        if self._page.last_written().basis != self._basis:  # after now_ns(): see Coordinator.take_over
             return False
         if now_ns >= self._schedule.due_ns(due.cycle + 1):  # this thread was delayed while it waited
             self.counters.overruns += 1
@@ -270,16 +274,16 @@ class SteppedLoop:
         return False
 
     def _resume(self, state: Clock) -> None:
-        """Follow real time again after virtual time was released."""
+        """Follow the schedule again after virtual time has ended."""
         self._basis = state.basis
         self._schedule = self._from_start.moved(state.offset_ns, state.lead(self._writer.block.period_ns))
 
     # ---- virtual time --------------------------------------------------------------------------------------------
 
     def _live(self) -> bool:
-        """Compute a requested step, or handle what came between two.
+        """Compute the requested step. Between steps, carry out commands and publish model changes.
 
-        Return True if told to stop.
+        Return True if the loop must stop.
         """
         state = self._page.read()
         if not state.virtual:
@@ -300,16 +304,16 @@ class SteppedLoop:
                 self._carry_out()
         return self._clock.wait_ns(wait_ns)
 
-    # ---- both ----------------------------------------------------------------------------------------------------
+    # ---- wall time and virtual time ------------------------------------------------------------------------------
 
     def _compute(self, cycle: int, time_ns: int, dt_ns: int) -> None:
-        """Compute one cycle or step."""
+        """Compute and publish one cycle or step."""
         self._writer.cycle, self._time_ns = cycle, time_ns
         self._published = False
         self.commands.release(cycle)
         self._carry_out()
         if self._published:
-            return  # a prompt source has published the frame already
+            return  # a prompt source published the frame when it was written
         begun_ns, asked_ns = self._clock.now_ns(), self._writer.now_ns()
         try:
             raw, doubt = self.counters.watch(self._clock.now_ns, lambda: self._step(time_ns, dt_ns))
@@ -332,7 +336,7 @@ class SteppedLoop:
         return self._writer.at_ns is not None
 
     def _show(self, cycle: int) -> None:
-        """Publish the present image without a step."""
+        """Publish the present image without computing a step."""
         try:
             self._publish(self._source.begin(), self._writer.now_ns())
         except ShmioError as error:
@@ -345,7 +349,7 @@ class SteppedLoop:
             self.commands.carry_out(self._write)
 
     def _write(self, writes: Sequence[Write]) -> list[str]:
-        """Write to the source. A prompt source publishes a frame before the outcomes."""
+        """Write to the source. If it is prompt, publish a frame before the outcomes of the writes."""
         refusals = self._source.write(writes)
         if self._source.prompt:
             self._publish(self._source.begin(), self._writer.now_ns())
@@ -361,12 +365,12 @@ class SteppedLoop:
         self.counters.polls += 1
 
     def _fail(self, cycle: int, reason: str) -> None:
-        """Publish a bad frame: in virtual time always, in wall time for each new reason."""
+        """Publish a bad frame; in wall time only if the reason is new."""
         new = self._quality_log.update(Quality.BAD, reason, cycle)
         if new or self._in_virtual_time:
             raw, source_ns = self._output.raw, self._output.source_ns
             self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, Provenance.SIMULATED, reason))
 
     def _utc_ns(self) -> int:
-        """Return the UTC time of the present image; in virtual time that of its step."""
+        """Return the UTC time of the present image; in virtual time, the time of its step."""
         return time.time_ns() if self._writer.at_ns is None else self._page.utc_ns(self._writer.at_ns)

@@ -1,1 +1,1 @@
-"""``connector = "replay"``: plays a recording (docs/how-to/replay-a-recording.md)."""
+"""The replay connector plays a recording (docs/how-to/replay-a-recording.md)."""

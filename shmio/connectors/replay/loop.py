@@ -1,7 +1,7 @@
-"""The loop that plays a recording: by the clock in wall time, by steps in virtual time.
+"""The loop that plays a recording, in wall time by the clock and in virtual time by steps.
 
-``Player`` publishes recorded frames and events, ``moved`` and ``Search`` carry out the requests of
-clients, and ``ReplayLoop`` decides what is due.
+``ReplayLoop`` decides which frames and events are due, and ``Player`` publishes them. ``moved`` and
+``Search`` carry out the requests of clients.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ from shmio.segment.playhead import (
 OVER: Final = f"{OWN_WORDS}the recording is over"
 STOPPED: Final = f"{OWN_WORDS}the source was stopped"
 NOTHING: Final = f"{OWN_WORDS}nothing of this source was recorded up to here"
-GOES_ON: Final = f"{OWN_WORDS}the recording goes on"
+GOES_ON: Final = f"{OWN_WORDS}the recording continues"
 
 PIECE: Final = 64
-"""Frames and events that are played before other work gets a turn."""
+"""Largest number of frames and events to play before requests and commands are handled."""
 LATE_NS: Final = 10_000_000_000
-"""Most instance time that is caught up on. What is later is skipped."""
+"""Longest delay of frames, in instance time, that is caught up; if it is longer, they are skipped."""
 ASK_TURN_NS: Final = 1_000_000
-"""How often to check whether the step that a request waits for is over.
+"""Period at which to check whether the step that a request waits for has ended.
 
-Its end causes no wake-up.
+The end of a step does not wake the loop.
 """
 BEHIND_NS: Final = 3_000_000_000
-"""A request of at most this age waits until what was due before it was played."""
+"""A request that is not older than this waits until everything due before it has been played."""
 AHEAD_NS: Final = 60_000_000_000
-"""Most that the moment of a request may lie ahead.
+"""The longest time by which a request may be in the future.
 
-It may lie back any time: the process may have been delayed.
+Requests may be in the past without limit, because the process may have been delayed.
 """
 ANY = "any"
-"""Stands for every kind of event that is replayed."""
+"""Event name in a search that matches every replayed event."""
 SEARCH_PIECE = 256
-"""Entries that a search reads before other work gets a turn."""
+"""Number of entries that a search reads before the loop continues to play."""
 
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
 _OF_INJECTIONS: Final = frozenset(
@@ -75,29 +75,29 @@ _OF_INJECTIONS: Final = frozenset(
 )
 
 Asked = tuple[int, PlayheadRequest | None] | None
-"""A request and its number; None if there is none."""
+"""The number of a request, and the request; None if no request waits."""
 StampOf = Callable[[int, int], Stamp]
-"""Returns the stamp of an entry from its position and its recorded clock, both in ns."""
+"""Returns the time stamp for an entry from its position and its recorded instance time, in ns."""
 
 log = logging.getLogger("shmio.source")
 
 
-# -- what is published -------------------------------------------------------------------------------------------------
+# -- publishing entries ------------------------------------------------------------------------------------------------
 
 
 def is_replayed(event: Event, *, keep: bool) -> bool:
-    """Return whether a recorded event is published.
+    """Return whether a replay publishes a recorded event.
 
-    ``keep``: whether recorded injections are shown.
+    Events about injections are published only if ``keep`` is set, which shows recorded injections.
     """
     return event.kind not in _OF_PROCESSES and (keep or not (event.kind in _OF_INJECTIONS or event.injection))
 
 
 class Player:
-    """The present place in a recording, and what is published there. For one thread."""
+    """Publishes the frames and events of a recording in order. Use it in one thread only."""
 
     def __init__(self, recorded: RecordedSource, output: Output, *, keep: bool) -> None:
-        """Create a player; ``keep`` says whether recorded injections are shown."""
+        """Create a player. Set ``keep`` to show recorded injections."""
         self._recorded = recorded
         self._output = output
         self._writer: BlockWriter = output.writer
@@ -105,11 +105,11 @@ class Player:
         self._entries: Iterator[Entry] = iter(())
         self._next: Entry | None = None
         self.note = ""
-        """Why quality is not good; empty if it is."""
-        self._bad = False  # as last published
-        self._missing = False  # whether the last frame was made by this replay
+        """Reason why the quality is not good; empty if it is good."""
+        self._bad = False  # the last published frame was bad
+        self._missing = False  # the last frame was a bad one of the replay itself, not a recorded one
         self.stopped = False
-        """Whether the last frame is the one that reports the end of the previous process."""
+        """True if the last frame is the bad one that the previous process published at its end."""
         self.published = 0
 
     @property
@@ -118,14 +118,14 @@ class Player:
         return None if self._next is None else self._next.position_ns
 
     def go(self, position_ns: int | None) -> None:
-        """Continue with the first entry at or behind a position; None: from the first entry on."""
+        """Continue with the first entry at or after a position; None: with the first entry."""
         self._entries = self._recorded.entries(position_ns)
         self._next = next(self._entries, None)
 
     def begin(self, position_ns: int, stamp: StampOf) -> None:
-        """Publish the frame before a position, then continue with the entries from the position on.
+        """Publish the last frame before a position, and continue with the entries from there on.
 
-        Without such a frame it continues with the first entry.
+        If there is no such frame, continue with the first entry of the recording.
         """
         entry = self._recorded.newest(position_ns - 1)
         if entry is not None:
@@ -133,13 +133,13 @@ class Player:
         self.go(None if entry is None else position_ns)
 
     def again(self, position_ns: int, stale_ns: int, stamp: StampOf) -> None:
-        """Continue at the begin of a loop. If no frame follows soon, publish a bad one."""
+        """Continue at the begin of a loop. Publish a bad frame if no frame is due in ``stale_ns``."""
         if self._recorded.newest(position_ns + stale_ns) is None:
             self.end(NOTHING, stamp(position_ns, position_ns))
         self.go(position_ns)
 
     def resume(self, position_ns: int) -> None:
-        """Continue behind the position up to which the previous process has published."""
+        """Continue after ``position_ns``, up to which the previous process has published."""
         self.go(position_ns + 1)
         entry = self._recorded.newest(position_ns)
         if entry is not None and isinstance(entry.item, Frame):
@@ -150,9 +150,9 @@ class Player:
         self.stopped, self._missing = reason == STOPPED, reason.startswith(OWN_WORDS)
 
     def show(self, position_ns: int, stamp: StampOf) -> None:
-        """Publish the newest frame at a position, and continue behind it.
+        """Publish the last frame at or before a position, and continue after the position.
 
-        Earlier entries are not read.
+        Entries in between are skipped.
         """
         entry = self._recorded.newest(position_ns)
         if entry is None:
@@ -162,7 +162,7 @@ class Player:
         self.go(position_ns + 1)
 
     def play(self, until_ns: int, stamp: StampOf, most: int) -> bool:
-        """Publish up to ``most`` entries until a position; return whether there are more."""
+        """Publish the entries up to a position, at most ``most``. Return whether more are left."""
         for _ in range(most):
             if self._next is None or self._next.position_ns > until_ns:
                 return False
@@ -218,7 +218,7 @@ class Player:
         self.published += 1
 
     def _happen(self, event: Event, at: Stamp) -> None:
-        """Publish a recorded event without an owner, so that no client takes it for its own."""
+        """Publish a recorded event without an owner, so that no client takes it for an answer."""
         if not is_replayed(event, keep=self._keep):
             return
         record = Record(
@@ -238,16 +238,16 @@ class Player:
 
 
 def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, int | None]:
-    """Apply a request to a play.
+    """Apply a client's request to the state of a replay.
 
     Args:
-        play: How it plays now.
+        play: The present state.
         ask: The request.
-        clock_ns: The instance time now, in ns.
+        clock_ns: The present instance time, in ns.
 
     Returns:
-        How it plays from the request's moment on, and the position to show; None if it stays where
-        it is.
+        The new state, which applies from the request's time on; and the position to show, or None
+        if the request does not seek.
 
     Raises:
         ValueRangeError: The request cannot be carried out.
@@ -260,7 +260,7 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
     play = play.anchored(ask.clock_ns)
     position_ns, paused = ask.position_ns, play.paused if ask.paused is None else ask.paused
     if position_ns is None and not paused and play.position_ns >= play.end_ns:
-        position_ns = play.begin_ns  # from the end it goes on at the beginning
+        position_ns = play.begin_ns  # `play` at the end starts from the beginning
     if position_ns is not None and not play.begin_ns <= position_ns <= play.end_ns:
         length_s = (play.end_ns - play.begin_ns) / 1e9
         raise ValueRangeError(f"that time is outside the played part, which is {length_s:.3f} s long")
@@ -270,7 +270,7 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
         raise ValueRangeError(f"that time has passed: the replay is at {at_s:.3f} s; seek to before that first")
     until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
     if ask.until_ns is None and position_ns is None and (ask.paused is None or play.until_ns > at_ns):
-        until_ns = play.until_ns  # `pause` and `play` keep one that lies ahead
+        until_ns = play.until_ns  # `pause` and `play` keep a stop position that lies ahead
     play = play._replace(
         paused=paused,
         speed=play.speed if ask.speed is None else ask.speed,
@@ -283,16 +283,16 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
 
 
 class Search:
-    """A search that runs in pieces, so that playing continues meanwhile."""
+    """A search for an event or a change; it reads the recording in pieces, while the replay runs."""
 
     def __init__(self, recorded: RecordedSource, find: FindRequest, end_ns: int, *, keep: bool) -> None:
         """Create a search.
 
         Args:
             recorded: The recording of the source.
-            find: What to find.
+            find: The event or register to find.
             end_ns: The position before which the search ends.
-            keep: Whether the recorded injections are shown.
+            keep: Whether recorded injections are shown.
 
         Raises:
             PathError: There is no such register or event kind.
@@ -306,7 +306,7 @@ class Search:
         self._what = f"event {find.event}" if find.event else f"change of {find.path}"
 
     def go_on(self) -> PlayheadAnswer | None:
-        """Read the next piece; return the result, or None if the search is not over."""
+        """Read the next piece. Return the result, or None if the search must continue."""
         for _ in range(SEARCH_PIECE):
             entry = next(self._entries, None)
             if entry is None or entry.position_ns >= self._end_ns:
@@ -351,9 +351,9 @@ def _change_matcher(recorded: RecordedSource, wanted: FindRequest, *, keep: bool
 
 
 class ReplayLoop:
-    """Plays one source of a recording.
+    """Plays one source of a recording, and answers requests to pause, seek and search.
 
-    In virtual time a step plays what lies in it, which may be nothing.
+    In virtual time, each step plays the entries whose time falls into it; there may be none.
     """
 
     def __init__(
@@ -373,12 +373,12 @@ class ReplayLoop:
         Args:
             source: The recording to play.
             writer: The writing side of the source's block.
-            beginning: How to start, from :func:`~shmio.connectors.replay.source.begin` for the same
-                block.
+            beginning: The state to start from, as
+                :func:`~shmio.connectors.replay.source.begin` returned it for the same block.
             clock: The loop's clock.
             writable: See :class:`CommandProcessor`, also for the arguments below.
             allow_nonfinite: Patterns of registers that may be written NaN and infinities.
-            owner_of: Finds the process that has a command queue.
+            owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
 
         """
@@ -392,7 +392,7 @@ class ReplayLoop:
         self._page = block.clock
         self._clock = clock
         self._output = Output(writer, clock.now_ns)
-        # Injections here reach no device, so arming is not needed.
+        # Injections cannot reach a device here, so `armed` is not required.
         self.commands = CommandProcessor(
             self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
             blocks=blocks, accepted=clock.nudge,
@@ -405,11 +405,11 @@ class ReplayLoop:
 
     @property
     def note(self) -> str:
-        """Why quality is not good; empty if it is."""
+        """Reason why the quality is not good; empty if it is good."""
         return self._player.note
 
     def run(self) -> None:
-        """Play until the clock says stop, then publish the end of the source."""
+        """Play until the clock stops the loop, then publish a last bad frame."""
         try:
             self._begin()
             while not self._turn():
@@ -421,13 +421,13 @@ class ReplayLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def _begin(self) -> None:
-        """Continue behind what the previous process published, if there was one."""
+        """Continue where the previous process stopped; if there was none, begin to play."""
         play, clock_ns = self._play, self._page.read().time_ns
         if self._done_ns is not None:
             reach_ns = play.reach_ns(clock_ns) if play.wraps else play.at_ns(clock_ns)
-            # What lies ahead was done before it was moved back, or in the round before.
+            # If that is ahead of the present position, it was published before a seek or in an earlier round.
             self._player.resume(self._done_ns if self._done_ns <= reach_ns else play.position_ns - 1)
-        else:  # a source that joins others takes their position
+        else:  # `play` may be that of other sources, which play already
             since_ns = clock_ns if clock_ns - play.anchor_ns > LATE_NS else play.anchor_ns
             self._player.begin(play.at_ns(since_ns), self._stamp)
             if play.over:
@@ -438,15 +438,15 @@ class ReplayLoop:
     # ---- the loop ------------------------------------------------------------------------------------------------
 
     def _turn(self) -> bool:
-        """Play what is due, answer requests, then wait; return True if told to stop."""
-        asked = self._head.asks(self._play.asked)  # before the time is read: the request is older
+        """Play what is due, answer requests, then wait. Return True if the loop must stop."""
+        asked = self._head.asks(self._play.asked)  # before the time is read, so that no request is in the future
         state = self._page.read()
-        # In virtual time what is published belongs to the end of the step.
+        # In virtual time, all frames and events have the time of the end of the step.
         self._writer.at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
         stepped = state.stepping and state.step != self._play.step
         if stepped and state.step != self._play.begun:
             self._keep(self._play._replace(begun=state.step, head=self._writer.block.ring.head()))
-        # Before anything is played: until a waiting request's moment the present play applies.
+        # First play up to the time of a waiting request: until then the present state applies.
         before_ns = None if state.stepping else self._before_ns(asked, state.time_ns)
         more = before_ns is not None or (not state.stepping and self._listen(asked, state.time_ns))
         clock_ns = state.time_ns if before_ns is None else before_ns
@@ -462,7 +462,7 @@ class ReplayLoop:
         return self._clock.wait_ns(0 if more else ASK_TURN_NS if waits else self._patience_ns(virtual=state.virtual))
 
     def _patience_ns(self, *, virtual: bool) -> int | None:
-        """Return how long nothing is due, in ns; None to wait for a wake-up."""
+        """Return the time in ns until the next entry is due; None to wait for a wake-up."""
         play, next_ns = self._play, self._player.next_ns
         if virtual or play.paused:
             return None
@@ -470,10 +470,10 @@ class ReplayLoop:
         return max(0, play.due_ns(goal_ns) - self._page.present_ns())
 
     def _advance(self, clock_ns: int) -> bool:
-        """Play a piece of what is due at ``clock_ns``; return whether there is more."""
+        """Play at most ``PIECE`` entries that are due at ``clock_ns``. Return whether more are due."""
         self._leave_out(clock_ns)
         play = self._play
-        # The entry at the pause position is played, the one at the end is not.
+        # An entry at the stop position is played; an entry at the end is not.
         target_ns = min(play.reach_ns(clock_ns), play.until_ns, play.end_ns - 1)
         before = self._player.published
         if self._player.play(target_ns, self._stamp, PIECE):
@@ -483,7 +483,7 @@ class ReplayLoop:
         settled = play.settled(clock_ns)
         if settled is play:
             if self._player.stopped and not play.over and (play.paused or self._writer.at_ns is not None):
-                self._show(play.at_ns(clock_ns))  # no next frame would show that it stands
+                self._show(play.at_ns(clock_ns))  # replace the bad frame: no other may follow
             return False
         if settled.paused:
             over = settled.position_ns >= settled.end_ns
@@ -501,10 +501,10 @@ class ReplayLoop:
         self._player.end(OVER, self._stamp(self._play.end_ns, self._play.end_ns))
 
     def _leave_out(self, clock_ns: int) -> None:
-        """Skip to the present, in wall time, if what comes next is too late.
+        """In wall time, skip to the present if the next entry is more than ``LATE_NS`` late.
 
-        In a loop this includes entries that are a whole round late, because nobody could tell them
-        from those due.
+        In a loop, also skip if it is a whole round late: clients could not tell it from the entry
+        of the present round.
         """
         play, next_ns = self._play, self._player.next_ns
         if next_ns is None or play.paused or self._writer.at_ns is not None:
@@ -516,14 +516,14 @@ class ReplayLoop:
             return
         left_out = behind_ns // self._source.recorded.block.period_ns
         self.counters.overruns += left_out
-        if too_late:  # else the speed is too high, and the line would repeat
+        if too_late:  # otherwise the speed is too high, and the message would repeat in each round
             log.warning("%d frames were skipped: this process was delayed by %.1f s", left_out, late_ns / 1e9)
         if play.wraps:
             self._keep(play.settled(clock_ns))
         self._player.show(min(self._play.at_ns(clock_ns), play.end_ns - 1), self._stamp)
 
     def _stamp(self, position_ns: int, clock_ns: int) -> Stamp:
-        """Return the stamp of a position; ``clock_ns`` is the recorded clock."""
+        """Return the time stamp for a position; ``clock_ns`` is the recorded instance time."""
         return stamp(self._play, position_ns, clock_ns)
 
     def _stamp_now(self) -> Stamp:
@@ -540,13 +540,16 @@ class ReplayLoop:
     # ---- requests ------------------------------------------------------------------------------------------------
 
     def _is_behind(self, clock_ns: int) -> bool:
-        """Return whether something that was due at ``clock_ns`` has not been played."""
+        """Return whether an entry that was due at ``clock_ns`` has not been played yet."""
         play, next_ns = self._play, self._player.next_ns
         due_ns = min(play.reach_ns(clock_ns), play.until_ns, play.end_ns - 1)
         return (next_ns is not None and next_ns <= due_ns) or play.settled(clock_ns) is not play
 
     def _before_ns(self, asked: Asked, clock_ns: int) -> int | None:
-        """Return the moment of a waiting request if what was due by then is to be played first."""
+        """Return the time up to which to play before the waiting request is answered.
+
+        None to answer it now.
+        """
         number, ask = asked or (0, None)
         if not isinstance(ask, MoveRequest) or number != self._play.asked + 1 or ask.position_ns is not None:
             return None
@@ -554,9 +557,9 @@ class ReplayLoop:
         return moment_ns if self._is_behind(moment_ns) and clock_ns - moment_ns < BEHIND_NS else None
 
     def _listen(self, asked: Asked, clock_ns: int) -> bool:
-        """Answer a request, or continue the search for its answer.
+        """Answer a request, or continue the search that it asked for.
 
-        Return whether there is more to do.
+        Return whether there was a request.
         """
         if asked is None:
             self._search = None
@@ -569,7 +572,7 @@ class ReplayLoop:
         if not isinstance(ask, MoveRequest):
             found = PlayheadAnswer("invalid request")
         elif missed and ask.clock_ns <= self._play.anchor_ns:
-            found = PlayheadAnswer()  # the others' play includes it
+            found = PlayheadAnswer()  # the state adopted from the other sources includes it
         else:
             found = self._move(ask, clock_ns)
         self._answer(number, found)
@@ -592,11 +595,11 @@ class ReplayLoop:
         return True
 
     def _move(self, ask: MoveRequest, clock_ns: int) -> PlayheadAnswer:
-        """Play as requested from the request's moment on."""
+        """Carry out a request as of its time, and publish the frame that it leads to."""
         play, behind = self._play, self._is_behind(min(ask.clock_ns, clock_ns + AHEAD_NS))
         before = self._round_before
         if before and before.anchor_ns <= ask.clock_ns < play.anchor_ns:
-            play, behind = play.moved_as(before), True  # the request came just before the round ended
+            play, behind = play.moved_as(before), True  # the request was made just before the round ended
         was_ns = play.at_ns(clock_ns)
         try:
             play, position_ns = moved(play, ask, clock_ns)
@@ -606,11 +609,11 @@ class ReplayLoop:
         if position_ns is not None:
             self._show(position_ns)
         elif behind or was_ns - play.at_ns(clock_ns) > self._source.recorded.block.stale_ns:
-            self._show(play.at_ns(clock_ns))  # or the request came late
+            self._show(play.at_ns(clock_ns))  # frames were played that the request would have held back
         return PlayheadAnswer()
 
     def _catch_up(self, clock_ns: int) -> None:
-        """Adopt the play of other sources of this recording, because requests were missed."""
+        """Adopt the state of the recording's other sources, because this one missed requests."""
         other = as_others(self._source, [head for block in self._blocks().values() if (head := block.playhead)])
         if other is None or other.anchor_ns <= self._play.anchor_ns:
             return
@@ -620,6 +623,6 @@ class ReplayLoop:
             self._end()
 
     def _show(self, position_ns: int) -> None:
-        """Publish the frame at a position, and continue behind it."""
+        """Publish the last frame at or before a position, and continue after the position."""
         self._writer.at_ns = self._play.base_ns + position_ns
         self._player.show(position_ns, self._stamp)

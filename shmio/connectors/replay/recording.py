@@ -1,4 +1,4 @@
-"""The recording that is played: its files, its times, and the frames and events of one source in it."""
+"""Opens a recording for replay, and reads the frames and events of one source by time."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from shmio.segment import Event, Frame
 from shmio.segment.header import MAX_PROCESSES
 
 Moment = float | str
-"""Seconds from the begin of a recording, or a date and time."""
+"""A time in a recording: seconds from its begin, or a date and time."""
 
 MAX_NS: Final = 1 << 61
-"""Largest valid time, about 70 years."""
+"""The largest valid time, about 70 years in ns."""
 
 MIN_PERIOD_NS: Final = 100_000
 MAX_PERIOD_NS: Final = 3_600_000_000_000
-"""Longest period of a source, as in a configuration."""
+"""The longest valid period of a source; the configuration has the same limit."""
 
 log = logging.getLogger("shmio.source")
 
 
 class MissingFrames(NamedTuple):
-    """Frames that are missing in the recording."""
+    """Frames that are missing in the recording, and the reason why."""
 
     reason: str
 
@@ -40,16 +40,17 @@ _DAMAGED: Final = MissingFrames("not in the recording: it is damaged here")
 
 
 class Entry(NamedTuple):
-    """A frame, an event, or a gap, with its position."""
+    """A frame, an event or a gap in a recording, and its position."""
 
     position_ns: int
     item: Frame | Event | MissingFrames
 
 
 class RecordedSource:
-    """Reads one source of a recording by position: ns since the start of the recorded instance.
+    """Reads the entries of one source of a recording by position.
 
-    Several iterators may run at once, in one thread.
+    A position is a time in ns since the start of the recorded instance. Several iterators may be
+    open at once. Use them in one thread only.
     """
 
     def __init__(self, dump: Dump, damage: list[Damage], block: DumpBlock, utc_ns: int) -> None:
@@ -57,9 +58,9 @@ class RecordedSource:
 
         Args:
             dump: The recording.
-            damage: The list to which the dump adds damaged places.
-            block: A block of the source. Only the source's blocks with the same layout are played.
-            utc_ns: UTC of position 0.
+            damage: The list to which ``dump`` appends each damaged place that it finds.
+            block: A block of the source. Only blocks of the source with the same layout are played.
+            utc_ns: UTC of position 0, in ns.
 
         """
         self._dump = dump
@@ -69,9 +70,9 @@ class RecordedSource:
         self._holes = [gap for gap in dump.gaps if gap.source == block.source and gap.what == "frames"]
 
     def entries(self, from_ns: int | None) -> Iterator[Entry]:
-        """Yield the entries from a position on (None: from the first), in their order.
+        """Yield the entries from a position on (None: from the first one) in recorded order.
 
-        Damage and gaps are MissingFrames.
+        The item of an entry at a gap or at damage is MissingFrames.
         """
         at_ns = from_ns
         begin_ns = 0 if from_ns is None else max(0, from_ns + self._utc_ns)
@@ -90,10 +91,7 @@ class RecordedSource:
             at_ns = position_ns
 
     def newest(self, position_ns: int) -> Entry | None:
-        """Return the last frame at or before a position, or the gap there.
-
-        None if neither exists.
-        """
+        """Return the last frame or gap at or before a position; None if there is none."""
         found = self._dump.latest(self.block.source, position_ns + self._utc_ns)
         self._damage.clear()
         last = None
@@ -112,7 +110,7 @@ class RecordedSource:
     def _hole(self, gap: Gap, at_ns: int) -> Entry:
         """Return the entry of a gap.
 
-        It begins a period after the last frame, or with the next one.
+        Its position is one period after the frame before the gap, or that of the frame after it.
         """
         position_ns = gap.after_ns - self._utc_ns + self.block.period_ns if gap.after_ns else at_ns
         if gap.before_ns:
@@ -122,7 +120,7 @@ class RecordedSource:
 
 
 class Span(NamedTuple):
-    """The part of a recording that is played, as positions; the end is exclusive."""
+    """A part of a recording, from one position to another; the end is exclusive."""
 
     begin_ns: int
     end_ns: int
@@ -132,8 +130,8 @@ class Recording:
     """A recording in one or several files, open for reading. A context manager.
 
     Raises:
-        RecordingError: A file cannot be read or is no recording, holds no frames, or the files are
-            of different runs.
+        RecordingError: A file cannot be read or is not a recording, there are no frames, or the
+            files are from different runs.
 
     """
 
@@ -157,7 +155,7 @@ class Recording:
         if not (started.isdecimal() and len(started) < 20):
             raise RecordingError(f"{self._file} does not say when its instance was started: it cannot be played")
         self.utc_ns = int(started)
-        """UTC of position 0: when the recorded instance started."""
+        """UTC of position 0, the start of the recorded instance, in ns."""
         names = self._dump.sources
         if len(names) > MAX_PROCESSES:
             raise RecordingError(
@@ -173,7 +171,7 @@ class Recording:
             min(span.begin_ns for span in spans.values()) - self.utc_ns,
             max(span.end_ns for span in spans.values()) - self.utc_ns,
         )
-        """From the first frame to a period behind the last one."""
+        """The whole recording, from the first frame to one period after the last one."""
         even = all(
             MIN_PERIOD_NS <= block.period_ns <= MAX_PERIOD_NS and block.period_ns <= block.stale_ns <= MAX_NS
             for block in self._dump.blocks
@@ -182,9 +180,9 @@ class Recording:
             raise RecordingError(f"{self._file} has invalid times: it cannot be played")
 
     def _measured(self, name: str) -> Span | None:
-        """Return the span of a source's frames in UTC, one period added at the end.
+        """Return the span of a source's frames in UTC, up to one period after the last one.
 
-        None without frames.
+        None if the source has no frames.
         """
         if self._dump.damage:  # then the index may be incomplete
             first, last = next(self._dump.frames(name), None), self._dump.latest(name)
@@ -200,11 +198,11 @@ class Recording:
         self._damage.append(damage)
 
     def span(self, start: Moment | None, end: Moment | None) -> Span:
-        """Return the part to play.
+        """Return the part of the recording between two times, either of which may be None.
 
         Raises:
-            RecordingError: A time is invalid, or nothing lies between the two. The message begins
-                with the key.
+            RecordingError: A time is invalid, or no part of the recording lies between them. The
+                message begins with the key.
 
         """
         begin_ns = self.whole.begin_ns if start is None else self.moment("start", start)
@@ -219,10 +217,12 @@ class Recording:
         return span
 
     def moment(self, key: str, text: Moment) -> int:
-        """Return the position of seconds from the begin, or of a date and time (local by default).
+        """Return the position of a time, given as seconds from the begin or as a date and time.
+
+        A date and time without a zone is local. ``key`` is for the message.
 
         Raises:
-            RecordingError: The text is neither.
+            RecordingError: The text is not a valid time.
 
         """
         try:
@@ -235,10 +235,10 @@ class Recording:
             ) from None
 
     def recorded(self, source: str, span: Span) -> RecordedSource:
-        """Return what the recording holds of a source.
+        """Return a reader of one source of the recording.
 
         Raises:
-            RecordingError: It holds nothing, or the layout changes within the part to play.
+            RecordingError: There are no frames of the source, or its layout changes within ``span``.
 
         """
         if source not in self.sources:

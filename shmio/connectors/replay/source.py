@@ -1,4 +1,4 @@
-"""The replay source: its keys, its recording, and how it starts."""
+"""The replay source: its configuration keys, its recording, and the state in which it starts."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ File = Annotated[str, msgspec.Meta(min_length=1)]
 
 
 class Replay(Replayed):
-    """``connector = "replay"``: plays one source of a recording.
-
-    Nothing is written to any device.
-    """
+    """``connector = "replay"``: plays one source of a recording. It never writes to a device."""
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """Its keys. With ``own_clock`` the whole instance has the clock of the recording."""
+        """Keys of the source.
+
+        With ``own_clock``, frames have the instance time at which they were recorded, not at which
+        they are played.
+        """
 
         file: File | Annotated[list[File], msgspec.Meta(min_length=1)]
         source: str | None = None
@@ -41,7 +42,7 @@ class Replay(Replayed):
         """Open the recording.
 
         Raises:
-            ConfigError: It cannot be played. The message begins with the key.
+            ConfigError: The recording cannot be played. The message begins with the key.
 
         """
         self.options = options
@@ -62,7 +63,7 @@ class Replay(Replayed):
 
     @property
     def keep(self) -> bool:
-        """Whether recorded injections are shown."""
+        """True if recorded injections are shown."""
         return self.options.injections == "keep"
 
     def close(self) -> None:
@@ -71,12 +72,12 @@ class Replay(Replayed):
 
 
 def files(options: Replay.Options) -> Sequence[str]:
-    """Return the files of the recording."""
+    """Return the names of the recording's files as configured."""
     return [options.file] if isinstance(options.file, str) else options.file
 
 
 def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Span, RecordedSource]:
-    """Return the part to play, and the recorded source.
+    """Return the part of the recording to play, and the reader of its source.
 
     Raises:
         ConfigError: There is nothing to play. The message begins with the key.
@@ -93,10 +94,10 @@ def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Sp
 
 
 class ReplayStart(NamedTuple):
-    """How a source plays from now on.
+    """The state in which the process of a replay source starts.
 
     ``done_ns`` is the position up to which the previous process has published the same recording;
-    None if there was none.
+    None if there was no such process.
     """
 
     play: PlayState
@@ -104,19 +105,22 @@ class ReplayStart(NamedTuple):
 
     @property
     def at(self) -> Stamp:
-        """The stamp of the process's start: that of the next entry, however long the start took."""
+        """The time stamp of the start event: that of the position at which playing continues."""
         play, done_ns = self
         position_ns = play.begin_ns if done_ns is None else done_ns
         return stamp(play, position_ns, position_ns)
 
 
 def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> ReplayStart:
-    """Set the playhead of a block, unless it is set for this recording already.
+    """Return the state to start from, and write it to the block's playhead.
+
+    If the playhead is set for this recording already, continue from it. Otherwise join the other
+    sources of the recording, or start as configured.
 
     Args:
         source: The recording to play.
         block: The block of the source.
-        started_ns: When the segment was created.
+        started_ns: Time at which the segment was created, in ns of CLOCK_MONOTONIC.
         blocks: All blocks of the instance.
 
     Raises:
@@ -127,18 +131,21 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
     if block.playhead is None or not heads:
         raise SegmentError(f"the block of source {block.source} has no playhead")
     own = block.playhead.read()
-    if own is not None and _is_of(source, own):  # without the lock: its holder may wait for this process
+    if own is not None and _is_of(source, own):  # no lock: its holder may wait for this process
         return ReplayStart(own, _done_ns(block, own))
-    with heads[0].held():  # sources that begin at the same time begin together
+    with heads[0].held():  # sources that start concurrently must agree on one state
         others = as_others(source, heads)
         play = _as_configured(source, block, started_ns) if others is None else others
-        play = play._replace(step=0, asked=block.playhead.asked(), answer="")  # earlier requests were for others
+        play = play._replace(step=0, asked=block.playhead.asked(), answer="")  # skip earlier requests
         block.playhead.write(play)
         return ReplayStart(play, None)
 
 
 def _done_ns(block: Block, play: PlayState) -> int | None:
-    """Return the position of the last frame, or of the last event without an owner behind it."""
+    """Return the position of the last replayed frame, or of a replayed event after it.
+
+    None if the block has no frame. Replayed events are those without an owner.
+    """
     last = block.latest()
     if last is None:
         return None
@@ -152,10 +159,7 @@ def _is_of(source: Replay, play: PlayState) -> bool:
 
 
 def as_others(source: Replay, heads: Iterable[Playhead]) -> PlayState | None:
-    """Return the replay state of the other sources of the same recording, as last requested.
-
-    None if there are no other sources.
-    """
+    """Return the newest state of all sources that replay the same recording; None if none does."""
     plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
     return max(plays, key=lambda play: play.anchor_ns, default=None)
 
@@ -180,7 +184,7 @@ def _as_configured(source: Replay, block: Block, started_ns: int) -> PlayState:
 
 
 def stamp(play: PlayState, position_ns: int, clock_ns: int) -> Stamp:
-    """Return the stamp of a position; ``clock_ns`` is the recorded clock."""
+    """Return the time stamp for a position; ``clock_ns`` is the recorded instance time."""
     if not play.own_clock:
         clock_ns = play.due_ns(max(position_ns, play.position_ns))
     return Stamp(play.base_ns + position_ns, clock_ns)

@@ -326,7 +326,7 @@ def test_write_reaches_the_device_altered(make: Callable[..., Rig]) -> None:
         (EventKind.WRITTEN, number, b"", 0),
         (EventKind.WRITTEN, number, b"", 0),
     ]
-    assert [event.text for event in events[-2:]] == ["with what the injection 'gain' made of it", ""]
+    assert [event.text for event in events[-2:]] == ["after the injection 'gain' changed its value", ""]
     rig.poll()
     rig.write({"speed": 21})
     rig.poll()
@@ -393,7 +393,7 @@ def test_full_delay_rejects_writes(make: Callable[..., Rig]) -> None:
         assert rig.other.write({"speed": value})[0].kind is OutcomeKind.TAKEN
     (outcome,) = rig.other.write({"speed": 1})
     assert (outcome.kind, outcome.text) == (
-        OutcomeKind.REJECTED, f"the delay of injection late holds {MAX_HELD} values already",
+        OutcomeKind.REJECTED, f"the injection late delays {MAX_HELD} writes already, the maximum",
     )  # fmt: skip
     rig.client.lift(rig.block.standing.read()[0].number)
     rig.write({"speed": 1})

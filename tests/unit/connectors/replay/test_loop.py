@@ -159,7 +159,7 @@ def test_gap_is_bad_until_the_recording_continues(tmp_path: Path, instance: str)
         coordinator.step(10 * S)
         frames = playing.frames()
         assert {frame.quality for frame in frames} == {Quality.GOOD}
-        assert [event.text for event in playing.happened()][-1] == "replay: the recording goes on"
+        assert [event.text for event in playing.happened()][-1] == "replay: the recording continues"
         coordinator.close()
 
 
