@@ -114,7 +114,7 @@ class TestS7(WriteConformance):
         rig.proxy.edit(rename)
         end = writer.write(Write(rig.spare, 0, b"x"))
         assert end.kind == EventKind.UNKNOWN
-        assert "not under way" in end.text
+        assert "not in flight" in end.text
         run.bad()
         rig.proxy.pass_all()
         run.good()

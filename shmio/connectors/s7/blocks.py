@@ -1,8 +1,8 @@
-"""Reads and writes a whole block by several requests in flight, or finds how long it is. No I/O.
+"""Reads and writes a whole block with several requests in flight, and finds its length. No I/O.
 
-Each operation makes its requests (``take``), and checks the answers (``accept``). ``transport``
-sends and receives them. Round trips take nearly all the time of a cycle, so it keeps as many
-requests in flight as the controller granted.
+Each operation builds its requests (``take``) and checks the answers (``accept``). ``transport``
+sends and receives them. Round trips take nearly all the time of a cycle, so ``transport`` keeps as
+many requests in flight as the controller granted.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_read, exp
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 
-MAX_ITEMS = 20  # per job; all known controllers take as many
-JOB_OVERHEAD = 12  # of a request within its PDU: header 10, parameters 2
-ITEM_OVERHEAD = 16  # address 12, head of the value 4
+MAX_ITEMS = 20  # per job; all known controllers accept that many
+JOB_OVERHEAD = 12  # bytes of a request's PDU: header 10, parameters 2
+ITEM_OVERHEAD = 16  # bytes of an item: address 12, header of the value 4
 _MOST_PROBED = 19  # items per job; request and answer fit the smallest known PDU, 240 bytes
 _REFERENCE = struct.Struct(">H")
-_ITEM_HEAD = struct.Struct(">BBH")  # return code (in a request reserved), transport size, length
+_ITEM_HEAD = struct.Struct(">BBH")  # return code (reserved in a request), transport size, length
 _SIZE_BIT, _SIZE_BITS = 0x03, 0x04  # transport sizes: a single bit; bytes, whose length counts bits
 
 
@@ -31,9 +31,9 @@ _SIZE_BIT, _SIZE_BITS = 0x03, 0x04  # transport sizes: a single bit; bytes, whos
 
 
 class BlockRead:
-    """The requests that read a block, and the image that the answers make.
+    """Reads a whole block: builds the requests, and assembles the image from the answers.
 
-    It is reused for later reads.
+    :meth:`begin` starts another read with the same buffers.
     """
 
     def __init__(self, db_number: int, size: int, chunk: int) -> None:
@@ -55,20 +55,17 @@ class BlockRead:
         """Start a read that must be complete by ``deadline_ns``."""
         self.deadline_ns = deadline_ns
         self.refusal: RefusedError | None = None
-        """Why the controller refused the block; there is no image then."""
+        """Why the controller refused to read the block; None unless it did."""
         self.sent = self._answered = 0
 
     @property
     def complete(self) -> bool:
-        """Whether every part of the block has come, or the block was refused."""
+        """True if every part of the block was received, or the controller refused the block."""
         return self._answered == self.count or self.refusal is not None
 
     @property
     def data(self) -> bytes:
-        """A copy of the block.
-
-        It is consistent only if the read is complete and was not refused.
-        """
+        """A copy of the image; valid only if the read is complete and was not refused."""
         return bytes(self._block)
 
     def take(self, count: int, first: int) -> memoryview:
@@ -81,9 +78,11 @@ class BlockRead:
         return self._requests_view[begin * size : self.sent * size]
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Take the answer to request ``index``, in any order.
+        """Process the answer to request ``index``; answers may come in any order.
 
-        ConnectorError if it does not match.
+        Raises:
+            ConnectorError: The answer does not match the request.
+
         """
         try:
             answer = pdu.parse_read_answer(frame)
@@ -104,27 +103,33 @@ class BlockRead:
 
 
 def byte_item(db_number: int, start: int, data: bytes) -> tuple[bytes, bytes]:
-    """Encode the address and value of bytes."""
+    """Return the encoded address and value of an item of bytes."""
     return pdu.address(db_number, 8 * start, len(data)), _ITEM_HEAD.pack(0, _SIZE_BITS, 8 * len(data)) + data
 
 
 def bit_item(db_number: int, start: int, bit: int, value: bool) -> tuple[bytes, bytes]:
-    """Encode the address and value of a single bit.
+    """Return the encoded address and value of an item of one bit.
 
-    The write leaves the other bits of its byte alone.
+    The controller does not change the other bits of the byte.
     """
     return pdu.address(db_number, 8 * start + bit, 1, pdu.TYPE_BIT), _ITEM_HEAD.pack(0, _SIZE_BIT, 1) + bytes((value,))
 
 
 def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes:
-    """Build a job that writes these items from ``byte_item`` and ``bit_item``."""
+    """Return a job that writes items from ``byte_item`` and ``bit_item``."""
     parameters = bytes((pdu.WRITE, len(items))) + b"".join(address for address, _ in items)
     values = b"".join(value + b"\0" * (len(value) & 1) for _, value in items[:-1]) + items[-1][1]
     return pdu.request(reference, parameters, values)
 
 
 def parse_write_answer(frame: memoryview, count: int) -> bytes:
-    """Return the codes of ``count`` written items; RefusedError if the whole job was refused."""
+    """Return the return codes of ``count`` written items.
+
+    Raises:
+        RefusedError: The controller refused the whole job.
+        ConnectorError: The answer is malformed.
+
+    """
     data_length = pdu.check_answer(frame)
     codes = frame[pdu.HEADER_END + 2 :]
     if len(frame) < pdu.HEADER_END + 2 or len(codes) != data_length or frame[pdu.HEADER_END] != pdu.WRITE:
@@ -136,16 +141,17 @@ def parse_write_answer(frame: memoryview, count: int) -> bytes:
 
 class _Item(NamedTuple):
     write: int
-    """Index of the write that it belongs to."""
+    """Index of the write to which the item belongs."""
     last: int
-    """The last byte that it touches."""
+    """Offset of the last byte that the item writes."""
     encoded: tuple[bytes, bytes]
 
 
 class BlockWrite:
-    """One wave of writes: jobs that may all be in flight. It puts refusals into ``outcomes``.
+    """One wave of writes: jobs that may all be in flight at once.
 
-    Items fill the jobs in the order of the writes, and the jobs are sent in that order.
+    Jobs contain the items in the order of the writes, and are sent in this order. Reasons of
+    refusals are stored in ``outcomes``.
     """
 
     def __init__(self, db_number: int, pdu_size: int, items: Sequence[_Item], outcomes: list[str]) -> None:
@@ -158,7 +164,7 @@ class BlockWrite:
 
     @property
     def complete(self) -> bool:
-        """Whether every job was answered."""
+        """True if the controller has answered every job."""
         return len(self._answered) == self.count
 
     def take(self, count: int, first: int) -> bytes:
@@ -170,7 +176,12 @@ class BlockWrite:
         )
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Take the answer to request ``index``; ConnectorError if it does not match."""
+        """Process the answer to request ``index``.
+
+        Raises:
+            ConnectorError: The answer does not match the request.
+
+        """
         job = self._jobs[index]
         try:
             codes = parse_write_answer(frame, len(job))
@@ -184,7 +195,7 @@ class BlockWrite:
         self._answered.add(index)
 
     def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
-        """Yield the write's index for each item, and what is known of it without an answer."""
+        """Yield for each item the index of its write, and how it was lost; None if answered."""
         for index, job in enumerate(self._jobs):
             known = None if index in self._answered else Lost.UNKNOWN if index < self.sent else Lost.UNSENT
             for item in job:
@@ -195,13 +206,13 @@ class BlockWrite:
 
 
 def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
-    """Cut a batch into waves, in order. Refusals go into ``outcomes``, one text per write.
+    """Divide a batch into waves, in order; send a wave when the one before it is complete.
 
-    The controller may serve jobs in flight in any order. So writes that touch the same bits are in
-    different waves, and each wave is confirmed before the next is sent.
+    The controller may execute jobs in flight in any order. So writes to the same bits must be in
+    different waves. Each wave stores the reasons of refusals in ``outcomes``, by index of the write.
     """
     wave: list[_Item] = []
-    spans: list[tuple[int, int]] = []  # of bits of the block that the wave touches, in order
+    spans: list[tuple[int, int]] = []  # sorted ranges of bits that the wave writes
     for place, write in enumerate(writes):
         span = _span(write)
         if wave and _touches(spans, span):
@@ -214,7 +225,7 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
 
 
 def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
-    """Return what is known of each write after the session was lost in a wave of ``begun``."""
+    """Return the outcome of each write after the session was lost; ``begun`` are the waves so far."""
     parts: list[set[Lost | None]] = [set() for _ in outcomes]
     for wave in begun:
         for write, known in wave.unanswered():
@@ -238,7 +249,7 @@ def _span(write: Write) -> tuple[int, int]:
 
 
 def _touches(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
-    """Return whether a span overlaps any of these, which are disjoint and sorted."""
+    """Return whether a span overlaps any of ``spans``, which are disjoint and sorted."""
     after = bisect_right(spans, span)
     return (after > 0 and spans[after - 1][1] > span[0]) or (after < len(spans) and spans[after][0] < span[1])
 
@@ -257,12 +268,12 @@ def _items(db_number: int, pdu_size: int, place: int, write: Write) -> Iterator[
 
 
 def _fill(items: Sequence[_Item], pdu_size: int) -> Iterator[list[_Item]]:
-    """Put as many items into each job as its PDU holds, in order."""
+    """Group items into jobs, in order, with as many items in each as fit into a PDU."""
     job: list[_Item] = []
     size = JOB_OVERHEAD
     for item in items:
         address, value = item.encoded
-        size += size & 1  # values begin at even places
+        size += size & 1  # values begin at even offsets
         if job and (size + len(address) + len(value) > pdu_size or len(job) == MAX_ITEMS):
             yield job
             job, size = [], JOB_OVERHEAD
@@ -272,22 +283,22 @@ def _fill(items: Sequence[_Item], pdu_size: int) -> Iterator[list[_Item]]:
         yield job
 
 
-# -- measuring ---------------------------------------------------------------------------------------------------------
+# -- finding the length ------------------------------------------------------------------------------------------------
 
 
 class SizeProbe:
-    """Finds the real length of a block whose end cannot be read.
+    """Finds the real length of a block that is shorter than its layout.
 
-    Each job narrows the range by a factor of twenty.
+    Each job reads single bytes at several places, and so narrows the range by a factor of twenty.
     """
 
     count = 1
 
     def __init__(self, db_number: int, size: int, pdu_size: int) -> None:
-        """Search below ``size``, whose last byte is known to be missing."""
+        """Search for a length below ``size`` bytes; the last of these bytes cannot be read."""
         self._db_number = db_number
         self._most = max(1, min(_MOST_PROBED, (pdu_size - 14) // 12))
-        self._low, self._high = 0, size - 1  # the range of the first missing byte, both ends included
+        self._low, self._high = 0, size - 1  # bounds, both inclusive, of the first missing byte's offset
 
     def begin(self) -> None:
         """Plan the next job."""
@@ -307,7 +318,12 @@ class SizeProbe:
         return pdu.read_request(first & 0xFFFF, [pdu.address(self._db_number, 8 * at, 1) for at in self._tried])
 
     def accept(self, index: int, frame: memoryview) -> None:  # noqa: ARG002 - there is one request
-        """Take the answer; ConnectorError if it does not match these items."""
+        """Process the answer.
+
+        Raises:
+            ConnectorError: The answer does not match the request.
+
+        """
         readable = parse_readable(frame, len(self._tried))
         for at, good in zip(self._tried, readable, strict=True):
             if not good:
@@ -318,9 +334,12 @@ class SizeProbe:
 
 
 def parse_readable(frame: memoryview, count: int) -> list[bool]:
-    """Return which of ``count`` single bytes could be read.
+    """Return for each of ``count`` single bytes whether the controller could read it.
 
-    RefusedError if the whole job was refused.
+    Raises:
+        RefusedError: The controller refused the whole job.
+        ConnectorError: The answer is malformed.
+
     """
     pdu.check_answer(frame)
     if bytes(frame[pdu.HEADER_END : pdu.HEADER_END + 2]) != bytes((pdu.READ, count)):
@@ -333,7 +352,7 @@ def parse_readable(frame: memoryview, count: int) -> list[bool]:
         code, _, _ = _ITEM_HEAD.unpack_from(frame, at)
         good = code == ITEM_OK
         readable.append(good)
-        at += 6 if good else 4  # one byte, and one that makes it even
-    if at - len(frame) not in {0, 1}:  # after the last item, none is needed
+        at += 6 if good else 4  # one byte of data, and one of padding
+    if at - len(frame) not in {0, 1}:  # the last item may have no padding
         raise ConnectorError(f"answer of {len(frame)} bytes, {at} belong to its items")
     return readable

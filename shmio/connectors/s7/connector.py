@@ -1,7 +1,7 @@
-"""The S7 connector: its keys, and the client that reads and writes one data block.
+"""The S7 connector: its configuration keys, and the client that reads and writes one data block.
 
-For one thread. ``submit`` sends the requests of a read and returns; ``collect`` waits for the
-image. In between, more reads may be submitted, up to ``depth``, and writes may be sent at any time.
+``submit`` sends the requests of a read and returns at once. ``collect`` waits for the image. Up to
+``depth`` reads may be in flight, and you may write at any time. Use a client in one thread only.
 """
 
 from __future__ import annotations
@@ -31,33 +31,32 @@ from shmio.layout.values.write import Write
 MAX_DEPTH = 4  # reads in flight at once; with more, images would only be older
 LONGEST_WRITE_S = 20  # limit for a whole batch; ``timeout`` if that is longer
 
-# The slot of the CPU in its rack, by family, where nothing is configured.
+# The slot of the CPU in its rack by family, unless the key slot is configured.
 _CPU_SLOT = {"S7_300": 2, "S7_400": 3, "S7_1200": 1, "S7_1500": 1}
 
 
 class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Address of the controller and parameters of the session; the keys are those of ``plc.ini``.
+    """Address of the controller and parameters of the session, with the keys of ``plc.ini``.
 
-    ValueError for an invalid host or model.
+    Raises:
+        ValueError: The host or the model is invalid.
+
     """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=253)]
     model: str | None = None
-    """``S7_300``, ``S7_400``, ``S7_1200`` or ``S7_1500``.
-
-    Only the default of ``slot`` depends on it.
-    """
+    """``S7_300``, ``S7_400``, ``S7_1200`` or ``S7_1500``; it sets only the default of ``slot``."""
     port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 102
     rack: Annotated[int, msgspec.Meta(ge=0, le=7)] = 0
     slot: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
-    """Milliseconds for connecting, for reading the block, and for each answer to a write."""
+    """Time-out in ms for connecting, for reading the block, and for each answer to a write."""
     packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
-    """The most data bytes in one read; the controller's PDU size limits it too."""
+    """Largest number of data bytes in one read; the controller's PDU size limits it too."""
     dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
-    """The data block; the layout's own number if absent."""
-    maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named as its siblings
-    """The most requests in flight; the controller's limit applies too."""
+    """Number of the data block; None: the number in the layout's name."""
+    maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named like the other keys
+    """Largest number of requests in flight; the controller's limit applies too."""
 
     def __post_init__(self) -> None:
         if not _is_host(self.host):
@@ -69,24 +68,24 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
 
     @property
     def cpu_slot(self) -> int:
-        """The slot as configured, else the model's usual one."""
+        """The configured slot, or the usual one of the model."""
         if self.slot is not None:
             return self.slot
         return 1 if self.model is None else _CPU_SLOT[_family(self.model)]
 
     @property
     def peer(self) -> str:
-        """``host:port`` for messages, IPv6 in brackets."""
+        """``host:port`` for messages, with IPv6 addresses in brackets."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
 def _family(model: str) -> str:
-    """Return the model as the table has it: ``s7-1500`` is ``S7_1500``."""
+    """Return the model as spelled in the table, for example ``S7_1500`` for ``s7-1500``."""
     return model.strip().upper().replace("-", "_").replace(" ", "_")
 
 
 def _is_host(text: str) -> bool:
-    """Return whether the text is an IP address (IPv6 with a zone too) or a valid host name."""
+    """Return whether the text is an IP address (IPv6 zones are allowed) or a valid host name."""
     try:
         ipaddress.ip_address(text)
     except ValueError:
@@ -95,7 +94,7 @@ def _is_host(text: str) -> bool:
 
 
 def _is_name(text: str) -> bool:
-    """Return whether the text can be looked up: no label is empty or longer than 63 bytes."""
+    """Return whether every label of a host name has 1 to 63 bytes, so that it can be looked up."""
     try:
         text.encode("idna")
     except UnicodeError:
@@ -106,15 +105,15 @@ def _is_name(text: str) -> bool:
 class S7Client:
     """Reads and writes one block of one controller.
 
-    Any error closes the socket, so that a late answer is never taken for the next one. ``connect``
-    may then be called again.
+    Any error closes the socket, so that a late answer is never matched to a later request. You may
+    call ``connect`` again afterwards.
     """
 
     def __init__(self, options: S7Options, db_number: int, size: int) -> None:
-        """Prepare to read ``size`` bytes of DB ``db_number``.
+        """Create a client for ``size`` bytes of DB ``db_number``. It does not connect yet.
 
         Raises:
-            ConfigError: S7 cannot address the block.
+            ConfigError: S7 cannot address such a block.
 
         """
         if not 1 <= size <= pdu.MAX_BLOCK_SIZE:
@@ -127,7 +126,7 @@ class S7Client:
         self._timeout_ns = options.timeout * 1_000_000
         self._transport: Transport | None = None
         self._session = pdu.Session(0, 0)
-        # A reconnect does not reset the references, so that old answers stay unknown.
+        # References continue after a reconnect, so that a late answer matches no new request.
         self._window = Window(0, 0)
         self._under_way: deque[BlockRead] = deque()
         self._idle: list[BlockRead] = []
@@ -136,38 +135,39 @@ class S7Client:
 
     @property
     def timeout_s(self) -> float:
-        """The longer of ``timeout`` and the limit for a batch of writes, in s."""
+        """The longest time that a method takes, in s: ``timeout``, at least LONGEST_WRITE_S."""
         return max(self.options.timeout / 1000, LONGEST_WRITE_S)
 
     @property
     def connected(self) -> bool:
-        """Whether a session is open, as far as is known."""
+        """True if a session is open, as far as the client knows."""
         return self._transport is not None
 
     @property
     def pdu_size(self) -> int:
-        """Size of the largest PDU as granted, in bytes; 0 before the first session."""
+        """Largest PDU size that the controller granted, in bytes; 0 before the first session."""
         return self._session.pdu_size
 
     @property
     def jobs(self) -> int:
-        """Requests kept in flight: as granted, at most ``maxJobs``; 0 before the first session."""
+        """Largest number of requests in flight; 0 before the first session.
+
+        The controller grants it, and ``maxJobs`` may limit it.
+        """
         return self._session.jobs
 
     @property
     def depth(self) -> int:
-        """Reads that may be in flight at once in this session, at least 1."""
+        """Largest number of reads in flight in this session, at least 1."""
         return max(1, len(self._idle) + len(self._under_way))
 
     @property
     def doubt(self) -> str:
-        """Why values may not change (the PLC is in STOP); empty if there is no reason."""
+        """Reason why values may not change, such as a PLC in STOP; empty if there is none."""
         return self._mode.doubt
 
     def connect(self) -> None:
-        """Open a session and query the operating mode.
-
-        It takes at most ``timeout``, plus the host name lookup.
+        """Open a session and query the operating mode, within ``timeout`` plus the name lookup.
 
         Raises:
             ConnectorError: No controller answers, it does not speak S7, or it refuses the session.
@@ -193,9 +193,9 @@ class S7Client:
             self._finish(self._mode, deadline_ns)
 
     def read(self) -> bytes:
-        """Read the whole block within ``timeout``; for use while no read is in flight.
+        """Read the whole block within ``timeout``. No other read may be in flight.
 
-        A read of several PDUs does not show a single instant of the controller.
+        If the block needs several PDUs, its parts may be from different instants.
 
         Returns:
             ``size`` bytes as the controller sent them.
@@ -211,7 +211,7 @@ class S7Client:
         return image
 
     def submit(self) -> None:
-        """Send the requests of one read without waiting. At most ``depth`` reads may be in flight.
+        """Send the requests of one read and return. At most ``depth`` reads may be in flight.
 
         Raises:
             ConnectorError: There is no session, or it was lost.
@@ -220,7 +220,7 @@ class S7Client:
         if self._transport is None:
             raise ConnectorError("not connected")
         if not self._idle:
-            raise RuntimeError(f"no more than {self.depth} reads may be under way")
+            raise RuntimeError(f"no more than {self.depth} reads may be in flight")
         with self._close_on_error:
             read = self._idle.pop()
             read.begin(time.monotonic_ns() + self._timeout_ns)
@@ -230,23 +230,23 @@ class S7Client:
             self._flush()
 
     def collect(self, until_ns: int) -> bytes | None:
-        """Wait for the oldest read.
+        """Wait until the oldest read is complete.
 
         Args:
-            until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
+            until_ns: Time at which to stop waiting, in ns of CLOCK_MONOTONIC.
 
         Returns:
             ``size`` bytes; None if the read is not complete by ``until_ns``.
 
         Raises:
-            ConnectorError: There is no session, a wrong answer, a refusal, or no answer within
-                ``timeout`` of ``submit``. The session is closed then.
+            ConnectorError: There is no session, an answer is wrong, the controller refused the
+                read, or it did not answer within ``timeout`` of ``submit``. The session is closed.
 
         """
         if self._transport is None:
             raise ConnectorError("not connected")
         if not self._under_way:
-            raise RuntimeError("no read is under way")
+            raise RuntimeError("no read is in flight")
         read = self._under_way[0]
         with self._close_on_error:
             if not self._advance(read, min(until_ns, read.deadline_ns)):
@@ -259,18 +259,18 @@ class S7Client:
             return read.data
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write in this order; reads may be in flight.
+        """Write a batch, and wait until the controller has answered. Reads may be in flight.
 
-        A batch that does not fit one PDU takes several jobs. It is not atomic and may be done in
-        part, and the controller may serve jobs in flight in any order. Each answer must come within
-        ``timeout`` of the one before.
+        If writes change the same bits, the last one wins. A batch that does not fit into one PDU
+        takes several jobs, and is not atomic. The controller may execute jobs in flight in any
+        order. Each answer must come within ``timeout`` of the one before.
 
         Returns:
-            For each write "" if the controller confirmed it, else why it refused it.
+            For each write, "" if the controller confirmed it, else why it refused the write.
 
         Raises:
-            WriteLostError: The session was lost, or the batch took longer than LONGEST_WRITE_S and
-                ``timeout``.
+            WriteLostError: The session was lost, or the batch took longer than both
+                LONGEST_WRITE_S and ``timeout``.
 
         """
         if self._transport is None:
@@ -295,7 +295,7 @@ class S7Client:
         return outcomes
 
     def close(self) -> None:
-        """Close the socket, if open."""
+        """Close the socket, if it is open."""
         if self._transport is not None:
             self._transport.close()
             self._transport = None
@@ -307,7 +307,7 @@ class S7Client:
     # -- session -------------------------------------------------------------------------------------------------------
 
     def _use(self, granted: pdu.Session, transport: Transport) -> None:
-        """Create the requests and buffers that all reads of this session use."""
+        """Create the requests and buffers for the reads of a new session."""
         jobs = min(granted.jobs, self.options.maxJobs or granted.jobs)
         self._session = pdu.Session(granted.pdu_size, jobs)
         self._window = Window(jobs, self._window.reference)
@@ -320,7 +320,7 @@ class S7Client:
     # -- requests and answers ------------------------------------------------------------------------------------------
 
     def _ask_mode(self) -> None:
-        """Queue a mode query if one is due; TimeoutError if the answer to the last one is late."""
+        """Queue a mode query if one is due; raise TimeoutError if the last answer is late."""
         now_ns = time.monotonic_ns()
         if not self._mode.complete:  # after a long period the answer may be in the socket
             self._advance(self._mode, now_ns)
@@ -331,7 +331,7 @@ class S7Client:
             raise TimeoutError
 
     def _flush(self) -> None:
-        """Send the requests that may be sent."""
+        """Send as many waiting requests as the window allows."""
         assert self._transport is not None  # noqa: S101 - for the type checker
         if self._window.waiting and (requests := self._window.due()):
             try:
@@ -342,9 +342,9 @@ class S7Client:
                 raise
 
     def _advance(self, operation: Operation, until_ns: int) -> bool:
-        """Send and receive until the operation is complete.
+        """Send and receive until the operation is complete, or until ``until_ns``.
 
-        Return False if it is not by ``until_ns``.
+        Return whether it is complete.
         """
         while not operation.complete:
             if self._step(until_ns) is None:
@@ -354,10 +354,10 @@ class S7Client:
         return True
 
     def _step(self, until_ns: int) -> int | None:
-        """Receive once, then send what may be sent.
+        """Receive once, then send as many waiting requests as the window allows.
 
         Returns:
-            The number of answers; None if nothing came until ``until_ns``.
+            The number of answers; None if nothing was received until ``until_ns``.
 
         """
         transport, window = self._transport, self._window
@@ -378,7 +378,7 @@ class S7Client:
             raise TimeoutError
 
     def _finish_wave(self, wave: BlockWrite, end_ns: int) -> None:
-        """Wait for all jobs of a wave: ``timeout`` between answers, until ``end_ns`` at most."""
+        """Wait for all jobs of a wave until ``end_ns``, and for each answer at most ``timeout``."""
         deadline_ns = time.monotonic_ns() + self._timeout_ns
         while not wave.complete:
             answers = self._step(min(deadline_ns, end_ns))
@@ -394,7 +394,7 @@ class S7Client:
                 )
 
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:
-        """If the block is too short, probe its real length, and return a refusal that names it."""
+        """If the controller's block is too short, return a refusal that names its real length."""
         if refusal.code != OUT_OF_RANGE:
             return refusal
         probe = SizeProbe(self.db_number, self.size, self.pdu_size)
@@ -410,7 +410,7 @@ class S7Client:
 
 
 class S7Connector(S7Client, Connector):
-    """The client of the data block that a layout describes."""
+    """The connector ``s7``: reads and writes the data block that a layout describes."""
 
     Options = S7Options
     can_write = True
@@ -422,19 +422,19 @@ class S7Connector(S7Client, Connector):
                 f"dbNumber: this key is needed, because the layout {layout.name!r} has no number in its name"
             )
         if layout.byte_order != "big":
-            raise ConfigError(f"layout: {layout.name!r} is in little-endian byte order, a controller's block is not")
+            raise ConfigError(f"layout: {layout.name!r} is little-endian, but a controller's block is big-endian")
         super().__init__(options, number, layout.size)
 
     def describe(self) -> str:
-        """Return peer and session parameters as granted."""
+        """Return the peer and the parameters of the session as a text for logs."""
         return f"to {self.options.peer} DB{self.db_number} pdu={self.pdu_size} jobs={self.jobs} depth={self.depth}"
 
 
-# -- errors of the connection ------------------------------------------------------------------------------------------
+# -- connection errors -------------------------------------------------------------------------------------------------
 
 
 def _named(error: BaseException, options: S7Options, *, opening: bool = False) -> ConnectorError | None:
-    """Return a ConnectorError that explains a connection's error; None for other errors."""
+    """Return a ConnectorError that explains a connection error; None for any other error."""
     peer = options.peer
     if isinstance(error, TimeoutError):
         return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
@@ -456,7 +456,7 @@ def _named(error: BaseException, options: S7Options, *, opening: bool = False) -
 
 
 class _CloseOnError:
-    """Context manager that closes a connection on any error, and explains the error."""
+    """Context manager that closes the connection on any error, and raises an explained error."""
 
     def __init__(self, close: Callable[[], None], options: S7Options, *, opening: bool = False) -> None:
         self._close = close

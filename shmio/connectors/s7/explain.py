@@ -1,7 +1,7 @@
-"""Explains a controller's refusals and their remedies to the operator of the cell.
+"""Messages that explain why a controller refused a request, and what to do about it.
 
-No public standard says which family sends which code when. These texts follow reports of users with
-real CPUs; docs/how-to/connect-an-s7-plc.md names them.
+No public standard says when each family sends which code. The messages follow reports of users with
+real CPUs; docs/how-to/connect-an-s7-plc.md names these reports.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ _ACCESS_DENIED = (
 )
 _PROTECTED = "the CPU's protection level forbids it {where}: choose 'Full access' in its protection settings"
 
-# Errors of a whole job for which the table of python-snap7 has less to say.
+# Errors of a whole job, where the texts of python-snap7 do not name the remedy.
 _ERRORS = {
-    0x8104: _ACCESS_DENIED,  # S7-1200 and S7-1500 to all jobs with PUT/GET off, and for optimized blocks
-    0x8304: _ACCESS_DENIED,  # S7-1200 and S7-1500 to writes with PUT/GET off
+    0x8104: _ACCESS_DENIED,  # S7-1200/1500: any job if PUT/GET is off, or the block is optimized
+    0x8304: _ACCESS_DENIED,  # S7-1200/1500: writes if PUT/GET is off
     0xD241: _PROTECTED,
     0xD602: _PROTECTED,
 }
 
 
 class RefusedError(ConnectorError):
-    """The controller understood the job and refused it.
+    """The controller refused a job.
 
-    ``code`` is the item's return code; 0 when the whole job was refused.
+    ``code`` is the return code of the refused item; 0 if the controller refused the whole job.
     """
 
     def __init__(self, message: str, code: int = 0) -> None:
@@ -43,7 +43,7 @@ class RefusedError(ConnectorError):
 
 
 def explain_error(error: int) -> str:
-    """Return what the error class and code in an answer's header mean."""
+    """Return a message for the error class and code in an answer's header."""
     if error in _ERRORS:
         return _ERRORS[error].format(where=f"(error 0x{error:04X})")
     known = S7_PROTOCOL_ERROR_CODES.get(error)
@@ -51,7 +51,7 @@ def explain_error(error: int) -> str:
 
 
 def explain_read(code: int, db_number: int, size: int) -> str:
-    """Return what an item's return code means for a read of a block of ``size`` bytes."""
+    """Return a message for an item's return code after a read of a block of ``size`` bytes."""
     if code == OUT_OF_RANGE:
         return (
             f"DB{db_number} has no {size} bytes (item code 0x05): the layout is of another version of the block, "
@@ -61,7 +61,7 @@ def explain_read(code: int, db_number: int, size: int) -> str:
 
 
 def explain_size(db_number: int, size: int, found: int) -> str:
-    """Return why a block of ``size`` bytes cannot be read if only its first ``found`` bytes can."""
+    """Return a message for a block that has only ``found`` bytes, not ``size`` as in the layout."""
     if not found:
         return (
             f"DB{db_number} has no byte that can be addressed (item code 0x05): it is optimized, {_NO_OPTIMIZED}; "
@@ -74,7 +74,7 @@ def explain_size(db_number: int, size: int, found: int) -> str:
 
 
 def explain_write(code: int, db_number: int, last: int) -> str:
-    """Return what an item's return code means for a write up to byte ``last``."""
+    """Return a message for an item's return code after a write up to byte ``last``."""
     if code == OUT_OF_RANGE:
         return (
             f"DB{db_number} has no byte {last} (item code 0x05): the layout is of another version of the block; export "

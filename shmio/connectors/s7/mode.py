@@ -1,8 +1,8 @@
 """Queries the controller's operating mode about once a second, to notice a PLC in STOP. No I/O.
 
-The mode is in SZL W#16#0424: the low half of the record's fourth byte; the high half is the
-previous mode. The numbers are from Siemens, System Software for S7-300/400, A5E00739858, 33.21. A
-controller that does not know the list is not queried again, and its mode is not watched.
+The mode is the low half of the fourth byte of a record of SZL W#16#0424; the high half is the
+previous mode. The numbers are from Siemens, System Software for S7-300/400, A5E00739858, 33.21. If
+a controller does not support this list, it is not queried again, and STOP is not noticed.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from shmio.connectors.s7.explain import ITEM_OK, RefusedError
 from shmio.errors import ConnectorError
 
 INTERVAL_NS = 1_000_000_000
-_PATIENCE = 2  # connections that may end during a query before it is given up
+_PATIENCE = 2  # number of connections that end during a query before queries stop
 _SZL = 0x0424
-_ASK = bytes.fromhex("000112 04 11 44 01 00")  # three bytes head, four follow, a request, of the group SZL, "read SZL"
-_PARAMETERS = b"\x00\x01\x12\x08\x12\x84\x01"  # three bytes head, eight follow, an answer, of the group SZL, "read SZL"
+_ASK = bytes.fromhex("000112 04 11 44 01 00")  # head 3 bytes, length 4, a request, group SZL, "read SZL"
+_PARAMETERS = b"\x00\x01\x12\x08\x12\x84\x01"  # head 3 bytes, length 8, an answer, group SZL, "read SZL"
 _PARAMETERS_SIZE = 12
 _DATA = struct.Struct(">BBH HH HH")  # return code, transport size, length; SZL and index; size and number of records
 
@@ -30,30 +30,30 @@ _MODES = {
     0xE: "in its self-test: its program does not run yet",
     0xF: "without power",
 }
-"""Modes in which values do not change.
+"""The modes in which values do not change, with their texts.
 
-RUN is 8; a redundant pair has 9, and B and C while it couples.
+In the other modes the program runs: RUN is 8; a redundant pair has 9, and B and C while it couples.
 """
 
 log = logging.getLogger("shmio.source")
 
 
 class ModeQuery:
-    """Queries the operating mode, and keeps the answer."""
+    """Queries the operating mode, and stores the last answer."""
 
     count = 1
 
     def __init__(self) -> None:
         self._due_ns = 0
         self.deadline_ns = 0
-        """When the answer to an open query must have come."""
-        self._known = False  # it has answered at least once
+        """Time by which the answer to an open query must come, in ns of CLOCK_MONOTONIC."""
+        self._known = False  # the controller has answered at least once
         self._failures = 0
         self._supported = True
         self.sent = 0
         self.complete = True
         self.doubt = ""
-        """Why values may not change; empty while the program runs, or if the mode is unknown."""
+        """Reason why values may not change; empty if the program runs or the mode is unknown."""
 
     def due(self, now_ns: int) -> bool:
         """Return whether to send a query now."""
@@ -64,7 +64,7 @@ class ModeQuery:
         return not self.complete and now_ns >= self.deadline_ns
 
     def begin(self, now_ns: int, deadline_ns: int) -> None:
-        """Begin a query."""
+        """Begin a query whose answer must come by ``deadline_ns``."""
         self._due_ns = now_ns + INTERVAL_NS
         self.deadline_ns = deadline_ns
         self.sent = 0
@@ -77,20 +77,25 @@ class ModeQuery:
         return pdu.request(first & 0xFFFF, _ASK, data, pdu.USERDATA)
 
     def accept(self, index: int, frame: memoryview) -> None:  # noqa: ARG002 - there is one request
-        """Take the answer; ConnectorError if it does not match."""
+        """Process the answer.
+
+        Raises:
+            ConnectorError: The answer does not match the request.
+
+        """
         self.complete = True
         mode = parse_mode_answer(frame)
         if mode is None:
-            self._give_up("does not tell it")
+            self._give_up("does not support the query")
             return
         self._known = True
         words = _MODES.get(mode)
         self.doubt = f"the PLC is {words}" if words else ""
 
     def lost(self) -> None:
-        """Forget the mode after a lost connection.
+        """Forget the mode, because the connection was lost.
 
-        Stop querying if queries end connections repeatedly.
+        Stop querying if connections were repeatedly lost during a query.
         """
         self.doubt = ""
         self._due_ns = 0
@@ -99,16 +104,16 @@ class ModeQuery:
         self.complete = True
         self._failures += 1
         if not self._known and self._failures == _PATIENCE:
-            self._give_up("does not answer when asked for it")
+            self._give_up("does not answer the query")
 
     def _give_up(self, why: str) -> None:
         self._supported = False
         self.doubt = ""
-        log.debug("the controller %s: its operating mode; STOP will not be noticed", why)
+        log.debug("the controller %s of its operating mode: STOP will not be noticed", why)
 
 
 def parse_mode_answer(frame: memoryview) -> int | None:
-    """Return the operating mode in an answer to a read of SZL 0x0424; None without one.
+    """Return the operating mode from an answer to a read of SZL 0x0424; None if it has none.
 
     Raises:
         ConnectorError: The answer is malformed.

@@ -6,11 +6,11 @@ answers with Ack-Data (3), or with a bare Ack (2) that holds an error. S7 has no
 names follow Wireshark's dissector.
 
 The client of python-snap7 is not used. Its parsers are many times slower than one ``struct`` call
-per frame, and do not compare an answer with its request. Its encoders have no write of several
-items. In its connection each piece has a time-out of its own, so a peer that drips bytes is never
-late.
+per frame, and do not compare an answer with its request. Its encoders cannot write several items in
+one job. It starts a new time-out for each piece that it receives, so a peer that sends byte by byte
+never times out.
 
-Every parser here raises only ConnectorError, whatever bytes it is given.
+Every parser in this module raises only ConnectorError, for any input.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_error
 from shmio.errors import ConnectorError
 
 FRAME_OVERHEAD = 7  # TPKT 4, COTP DT 3
-READ_OVERHEAD = 18  # of an answer to a read within its PDU: header 12, parameters 2, item header 4
+READ_OVERHEAD = 18  # bytes of a read answer's PDU: header 12, parameters 2, item header 4
 READ_REQUEST_SIZE = 31
-REFERENCE_OFFSET = 11  # of the PDU reference in a frame
-MAX_BLOCK_SIZE = 65536  # of a standard data block; also, one byte a read, the number of references there are
+REFERENCE_OFFSET = 11  # offset of the PDU reference in a frame
+MAX_BLOCK_SIZE = 65536  # size of a standard data block; also the number of references, if each read has one byte
 
-WANTED_JOBS = 24  # four reads of a block of 2 kB at once, and some to spare; real controllers grant 1 to 16
+WANTED_JOBS = 24  # enough for four reads of a 2 kB block; real controllers grant 1 to 16
 WANTED_PDU_SIZE = 960
-MIN_PDU_SIZE = 64  # the smallest known controllers grant 240; less than this is not one
-DEFAULT_TPDU_SIZE = 65531  # if the peer names none: RFC 1006
+MIN_PDU_SIZE = 64  # the smallest known controllers grant 240; a peer that grants less than 64 is not a controller
+DEFAULT_TPDU_SIZE = 65531  # if the peer does not name a size: RFC 1006
 _TPDU_SIZE_CODE = 0x0A  # 2 ** 10
 
 _TPKT = struct.Struct(">BxH")
-_HEADER = struct.Struct(">4x 3s BB2x2xHH")  # what all S7 PDUs share
+_HEADER = struct.Struct(">4x 3s BB2x2xHH")  # the common header of all S7 PDUs
 _REQUEST = struct.Struct(">BBHHHH")  # protocol, ROSCTR, reserved, reference, length of parameters, length of data
-_ADDRESS = struct.Struct(">BBBBHHI")  # 18, 10, S7-Any; type, count, block; area and place in bits
+_ADDRESS = struct.Struct(">BBBBHHI")  # 18, 10, S7-Any; type, count, block; area and offset in bits
 _ITEM = struct.Struct(">BB BBH")
-_USUAL = struct.Struct(">4x 5s2x2x HHH 4sH")  # an answer to a read, cut so that what is always the same is in one piece
+_USUAL = struct.Struct(">4x 5s2x2x HHH 4sH")  # an answer to a read; the constant parts are one field each
 _USUAL_HEAD, _USUAL_ITEM = b"\x02\xf0\x80\x32\x03", b"\x04\x01\xff\x04"
-HEADER_END = 19  # of the headers of an answer to a job, after which its parameters begin
-USERDATA_END = 17  # the same of userdata, whose header has no error
+HEADER_END = 19  # end of the headers of an answer to a job; its parameters follow
+USERDATA_END = 17  # the same for userdata, whose header has no error code
 _ITEM_END = 25
 _COTP_DATA = b"\x02\xf0\x80"  # header length, DT, end of the message
 _COTP_CR, _COTP_CC, _COTP_DR, _COTP_DT = 0xE0, 0xD0, 0x80, 0xF0
 _ACK, _ACK_DATA = 2, 3
 READ, WRITE, _SETUP = 0x04, 0x05, 0xF0
 JOB, USERDATA = 1, 7
-"""ROSCTR of requests."""
+"""The values of ROSCTR in requests."""
 _DATA_BLOCK: Final = 0x84
 TYPE_BIT, TYPE_BYTE = 1, 2
 _BITS, _OCTETS = 0x04, 0x09  # transport sizes: whether an item's length counts bits or bytes
@@ -59,16 +59,16 @@ class Session(NamedTuple):
     """The session parameters that the controller granted."""
 
     pdu_size: int
-    """Size of the largest S7 PDU in bytes, header included."""
+    """Largest size of an S7 PDU in bytes, including its header."""
     jobs: int
-    """Requests that may be in flight at once."""
+    """Largest number of requests in flight."""
 
 
 class ReadAnswer(NamedTuple):
     """The answer to a read of one item."""
 
     code: int
-    """The item's return code. Only with ITEM_OK is there data."""
+    """The item's return code. There is data only if it is ITEM_OK."""
     data: memoryview
 
 
@@ -76,9 +76,11 @@ class ReadAnswer(NamedTuple):
 
 
 def frame_length(inbox: memoryview, start: int, longest: int) -> int:
-    """Return the length of the frame at ``start`` in bytes, at most ``longest``.
+    """Return the length in bytes of the frame at ``start``, whose first four bytes were received.
 
-    Four of its bytes are there.
+    Raises:
+        ConnectorError: It is not a frame, or is longer than ``longest`` bytes.
+
     """
     version, length = _TPKT.unpack_from(inbox, start)
     if version != 3:
@@ -90,13 +92,16 @@ def frame_length(inbox: memoryview, start: int, longest: int) -> int:
 
 
 def request(reference: int, parameters: bytes, data: bytes = b"", rosctr: int = JOB) -> bytes:
-    """Build a request with a PDU reference of 16 bits."""
+    """Return a request as a frame; ``reference`` has 16 bits."""
     header = _REQUEST.pack(0x32, rosctr, 0, reference, len(parameters), len(data))
     return _frame(_COTP_DATA + header + parameters + data)
 
 
 def address(db_number: int, place: int, count: int, kind: int = TYPE_BYTE) -> bytes:
-    """Encode the address of ``count`` bytes, or of a bit, in a data block. ``place`` is in bits."""
+    """Return the encoded address of ``count`` bytes or of one bit in a data block.
+
+    ``place`` is the offset in bits.
+    """
     return _ADDRESS.pack(0x12, 10, 0x10, kind, count, db_number, _DATA_BLOCK << 24 | place)
 
 
@@ -105,7 +110,7 @@ def _frame(payload: bytes) -> bytes:
 
 
 def reference_of(frame: memoryview) -> int:
-    """Return the reference of the request that an answer belongs to. Its parser checks the rest."""
+    """Return the reference of the request to which an answer belongs; check nothing else."""
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
         raise ConnectorError(f"answer of {len(frame)} bytes is too short")
@@ -115,7 +120,7 @@ def reference_of(frame: memoryview) -> int:
 def check_envelope(frame: memoryview) -> tuple[int, int, int]:
     """Check the common header of all S7 PDUs.
 
-    Return ROSCTR and the lengths of parameters and data.
+    Return ROSCTR and the lengths in bytes of parameters and data.
     """
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
@@ -123,17 +128,20 @@ def check_envelope(frame: memoryview) -> tuple[int, int, int]:
     cotp, protocol, kind, parameter_length, data_length = _HEADER.unpack_from(frame)
     if cotp != _COTP_DATA:
         _check_cotp(frame)
-        # With the TPDU size agreed on, no answer needs more than one TPDU.
-        raise ConnectorError("answer in several parts, though one holds it")
+        # The agreed TPDU size is large enough for any answer.
+        raise ConnectorError("answer in several TPDUs, though it fits into one")
     if protocol != 0x32:
         raise ConnectorError(f"the peer does not speak S7 (protocol 0x{protocol:02X}, expected 0x32)")
     return kind, parameter_length, data_length
 
 
 def check_answer(frame: memoryview) -> int:
-    """Check the headers of an answer to a job; return the length of its data.
+    """Check the headers of an answer to a job, and return the length of its data in bytes.
 
-    RefusedError: it holds an error.
+    Raises:
+        RefusedError: The header contains an error code.
+        ConnectorError: The header is malformed.
+
     """
     kind, parameter_length, data_length = check_envelope(frame)
     if kind not in {_ACK, _ACK_DATA}:
@@ -164,9 +172,9 @@ def _check_cotp(frame: memoryview) -> None:
 
 
 def connect_request(rack: int, slot: int) -> bytes:
-    """Build the COTP connection request to a CPU.
+    """Return the COTP connection request to a CPU.
 
-    The called TSAP is (programming device, rack and slot).
+    The called TSAP contains the connection type (programming device), and rack and slot.
     """
     tsaps = struct.pack(">BBH BBBB BBB", 0xC1, 2, 0x0100, 0xC2, 2, 0x01, rack << 5 | slot, 0xC0, 1, _TPDU_SIZE_CODE)
     head = struct.pack(">BBHHB", 6 + len(tsaps), _COTP_CR, 0, 1, 0)
@@ -174,7 +182,7 @@ def connect_request(rack: int, slot: int) -> bytes:
 
 
 def parse_connect_confirm(frame: memoryview) -> int:
-    """Check the answer to a connection request; return the size of the largest TPDU in bytes."""
+    """Check the answer to a connection request, and return the largest TPDU size in bytes."""
     if frame[5] == _COTP_DR:
         raise ConnectorError("the controller refused the session")
     if frame[5] != _COTP_CC or len(frame) < 11:
@@ -189,22 +197,22 @@ def parse_connect_confirm(frame: memoryview) -> int:
         if code == 0xC0 and length == 1:
             exponent = frame[position + 2]
             if not 7 <= exponent <= 16:
-                raise ConnectorError(f"TPDU size code {exponent} is not one")
+                raise ConnectorError(f"TPDU size code {exponent} is invalid")
             return int(min(1 << exponent, DEFAULT_TPDU_SIZE))
         position += 2 + length
     return DEFAULT_TPDU_SIZE
 
 
 def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
-    """Build "setup communication", which asks for parallel jobs and a PDU size in bytes."""
+    """Return the request "setup communication", for so many parallel jobs and a PDU size in bytes."""
     return request(reference, struct.pack(">BBHHH", _SETUP, 0, jobs, jobs, pdu_size))
 
 
 def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Session:
-    """Return what the controller grants, never more than was asked."""
+    """Return the session that the controller grants, limited to what was requested."""
     data_length = check_answer(frame)
     if (answered := reference_of(frame)) != reference:
-        raise ConnectorError(f"answer to a request that was not made (reference {answered})")
+        raise ConnectorError(f"answer to a request that was not sent (reference {answered})")
     if len(frame) != HEADER_END + 8 or data_length or frame[HEADER_END] != _SETUP:
         raise ConnectorError("not an answer to 'setup communication'")
     calling, called, pdu_size = struct.unpack_from(">HHH", frame, HEADER_END + 2)
@@ -217,7 +225,7 @@ def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Ses
 
 
 def read_request(reference: int, items: Sequence[bytes]) -> bytes:
-    """Build a read of the items at these addresses."""
+    """Return a request that reads the items at these addresses."""
     return request(reference, bytes((READ, len(items))) + b"".join(items))
 
 
@@ -230,7 +238,7 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
 
     """
     if len(frame) >= _ITEM_END:
-        # Nearly all answers look like this; others are parsed by field below, to say what is wrong.
+        # Nearly all answers have this form. Others are parsed field by field, for a precise error.
         head, parameter_length, data_length, error, item, bits = _USUAL.unpack_from(frame)
         if (
             head == _USUAL_HEAD
@@ -256,7 +264,7 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
         length >>= 3
     elif transport != _OCTETS:
         raise ConnectorError(f"data of transport size 0x{transport:02X}, length {length}; bytes were asked for")
-    # Some servers pad an odd length, though only items that others follow need it.
+    # Some servers pad data of odd length, although only items before the last one need padding.
     if len(frame) - _ITEM_END not in {length, length + (length & 1)}:
-        raise ConnectorError(f"answer with {len(frame) - _ITEM_END} bytes of data names {length}")
+        raise ConnectorError(f"answer with {len(frame) - _ITEM_END} bytes of data, its header says {length}")
     return ReadAnswer(code, frame[_ITEM_END : _ITEM_END + length])

@@ -1,8 +1,8 @@
 """The TCP connection to a controller, and the window of requests in flight on it.
 
-Every wait is bounded by a deadline. Reads of the block, writes and the mode query share the
-connection and the jobs that the controller granted. Every request has its own reference, and each
-answer is taken once by the operation that asked, or not at all.
+Every wait has a deadline. Reads of the block, writes and the mode query share the connection and
+the number of jobs that the controller granted. Every request has a unique reference, and each
+answer is passed once, to the operation whose request has its reference.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from shmio.errors import ConnectorError
 class Transport:
     """One TCP connection.
 
-    Deadlines are ns of CLOCK_MONOTONIC; ``select`` keeps them to about 0.1 ms.
+    Deadlines are in ns of CLOCK_MONOTONIC, and are met to about 0.1 ms.
     """
 
     def __init__(self, host: str, port: int, timeout_ns: int) -> None:
-        """Connect within ``timeout_ns``, plus the host name lookup; OSError if nothing answers."""
+        """Connect within ``timeout_ns`` plus the host name lookup; raise OSError on failure."""
         places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         self.deadline_ns = time.monotonic_ns() + timeout_ns
-        """When ``timeout_ns`` is over."""
+        """Time at which ``timeout_ns`` has passed, in ns of CLOCK_MONOTONIC."""
         for attempt, (family, kind, protocol, _, address) in enumerate(places, 1):
             self._socket = socket.socket(family, kind, protocol)
             try:
@@ -43,17 +43,17 @@ class Transport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setblocking(False)
         self.taken = 0
-        """Bytes of the last ``send`` that the kernel has taken, also when it failed."""
-        self.reserve(1, 512)  # more than any connection confirm
+        """Number of bytes of the last ``send`` that the kernel accepted, also if ``send`` failed."""
+        self.reserve(1, 512)  # longer than any connection confirm
 
     def reserve(self, frames: int, longest: int) -> None:
-        """Reserve room for ``frames`` frames of at most ``longest`` bytes.
+        """Allocate a buffer for ``frames`` frames of at most ``longest`` bytes.
 
-        All received frames must be taken.
+        Take all received frames before.
         """
         self._longest = longest
         self._inbox = memoryview(bytearray(frames * longest))
-        self._start = self._end = 0  # of the bytes received, but not yet taken
+        self._start = self._end = 0  # range of the bytes received, but not yet taken
 
     @property
     def left(self) -> int:
@@ -61,9 +61,9 @@ class Transport:
         return self._end - self._start
 
     def send(self, data: bytes | memoryview, deadline_ns: int) -> None:
-        """Send all of ``data``; TimeoutError if the peer does not take it in time.
+        """Send all of ``data``; raise TimeoutError if the peer does not accept it in time.
 
-        The kernel buffers the answers that come meanwhile; with so few requests in flight they fit.
+        The kernel buffers answers that come meanwhile; its buffer suffices for so few requests.
         """
         self.taken = 0
         with suppress(BlockingIOError):
@@ -75,9 +75,9 @@ class Transport:
             self.taken += self._socket.send(data[self.taken :])
 
     def receive(self, until_ns: int) -> bool:
-        """Receive what the socket has, waiting until ``until_ns``; return False if nothing came.
+        """Wait for data until ``until_ns``, and receive it. Return False if nothing came.
 
-        Take all whole frames before the next call, so that there is always room.
+        Take all whole frames before the next call, so that there is room in the buffer.
 
         Raises:
             EOFError: The peer closed the connection.
@@ -97,10 +97,7 @@ class Transport:
         return True
 
     def frame(self) -> memoryview | None:
-        """Take the next whole frame; None if there is none.
-
-        It is valid until the next ``receive``.
-        """
+        """Return the next whole frame; None if there is none. It is valid until ``receive``."""
         if self._end - self._start < 4:
             return None
         length = pdu.frame_length(self._inbox, self._start, self._longest)
@@ -111,14 +108,14 @@ class Transport:
         return frame
 
     def next_frame(self, deadline_ns: int) -> memoryview:
-        """Wait for a whole frame; TimeoutError if it does not come in time."""
+        """Wait for a whole frame and return it; raise TimeoutError if it does not come in time."""
         while (frame := self.frame()) is None:
             if not self.receive(deadline_ns):
                 raise TimeoutError
         return frame
 
     def close(self) -> None:
-        """Close the socket. In class 0 of the transport protocol this ends the session."""
+        """Close the socket, which also ends the session."""
         self._socket.close()
 
 
@@ -127,18 +124,18 @@ def _left_s(until_ns: int) -> float:
 
 
 class Operation(Protocol):
-    """A group of requests with a common result."""
+    """A group of requests that together have one result, such as the read of a block."""
 
     @property
     def count(self) -> int:
-        """Number of requests in all."""
+        """Total number of requests."""
 
     sent: int
     """Number of requests that ``take`` has returned."""
 
     @property
     def complete(self) -> bool:
-        """Whether no more answers are expected."""
+        """True if no more answers are expected."""
 
     def take(self, count: int, first: int) -> bytes | memoryview:
         """Return the next ``count`` requests as frames, with references from ``first`` on.
@@ -147,13 +144,13 @@ class Operation(Protocol):
         """
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Take the answer to request ``index``; ConnectorError if it does not match."""
+        """Process the answer to request ``index``; raise ConnectorError if it does not match."""
 
 
 class Window:
-    """Keeps at most ``jobs`` requests in flight, and matches answers to them. No I/O.
+    """Limits the requests in flight to ``jobs``, and matches answers to them. No I/O.
 
-    References count from ``reference`` and wrap after 65535.
+    References start at ``reference`` and wrap after 65535.
     """
 
     def __init__(self, jobs: int, reference: int) -> None:
@@ -161,27 +158,27 @@ class Window:
         self.reference = reference
         self._queue: deque[Operation] = deque()
         self._under_way: dict[int, tuple[Operation, int]] = {}
-        self._given: list[tuple[Operation, int]] = []  # from the last ``due``: operations, each with its first request
+        self._given: list[tuple[Operation, int]] = []  # by the last ``due``: operations, each with its first request
 
     @property
     def idle(self) -> bool:
-        """Whether no answer is outstanding."""
+        """True if no request is in flight."""
         return not self._under_way
 
     @property
     def waiting(self) -> bool:
-        """Whether requests wait to be sent."""
+        """True if requests wait to be sent."""
         return bool(self._queue)
 
     def add(self, operation: Operation, *, urgent: bool = False) -> None:
-        """Queue the requests of an operation, before all others if ``urgent``."""
+        """Queue the requests of an operation; if ``urgent``, in front of all others."""
         if urgent:
             self._queue.appendleft(operation)
         else:
             self._queue.append(operation)
 
     def due(self) -> bytes | memoryview:
-        """Return the requests that may be sent now; empty if there are none."""
+        """Return the requests to send now, in one piece; empty if there are none."""
         parts: list[bytes | memoryview] = []
         self._given.clear()
         while self._queue and (free := self.jobs - len(self._under_way)) > 0:
@@ -197,18 +194,20 @@ class Window:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def take_back(self) -> None:
-        """Mark the requests that ``due`` returned last as unsent.
-
-        Call it when the connection was lost.
-        """
+        """Mark the requests that ``due`` returned last as unsent, after the connection was lost."""
         for operation, begin in self._given:
             operation.sent = begin
 
     def accept(self, frame: memoryview) -> None:
-        """Pass an answer to the operation that asked; ConnectorError if none did."""
+        """Pass an answer to the operation that sent the request.
+
+        Raises:
+            ConnectorError: No request in flight has the answer's reference.
+
+        """
         reference = pdu.reference_of(frame)
         owner = self._under_way.pop(reference, None)
         if owner is None:
-            pdu.check_answer(frame)  # a clearer reason, if it is not even an answer
-            raise ConnectorError(f"answer to a request that is not under way (reference {reference})")
+            pdu.check_answer(frame)  # raises a more precise error if it is not an answer
+            raise ConnectorError(f"answer to a request that is not in flight (reference {reference})")
         owner[0].accept(owner[1], frame)

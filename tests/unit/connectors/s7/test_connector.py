@@ -228,7 +228,7 @@ def test_late_answer_is_never_used_for_the_next_request(plc: Plc) -> None:
     client.connect()
     plc.block[:] = bytes(SIZE)
     plc.proxy.release()  # the old answers, on the new connection
-    with pytest.raises(ConnectorError, match="not under way"):
+    with pytest.raises(ConnectorError, match="not in flight"):
         client.read()
     assert_recovers(plc, client)
 
@@ -237,7 +237,7 @@ def test_wrong_reference(plc: Plc) -> None:
     client = plc.client()
     client.connect()
     plc.proxy.rewrite_reference(lambda reference: reference + 100)
-    with pytest.raises(ConnectorError, match="not under way"):
+    with pytest.raises(ConnectorError, match="not in flight"):
         client.read()
     assert_recovers(plc, client)
 
@@ -246,7 +246,7 @@ def test_answer_sent_twice(plc: Plc) -> None:
     client = plc.client(packetSize=96)
     client.connect()
     plc.proxy.edit(lambda frame: frame * 2, frames=1)
-    with pytest.raises(ConnectorError, match="not under way"):
+    with pytest.raises(ConnectorError, match="not in flight"):
         client.read()
     assert_recovers(plc, client)
 

@@ -157,7 +157,7 @@ def test_an_answer_of_a_read_that_is_complete_is_refused(wide: Plc) -> None:
         image(client)
         image(client)
 
-    with pytest.raises(ConnectorError, match="not under way"):
+    with pytest.raises(ConnectorError, match="not in flight"):
         both()
     assert_recovers(wide, client)
 
@@ -180,7 +180,7 @@ def test_the_connection_is_lost_with_reads_under_way(wide: Plc) -> None:
 
 def test_too_many_or_no_reads_under_way_are_errors_of_the_caller(wide: Plc) -> None:
     client = wide.connected(maxJobs=5)
-    with pytest.raises(RuntimeError, match="no read is under way"):
+    with pytest.raises(RuntimeError, match="no read is in flight"):
         client.collect(in_ns(10))
     client.submit()
     with pytest.raises(RuntimeError, match="no more than 1 "):

@@ -136,7 +136,7 @@ def test_controller_that_refuses_writes(make_plc: MakePlc, fault: Fault, text: s
 def test_an_answer_to_another_request(plc: Plc) -> None:
     client = plc.connected()
     plc.proxy.rewrite_reference(lambda reference: reference + 100)
-    with pytest.raises(ConnectorError, match="not under way"):
+    with pytest.raises(ConnectorError, match="not in flight"):
         client.write([Write(0, 0, b"x")])
     assert_recovers(plc, client)
 
@@ -162,7 +162,7 @@ def test_late_answer_is_never_used_for_the_next_request(plc: Plc) -> None:
     plc.proxy.edit(lambda frame: frame)  # pass the new session, keep the held answer
     client.connect()
     plc.proxy.release()  # the old confirmation, on the new connection
-    with pytest.raises(ConnectorError, match="not under way"):
+    with pytest.raises(ConnectorError, match="not in flight"):
         client.write([Write(SIZE, 0, b"y")])  # this write would be refused
     assert_recovers(plc, client)
 

@@ -70,7 +70,7 @@ def test_unexpected_answers_are_refused() -> None:
     window.due()
     window.accept(frame(10))
     for reference in (10, 9, 12, 65535):  # answered, older, not sent, never
-        with pytest.raises(ConnectorError, match=rf"not under way \(reference {reference}\)"):
+        with pytest.raises(ConnectorError, match=rf"not in flight \(reference {reference}\)"):
             window.accept(frame(reference))
     with pytest.raises(ConnectorError, match="PUT/GET"):  # its error says more than that it is unexpected
         window.accept(frame(77, error=0x8104))
