@@ -1,7 +1,4 @@
-"""The meaning of a declared injection: target, condition, operation and activation.
-
-Pure, no I/O.
-"""
+"""Compiles and evaluates declared injections: targets, conditions, operations, activation. No I/O."""
 
 from shmio.injection.program import Program, compile_program
 

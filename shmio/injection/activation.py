@@ -1,8 +1,8 @@
 """Decides when a declared injection is active.
 
-It is active between two times, while a condition holds, or for some time after that. York's
-metamodel of tests calls these activation at a fixed time, on a condition, and on a condition for a
-limited time.
+It is active between two times, while a condition is true, or for some time after a condition became
+true. The testing metamodel of the University of York calls these activation at a fixed time, on a
+condition, and on a condition for a limited time.
 """
 
 from __future__ import annotations
@@ -17,14 +17,18 @@ class State(StrEnum):
     WAITING = "waiting"
     ACTIVE = "active"
     OVER = "over"
-    """It cannot become active again."""
+    """The injection cannot become active again."""
     LIFTED = "lifted"
-    """It was lifted, but the configuration still has it."""
+    """A client has lifted the injection, which is still in the configuration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Time limits in ns on the instance clock, per activation, and for their number."""
+    """Limits on when, how long and how often an injection is active.
+
+    ``start_ns`` and ``end_ns`` are instance times. ``for_ns`` is the length of each activation, and
+    ``times`` the largest number of activations. None is no limit.
+    """
 
     start_ns: int = 0
     end_ns: int | None = None
@@ -34,9 +38,10 @@ class Window:
 
 @dataclass(slots=True)
 class Activation:
-    """The activation state.
+    """The state of an injection's activation.
 
-    ``runs`` counts activations; ``cycle`` and ``time_ns`` are when the last one began.
+    ``runs`` is the number of activations so far. ``cycle`` and ``time_ns`` are the cycle and the
+    instance time at which the last activation began.
     """
 
     window: Window
@@ -45,15 +50,18 @@ class Activation:
     cycle: int = 0
     time_ns: int = 0
     met: bool | None = None
-    """Whether the condition and the window held at the last cycle; None before the first."""
+    """True if the last cycle was in the window and its condition was true.
+
+    None before the first cycle.
+    """
 
     def advance(self, time_ns: int, cycle: int, *, holds: bool) -> bool:
-        """Advance to a cycle; return whether the state has changed.
+        """Update the state for a cycle, and return whether it has changed.
 
         Args:
             time_ns: The instance time of the cycle.
-            cycle: The cycle.
-            holds: Whether the condition holds; True without a condition.
+            cycle: The number of the cycle.
+            holds: True if the condition is true, or there is no condition.
 
         """
         if self.state in (State.OVER, State.LIFTED):
@@ -73,10 +81,10 @@ class Activation:
         return self.state is not before
 
     def _begins(self) -> bool:
-        """Return whether the injection becomes active, given that its condition holds.
+        """Return whether a waiting injection becomes active now that its condition is true.
 
-        With ``for_ns`` it does when the condition becomes true. A restarted process does not know
-        the earlier value of the condition, so there it does not become active at once.
+        With ``for_ns``, it becomes active only when the condition changes from false to true. A
+        restarted process does not know the previous value, so it waits for the next such change.
         """
         if self.window.for_ns is None:
             return True

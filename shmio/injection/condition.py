@@ -1,4 +1,6 @@
-"""Conditions: a small language over registers, read by our own parser, evaluated without ``eval``.
+"""Parses and evaluates conditions over registers, without Python's ``eval``.
+
+Two examples and the grammar:
 
 ::
 
@@ -14,8 +16,9 @@
     factor = "-" factor | number | "true" | "false" | register | "(" expression ")"
            | ("abs" | "rising" | "falling" | "changed") "(" expression ")"
 
-A register is a path. Put it in quotes if it has other characters than letters, digits and ``_ . / % :``. A path may
-contain ``/``, so put blanks around the ``/`` of a division. Numbers are as in S7: ``16#FF``, ``2#1010``, ``1.5e3``.
+A register is a path. Put it in quotes if it has characters other than letters, digits and
+``_ . / % :``. A path may contain ``/``, so put blanks around the ``/`` of a division. Numbers are
+written as in S7: ``16#FF``, ``2#1010``, ``1.5e3``.
 """
 
 from __future__ import annotations
@@ -70,38 +73,38 @@ _EDGES: Final[dict[str, Callable[[Number, Number], bool]]] = {
 
 _Stack = list[Number]
 _Seen = dict[int, Number]
-"""The last value of each edge function, by its place in the program."""
+"""The last value of each edge function's argument, by the function's index in the expression."""
 _Step = Callable[[_Stack, Sequence[Number], _Seen], None]
 
 
 @dataclass
 class Memory:
-    """The last values of an expression's edge functions.
+    """The last arguments of the edge functions (rising, falling, changed) of an expression.
 
-    Empty at first, and after a value was unknown.
+    It is empty at first, and after a value was unknown.
     """
 
     seen: _Seen = field(default_factory=dict)
 
 
 class Expression(NamedTuple):
-    """A program for a stack machine.
+    """A parsed condition, as a program for a stack machine.
 
-    Every part is evaluated each time, so that no edge is missed.
+    Every operand is evaluated each time, also of ``and`` and ``or``, so that no edge is missed.
     """
 
     steps: tuple[_Step, ...]
     references: tuple[str, ...]
-    """The registers that it reads, as written."""
+    """The registers that the expression reads, as written."""
 
     def holds(self, values: Sequence[Number | None], memory: Memory) -> bool:
         """Return whether the expression is true.
 
-        It is false if a value is unknown, or on a division by zero.
+        The result is False if a value is unknown, or after a division by zero.
 
         Args:
-            values: One value for each reference; None if it is unknown.
-            memory: The last values of the edge functions.
+            values: The value of each reference; None if it is unknown.
+            memory: The last arguments of the edge functions. They are updated.
 
         """
         known = [value for value in values if value is not None]
@@ -118,14 +121,19 @@ class Expression(NamedTuple):
 
 
 def parse(text: str) -> Expression:
-    """Parse an expression; ConfigError names the place of an error."""
+    """Parse a condition.
+
+    Raises:
+        ConfigError: The text is invalid. The message names the character.
+
+    """
     if len(text) > MAX_LENGTH:
         raise ConfigError(f"a condition is at most {MAX_LENGTH} characters long, this has {len(text)}")
     return _Parser(text).whole()
 
 
 class _Parser:
-    """A recursive-descent parser, from the loosest binding to the tightest."""
+    """A recursive-descent parser with a method for each rule of the grammar."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -142,7 +150,7 @@ class _Parser:
         return Expression(tuple(self._steps), tuple(self._references))
 
     def _advance(self) -> None:
-        """Read the next token: its kind (empty at the end) and its text, keywords in lower case."""
+        """Read the next token: its kind (empty at the end) and its text (keywords in lower case)."""
         self._start = self._at
         rest = self._text[self._at :]
         if not rest.strip():
@@ -171,7 +179,7 @@ class _Parser:
         self._steps.append(step)
 
     def _chain(self, operand: Callable[[], None], operators: _Operators) -> None:
-        """Read operands and the operators between them, which bind to the left."""
+        """Parse operands with left-associative operators between them."""
         operand()
         while self._is(*operators):
             function = operators[self._word]
@@ -260,7 +268,7 @@ class _Parser:
         return float(digits) if set(digits) & set(".eE") else int(digits)
 
 
-# -- what a step does with the stack ---------------------------------------------------------------------------------
+# -- steps of the stack machine --------------------------------------------------------------------------------------
 
 
 def _push(number: Number) -> _Step:

@@ -1,8 +1,8 @@
 """Random numbers that depend only on a seed and their purpose.
 
-They are counter-based: there is no state that an extra frame or a restarted process could shift.
-The mixing function is that of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number
-generators", OOPSLA 2014).
+Each number is computed from counters, without state. So an extra frame or a restarted process does
+not change later numbers. The mixing function is that of SplitMix64 (Steele, Lea, Flood: "Fast
+splittable pseudorandom number generators", OOPSLA 2014).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Words = npt.NDArray[np.uint64]
 Floats = npt.NDArray[np.float64]
 
 FEW: Final = 16
-"""Up to this count Python is faster than numpy.
+"""Up to this count, plain Python is faster than numpy.
 
-Both give the same numbers except a gaussian's last bit.
+Both compute the same numbers, except for the last bit of a gaussian number.
 """
 
 _MASK: Final = (1 << 64) - 1
@@ -30,7 +30,7 @@ _FIRST, _SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 
 
 class Purpose(IntEnum):
-    """The purpose of random numbers; each has its own sequence."""
+    """The purpose of a random number; each purpose has a separate sequence."""
 
     CHANCE = 0
     VALUE = 1
@@ -38,17 +38,18 @@ class Purpose(IntEnum):
 
 
 class SeededRandom:
-    """The random numbers of one injection.
+    """Generates the random numbers of one injection.
 
-    ``run`` is the activation, and ``place`` the cycle or write within it.
+    In all methods, ``run`` is the number of the activation, and ``place`` the number of the cycle
+    or write in this activation. The same arguments always give the same numbers.
     """
 
     def __init__(self, seed: int, name: str) -> None:
-        """Create the generator; ``name`` separates injections with the same seed."""
+        """Create the generator; with the same seed, each ``name`` has different numbers."""
         self._key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
 
     def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
-        """Return ``count`` random words of 64 bits."""
+        """Return ``count`` random integers of 64 bits, (count,) of uint64."""
         if count <= FEW:
             return np.array(self._few(run, place, purpose, count), np.uint64)
         base = self._base(run, place, purpose)
@@ -56,13 +57,16 @@ class SeededRandom:
         return _mix_all(counter * np.uint64(_GOLDEN) + np.full(count, base, np.uint64))
 
     def uniform(self, run: int, place: int, count: int, purpose: Purpose = Purpose.VALUE) -> Floats:
-        """Return ``count`` numbers from 0 to below 1."""
+        """Return ``count`` random numbers x with 0 <= x < 1."""
         if count <= FEW:
             return np.array([(word >> 11) * 2.0**-53 for word in self._few(run, place, purpose, count)])
         return (self.words(run, place, purpose, count) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
     def gaussian(self, run: int, place: int, count: int) -> Floats:
-        """Return ``count`` numbers of mean 0 and standard deviation 1 (Box and Muller, 1958)."""
+        """Return ``count`` normally distributed numbers of mean 0 and standard deviation 1.
+
+        The method is that of Box and Muller, 1958.
+        """
         if count <= FEW:
             radii = (1 - (word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.VALUE, count))
             angles = ((word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.ANGLE, count))
@@ -81,12 +85,12 @@ class SeededRandom:
         return [_mix_word(base + number * _GOLDEN & _MASK) for number in range(1, count + 1)]
 
     def below(self, limit: int, run: int, place: int, count: int) -> npt.NDArray[np.intp]:
-        """Return ``count`` whole numbers from 0 to below ``limit``, which is at most 2^32."""
+        """Return ``count`` random integers x with 0 <= x < ``limit``, which is at most 2^32."""
         high = self.words(run, place, Purpose.VALUE, count) >> np.uint64(32)
         return (high * np.uint64(limit) >> np.uint64(32)).astype(np.intp)
 
     def happens(self, probability: float, run: int, place: int) -> bool:
-        """Return whether an event of this probability happens there."""
+        """Return True with this probability, from 0 to 1."""
         return probability >= 1 or bool(self.uniform(run, place, 1, Purpose.CHANCE)[0] < probability)
 
 

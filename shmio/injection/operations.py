@@ -1,8 +1,8 @@
-"""The operations of declared injections: the table in docs/reference/injections.md.
+"""The operations of declared injections, as listed in docs/reference/injections.md.
 
-An operation works on images of the whole block, (size,) of uint8, in which a ``ValueGroup`` reads
-and writes all values of one type at once. Its state starts anew with each activation, and applying
-it twice in a cycle gives the same result.
+An operation changes images of the whole block, (size,) of uint8. A ``ValueGroup`` reads and writes
+all values of one type in an image at once. Each activation resets the state of the operation.
+Applying an operation twice in a cycle gives the same result.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from shmio.layout.values.codec import REAL_MAX, scalar_codec
 Bytes = npt.NDArray[np.uint8]
 Values = npt.NDArray[Any]
 _MAX_ELEMENTS: Final = 4096
-"""Most single values of one injection; more would slow the poll loop."""
+"""The largest number of single values in one injection; more would slow the poll loop."""
 MAX_DELAY_CYCLES: Final = 10_000
 MAX_DELAY_BYTES: Final = 16_000_000
-"""Most memory for the images that one delay holds."""
+"""The largest number of bytes in the images that one ``delay`` stores."""
 _REAL_LIMIT: Final = float(np.float32(REAL_MAX))
 _NUMPY: Final = {
     "b": "i1", "B": "u1", "h": "i2", "H": "u2", "i": "i4", "I": "u4", "q": "i8", "Q": "u8", "f": "f4", "d": "f8",
@@ -39,26 +39,26 @@ _NUMPY: Final = {
 
 @dataclass(frozen=True)
 class ValueGroup:
-    """All single values of one type.
+    """All single values of one type in an injection's target.
 
-    ``first`` is the number of the first among those of the injection.
+    ``first`` is the index of the first of these values among all values of the injection.
     """
 
     element: ElementType
     first: int
     index: npt.NDArray[np.intp]
-    """Offsets of the values' bytes in the block, (n, size); for bits (n,)."""
+    """Offsets of the values' bytes in the block, (n, size); (n,) for bits."""
     shifts: Bytes
-    """For bits, the bit number within the byte, (n,)."""
+    """The number of each bit in its byte, (n,); used only for bits."""
     dtype: np.dtype[Any]
-    """The type as in the controller; of kind V if it is not a number."""
+    """The numpy type of the values in the image; of kind V if they are not numbers."""
 
     def __len__(self) -> int:
         return len(self.index)
 
     @cached_property
     def limits(self) -> tuple[Any, Any]:
-        """The least and the greatest number, in the type used for calculations."""
+        """The smallest and the largest number of the type, in the type used for calculations."""
         if self.dtype.kind == "f":
             most = _REAL_LIMIT if self.dtype.itemsize == 4 else float(np.finfo(np.float64).max)
             return -most, most
@@ -66,24 +66,31 @@ class ValueGroup:
         return exact(bounds.min), exact(bounds.max)
 
     def numbers(self, image: Bytes) -> Values:
-        """Return the values, 64-bit ones as long doubles because a double would lose digits."""
+        """Return the values, (n,) of float64.
+
+        64-bit integers are returned as long doubles, because a double would lose digits.
+        """
         exact = np.longdouble if self.dtype.kind in "iu" and self.dtype.itemsize == 8 else np.float64
         return np.ascontiguousarray(image[self.index]).view(self.dtype)[:, 0].astype(exact)
 
     def put_numbers(self, image: Bytes, values: Values) -> None:
-        """Put numbers into an image, rounded for integers and clamped to the range of the type."""
+        """Write numbers into an image; round them for integers, and clamp them to the type's range."""
         least, most = self.limits
         if self.dtype.kind != "f":
             values = np.rint(values)
-            if self.dtype.itemsize == 8:  # its limits are not exact as doubles
+            if self.dtype.itemsize == 8:  # a double cannot represent the limits exactly
                 values = values.astype(np.longdouble)
         fitting = np.minimum(np.maximum(values, least), most).astype(self.dtype)
         image[self.index] = fitting.view(np.uint8).reshape(self.index.shape)
 
     def put(self, image: Bytes, table: Bytes, choice: npt.NDArray[np.intp]) -> None:
-        """Put values of a table (k, size) into an image; ``choice`` (n,) selects a row for each element.
+        """Write encoded values into an image.
 
-        Bits are 0 or 1.
+        Args:
+            image: The image.
+            table: The values to choose from, (k, size); bits are 0 or 1.
+            choice: The row of ``table`` for each value of the group, (n,).
+
         """
         if self.element.base != "BOOL":
             image[self.index] = table[choice]
@@ -98,7 +105,7 @@ class ValueGroup:
 
 
 _Change = Callable[[ValueGroup, Values], Values]
-"""Computes new values from the old ones."""
+"""Returns new values for the present ones."""
 
 
 def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGroup]:
@@ -131,7 +138,7 @@ def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGr
 
 
 def _number_type(element: ElementType, byte_order: ByteOrder) -> np.dtype[Any]:
-    """Return the numpy type of a number as in the controller; of kind V if it is not a number."""
+    """Return the numpy type of an element in the image; of kind V if it is not a number."""
     plain = "" if element.base == "BOOL" else scalar_codec(element, byte_order).plain
     kind = _NUMPY.get(plain, f"V{element.size}")
     return np.dtype(("<" if byte_order == "little" else ">") + kind)
@@ -141,9 +148,10 @@ def _number_type(element: ElementType, byte_order: ByteOrder) -> np.dtype[Any]:
 
 
 class OperationContext(NamedTuple):
-    """Identifies an image.
+    """Identifies the image or write to which an operation is applied.
 
-    ``run`` is the activation, and ``place`` the number of the cycle or write within it.
+    ``run`` is the number of the activation, and ``place`` the number of the cycle or write in it.
+    ``time_ns`` is the instance time.
     """
 
     run: int
@@ -153,24 +161,27 @@ class OperationContext(NamedTuple):
 
 
 class Operation(ABC):
-    """One operation with its state."""
+    """Base class of operations; an object has the state of one injection."""
 
-    def begin(self) -> None:  # noqa: B027  most hold nothing
-        """Forget all state, because an activation begins."""
+    def begin(self) -> None:  # noqa: B027  most operations have no state
+        """Reset all state, because an activation begins."""
 
     @abstractmethod
     def apply(self, image: Bytes, at: OperationContext) -> None:
-        """_Change the image in place. The caller keeps only the covered bits."""
+        """Change the image in place. The caller uses only the covered bits of the result."""
 
-    def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most need not know
-        """Called instead of :meth:`apply` if by chance this image stays unchanged."""
+    def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most operations have no state
+        """Record an image that stays unchanged; called instead of :meth:`apply`.
+
+        This happens if the injection has a probability.
+        """
 
     def resume(self, image: Bytes) -> None:  # noqa: B027
-        """Continue for a previous process, which published this image last."""
+        """Restore the state of the previous process, which published this image last."""
 
 
 class Fixed(Operation):
-    """``set``: the same values in each cycle."""
+    """``set``: replaces the values by fixed ones."""
 
     def __init__(self, values: Bytes) -> None:
         self._values = values
@@ -180,7 +191,7 @@ class Fixed(Operation):
 
 
 class Arithmetic(Operation):
-    """``offset``, ``scale``, ``clamp``: new numbers from the old ones."""
+    """``offset``, ``scale``, ``clamp``: computes a new number from each number."""
 
     def __init__(self, places: Sequence[ValueGroup], change: _Change) -> None:
         self._places = places
@@ -214,7 +225,10 @@ class Noise(Operation):
 
 
 class RandomRange(Operation):
-    """``random`` from a range; for whole numbers both ends are included."""
+    """``random`` with a range: replaces each number by a random one.
+
+    Integers may be equal to either end of the range.
+    """
 
     def __init__(self, places: Sequence[ValueGroup], draw: SeededRandom, least: float, most: float) -> None:
         self._places = places
@@ -235,10 +249,10 @@ class RandomRange(Operation):
 
 
 class RandomChoice(Operation):
-    """``random`` from a set."""
+    """``random`` with a list: replaces each value by a random one of the list."""
 
     def __init__(self, tables: Sequence[tuple[ValueGroup, Bytes]], draw: SeededRandom) -> None:
-        """Create it; ``tables`` holds the values (k, size) to choose from for each group."""
+        """Create the operation; ``tables`` has the values to choose from, (k, size), for each group."""
         self._tables = tables
         self._draw = draw
 
@@ -250,17 +264,17 @@ class RandomChoice(Operation):
 
 
 class Freeze(Operation):
-    """``freeze``: holds the first values of the activation."""
+    """``freeze``: shows the first values of the activation until it ends."""
 
     def __init__(self) -> None:
         self._held: Bytes | None = None
 
     def begin(self) -> None:
-        """Hold the next values."""
+        """Forget the frozen values; the next image's values are frozen."""
         self._held = None
 
     def resume(self, image: Bytes) -> None:
-        """Hold the values that the previous process held."""
+        """Freeze the values that the previous process showed last."""
         self._held = image.copy()
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
@@ -270,9 +284,9 @@ class Freeze(Operation):
 
 
 class Drop(Operation):
-    """``drop`` over ``/out``: a cycle's values are lost, and consumers keep the previous ones.
+    """``drop`` over ``/out``: drops the values of a cycle, so that readers see the previous ones.
 
-    The caller decides which cycles are lost, and reports the others by :meth:`passed`.
+    The caller calls :meth:`apply` for the cycles to drop, and :meth:`passed` for all others.
     """
 
     def __init__(self) -> None:
@@ -280,15 +294,15 @@ class Drop(Operation):
         self._passing: tuple[int, Bytes] | None = None
 
     def begin(self) -> None:
-        """Forget the held values; the next ones are shown because there are none before them."""
+        """Forget all values; the next ones are shown in any case, because there are none before."""
         self._held = self._passing = None
 
     def resume(self, image: Bytes) -> None:
-        """Hold the values that consumers saw last."""
+        """Restore the values that readers saw last."""
         self._held = image.copy()
 
     def passed(self, image: Bytes, at: OperationContext) -> None:
-        """Take a cycle that is not lost."""
+        """Record the values of a cycle that is not dropped."""
         self._settle(at.cycle)
         self._passing = at.cycle, image.copy()
 
@@ -299,15 +313,15 @@ class Drop(Operation):
         image[:] = self._held
 
     def _settle(self, cycle: int) -> None:
-        """Hold what an earlier cycle showed; a cycle may have several images."""
+        """Store the values to show if this cycle is dropped: the last image of an earlier cycle."""
         if self._passing is not None and self._passing[0] != cycle:
             self._held, self._passing = self._passing[1], None
 
 
 class Delay(Operation):
-    """``delay`` over ``/out``: consumers see what was delivered some time or cycles earlier.
+    """``delay`` over ``/out``: readers see the values from some time or some cycles earlier.
 
-    Until that time has passed since the activation they see its first values.
+    Until the activation has lasted that long, they see its first values.
     """
 
     def __init__(self, size: int, delay_ns: int, cycles: int) -> None:
@@ -325,7 +339,7 @@ class Delay(Operation):
         self._line: deque[tuple[int, int, Bytes]] = deque()
 
     def begin(self) -> None:
-        """Forget all images."""
+        """Forget all stored images."""
         self._line.clear()
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
@@ -339,17 +353,21 @@ class Delay(Operation):
         image[:] = self._line[0][2]
 
     def due(self, cycle: int, time_ns: int, at: OperationContext) -> bool:
-        """Return whether an image of that cycle and time is to be shown by now."""
+        """Return whether the delay of an image of that cycle and time is over at ``at``."""
         return at.cycle - cycle >= self.cycles if self.cycles else at.time_ns - time_ns >= self.delay_ns
 
 
 class Flip(Operation):
-    """``flip``: inverts the given bits, or a random one of all covered bits."""
+    """``flip``: inverts the given bits, or one random bit of all covered bits."""
 
     def __init__(self, mask: Bytes | None, cover: Bytes, draw: SeededRandom) -> None:
-        """Create it.
+        """Create the operation.
 
-        ``mask`` has the bits to invert, or is None for a random bit of ``cover`` each time.
+        Args:
+            mask: The bits to invert, (size,); None to invert a random bit in each cycle.
+            cover: The covered bits, (size,), from which the random bit is chosen.
+            draw: The source of randomness.
+
         """
         self._mask = mask
         self._draw = draw

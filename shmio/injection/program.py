@@ -1,4 +1,4 @@
-"""Compiles declarations: finds the registers of targets and conditions, and encodes values."""
+"""Compiles declared injections: finds the registers that they name, and encodes their values."""
 
 from __future__ import annotations
 
@@ -41,15 +41,18 @@ from shmio.layout.values.write import bits_of, chosen
 
 _NS: Final = 1_000_000_000
 MAX_REGISTERS: Final = 4096
-"""Most registers and elements in one target."""
+"""The largest number of registers and elements in one target."""
 _MAX_REFERENCES: Final = 64
 
 _Operate = Callable[[SeededRandom], Operation]
-"""Creates the operation with its source of random numbers."""
+"""Creates the operation; the argument is its source of random numbers."""
 
 
 class Target(NamedTuple):
-    """Distinct registers of one source in one direction. ``cover`` has their bits in the block."""
+    """The registers that an injection changes: of one source, in one direction, without overlap.
+
+    ``cover`` is an image of the block in which their bits are set.
+    """
 
     source: str
     direction: Direction
@@ -59,7 +62,7 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True)
 class Condition:
-    """An expression, with the source and the codec of each of its references."""
+    """A parsed condition, with the source and the codec of each register that it reads."""
 
     expression: Expression
     reads: tuple[tuple[str, RegisterCodec], ...]
@@ -82,13 +85,13 @@ class Program:
 
     @property
     def foreign(self) -> frozenset[str]:
-        """The other sources whose values the condition reads."""
+        """The names of the other sources that the condition reads."""
         reads = self.condition.reads if self.condition else ()
         return frozenset(source for source, _ in reads if source != self.source)
 
 
 def compile_program(declaration: Declaration, layouts: Mapping[str, Layout], periods_ns: Mapping[str, int]) -> Program:
-    """Compile a declaration: find everything that it names.
+    """Compile a declared injection.
 
     Args:
         declaration: The declared injection.
@@ -96,7 +99,7 @@ def compile_program(declaration: Declaration, layouts: Mapping[str, Layout], per
         periods_ns: The period of each source, in ns.
 
     Raises:
-        ConfigError: The declaration is wrong. The message begins with the key.
+        ConfigError: The declaration is invalid. The message begins with the key.
 
     """
     texts = [declaration.target] if isinstance(declaration.target, str) else declaration.target
@@ -117,10 +120,10 @@ def compile_program(declaration: Declaration, layouts: Mapping[str, Layout], per
 
 
 def compile_condition(text: str, layouts: Mapping[str, Layout]) -> Condition:
-    """Parse a condition and find its registers.
+    """Parse a condition, and find the registers that it reads.
 
     Raises:
-        ConfigError: The condition is wrong. The message begins with the key ``when``.
+        ConfigError: The condition is invalid. The message begins with the key ``when``.
 
     """
     try:
@@ -155,13 +158,13 @@ def _window(declaration: Declaration) -> Window:
 
 
 def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
-    """Return the target that several texts name together.
+    """Return the target that consists of the registers which the texts name.
 
-    A text is the path of a topic or a part of a register, a pattern, a structure or a whole source.
+    A text is the path of a register or of a part of it, a pattern, a structure or a whole source.
 
     Raises:
-        PathError: There is no such register, more than one source or direction, an overlap, or too
-            many registers.
+        PathError: A text names no register, the registers are of several sources or directions,
+            they overlap, or there are too many.
 
     """
     found: list[tuple[str, Direction, Register]] = []
@@ -169,7 +172,7 @@ def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
         found += _registers(text, layouts)
         if len(found) > MAX_REGISTERS:
             raise PathError(
-                f"{text}: more than {MAX_REGISTERS} registers and elements: lay several injections over parts of it"
+                f"{text}: more than {MAX_REGISTERS} registers and elements: declare several injections for parts of it"
             )
     places = {(source, direction) for source, direction, _ in found}
     if len(places) != 1:
@@ -194,7 +197,9 @@ def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
 def single(text: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
     """Return the source and the single register, element or part that a text names.
 
-    PathError if there is none.
+    Raises:
+        PathError: There is no such register, or the text names an input.
+
     """
     topic = parse_topic(text, layouts, _default(layouts))
     if topic.direction == "in":
@@ -239,9 +244,11 @@ def _set(declaration: Declaration, target: Target, layout: Layout, _period_ns: i
 
 
 def _encode(value: Any, key: str, register: Register, layout: Layout, image: bytearray) -> None:
-    """Put a value of the configuration into an image.
+    """Encode a value of the configuration into an image.
 
-    ConfigError if it does not fit the register.
+    Raises:
+        ConfigError: The value does not fit into the register. The message begins with ``key``.
+
     """
     try:
         if isinstance(value, str) and (register.dims or wire_type(register) != "string"):
@@ -297,7 +304,7 @@ def _random(declaration: Declaration, target: Target, layout: Layout, _period_ns
 
 
 def _table(values: list[Any], element: ElementType, layout: Layout) -> Bytes:
-    """Encode the values for one type, (k, size)."""
+    """Return the values, encoded for one type, (k, size)."""
     register = Register(element.name, element.name, (), 0, 0 if element.base == "BOOL" else None, element.size, 1)
     rows = []
     for index, value in enumerate(values):
@@ -321,7 +328,7 @@ def _delay(declaration: Declaration, _target: Target, layout: Layout, period_ns:
     held = cycles or -(-delay_ns // period_ns)
     most = min(MAX_DELAY_CYCLES, MAX_DELAY_BYTES // max(1, layout.size))
     if held > most:
-        raise ConfigError(f"{key}: {held} cycles of {layout.size} bytes, but a delay holds at most {most}")
+        raise ConfigError(f"{key}: {held} cycles of {layout.size} bytes, but a delay stores at most {most}")
     return lambda _draw: Delay(layout.size, delay_ns, cycles)
 
 
@@ -367,7 +374,7 @@ def _places(target: Target, layout: Layout) -> list[ValueGroup]:
 
 
 def _numbers(declaration: Declaration, target: Target, layout: Layout) -> list[ValueGroup]:
-    """Return the values of a target of numbers; ConfigError if it covers something else."""
+    """Return the values of a target; raise ConfigError if any of them is not a number."""
     for register in target.registers:
         if register.type == "BOOL" or not scalar_codec(register.element).plain:
             kinds = "numbers: REAL, LREAL, " + ", ".join(sorted(INTEGERS)) + ", TIME, LTIME"

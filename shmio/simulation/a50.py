@@ -1,13 +1,13 @@
-"""The A50 cell (D6.5, section 5.1): three robots, two engine test units, a conveyor for trolleys, a rack of frames.
+"""A model of the A50 cell (D6.5, section 5.1): three robots, two engine test units, a conveyor and a rack.
 
-The tables below say what moves when; all motion follows from the time alone. In a cycle, a trolley brings two
-engines and is clamped. Robot_825 and Robot_850 carry them to the test units, whose two actuators each grip. The
-units' axes run the test while Robot_800 fetches a frame from the rack. The engines go back, the frame is put on the
-trolley, and the trolley leaves. An operator, any client that writes the orders below, can pause the cell and drive its
-actuators by hand.
+All motion depends only on the time; the constants in this module say what moves when. In a cycle, a trolley brings two
+engines and is clamped. Robot_825 and Robot_850 carry the engines to the test units, where two actuators hold each of
+them. The axes of the units run the test, while Robot_800 fetches a frame from the rack. The robots carry the engines
+back and put the frame on the trolley, and the trolley leaves. Any client that writes the commands below can pause the
+cell and move its actuators by hand.
 
-The real cell's I/O assignment is not public. This one is shmio's own, in the first bytes of ``Inputs`` and
-``Outputs``; what follows, and the orders, are left as clients wrote them. Words are big-endian, bits of a byte count
+The real cell's I/O assignment is not public. This one was made for shmio. It uses the first bytes of ``Inputs`` and
+``Outputs``; the model does not change the other bytes or the commands. Words are big-endian, bits of a byte count
 from the lowest.
 
 ======  ===========================================================================================================
@@ -31,9 +31,9 @@ Outputs  controller to plant
 4        cycles finished, UDINT
 8, 9     valves of ``ACTUATORS`` in their order: one bit each
 10 - 12  Robot_800, Robot_825, Robot_850: drives on, task runs, work space released
-13       order: hold, which stops all motion where it is until it is taken back
-14, 15   order: valves of ``ACTUATORS`` to be open whatever the step says; the drive is at its end at once
-16, 17   order: valves to be closed, likewise; it wins over the one before
+13       command: hold; all motion stops while bit 0 is set
+14, 15   command: valves of ``ACTUATORS`` to open in every step; the drive reaches its end at once
+16, 17   command: valves to close in every step, likewise; it overrides the command to open
 =======  ==========================================================================================================
 """
 
@@ -51,28 +51,28 @@ from shmio.simulation.model import InOut, Model, Output
 Pose = tuple[float, ...]
 
 _BREATH_PERIOD_S = 2.2
-_BREATH_SPREAD_S = 0.31  # between neighbouring axes, so that they do not move in step
+_BREATH_SPREAD_S = 0.31  # difference between neighbouring axes, so that they do not move in phase
 
 
 def smooth(u: float) -> float:
-    """Return a smooth step from 0 to 1: at rest at both ends, clamped outside."""
+    """Return a smooth transition from 0 (for u <= 0) to 1 (for u >= 1), with slope 0 at both ends."""
     u = min(max(u, 0.0), 1.0)
     return u * u * (3 - 2 * u)
 
 
 class Track:
-    """A cyclic path of several axes. Between key poses all axes start and stop together.
+    """A cyclic motion of several axes through key poses; all axes start and stop together.
 
-    A slow sine on top of ``smooth``, the play of a servo loop, changes the value of an axis at rest
-    too.
+    A slow sine of small amplitude is added, like the play of a servo loop. So the value of an axis
+    changes even while it rests.
     """
 
     def __init__(self, keys: Sequence[tuple[float, Pose]], cycle_s: float, breath: float) -> None:
         """Create the track.
 
         Args:
-            keys: Times in the cycle in s with their key poses, in order; the last leads to the
-                first of the next cycle.
+            keys: The key poses with their times in the cycle in s, in order. From the last one, the
+                axes move to the first one of the next cycle.
             cycle_s: The length of the cycle in s.
             breath: The amplitude of the sine, in the unit of the axes.
 
@@ -89,7 +89,7 @@ class Track:
         return self._poses[index] if self._poses[index] == self._poses[index + 1] else None
 
     def pose(self, time_s: float) -> Pose:
-        """Return the position of each axis."""
+        """Return the position of each axis at a time in s."""
         index, u = self._place(time_s)
         share = smooth(u)
         return tuple(
@@ -98,7 +98,7 @@ class Track:
         )
 
     def _place(self, time_s: float) -> tuple[int, float]:
-        """Return the index of the last key, and the progress to the next one, 0 to 1."""
+        """Return the index of the last key pose, and the progress to the next one from 0 to 1."""
         phase_s = (time_s - self._times[0]) % self._cycle_s + self._times[0]
         index = min(bisect_right(self._times, phase_s), len(self._times) - 1) - 1
         begun_s, ends_s = self._times[index], self._times[index + 1]
@@ -108,17 +108,17 @@ class Track:
         return self._breath * math.sin(2 * math.pi * time_s / (_BREATH_PERIOD_S + axis * _BREATH_SPREAD_S))
 
 
-# Number and duration in s of each step, in order.
+# Duration in s of each step by its number, in order.
 STEPS: Mapping[int, float] = {
     10: 4.0,  # trolley in
     20: 1.0,  # clamp it
     30: 2.0,  # close the door
     40: 8.0,  # Robot_825 loads test unit 1
-    50: 1.5,  # its actuators take hold
+    50: 1.5,  # its actuators grip
     60: 8.0,  # Robot_850 loads test unit 2
-    70: 1.5,  # its actuators take hold
+    70: 1.5,  # its actuators grip
     80: 12.0,  # test; Robot_800 fetches a frame
-    90: 1.5,  # actuators let go
+    90: 1.5,  # actuators release
     100: 7.0,  # Robot_825 unloads unit 1
     110: 7.0,  # Robot_850 unloads unit 2
     120: 6.0,  # Robot_800 puts the frame on the trolley
@@ -137,14 +137,14 @@ class Actuator(NamedTuple):
     name: str
     travel_s: float
     spans: tuple[tuple[float, float], ...]
-    """Times in a cycle, in s, at which the valve opens and closes; open extends the drive."""
+    """Times in a cycle, in s, at which the valve opens and closes; an open valve extends the drive."""
 
     def valve(self, phase_s: float) -> bool:
         """Return whether the valve is open."""
         return any(extend_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
 
     def switches(self, phase_s: float) -> int:
-        """Return the limit switches: bit 0 extended, bit 1 retracted; neither during travel."""
+        """Return the limit switches: bit 0 extended, bit 1 retracted; 0 while the drive moves."""
         travel_s = self.travel_s
         extended = any(extend_s + travel_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
         away = any(extend_s <= phase_s < retract_s + travel_s for extend_s, retract_s in self.spans)
@@ -172,9 +172,9 @@ ACTUATORS = (
         ((BEGINS[60] + 2.5, BEGINS[60] + 6.0), (BEGINS[110] + 2.2, BEGINS[110] + 5.3)),
     ),
 )
-GRIPPERS = slice(7, 10)  # the robots', in their order
+GRIPPERS = slice(7, 10)  # the actuators of the robots, in the order of ROBOTS
 
-# Degrees, as the printed limits of a KR 210's axes allow.
+# In degrees, from the data sheet of a KR 210.
 AXIS_LIMITS = ((-185.0, 185.0), (-140.0, -5.0), (-120.0, 168.0), (-350.0, 350.0), (-122.5, 122.5), (-350.0, 350.0))
 HOME: Pose = (0.0, -90.0, 90.0, 0.0, 45.0, 0.0)
 _OVER_RACK: Pose = (96.0, -78.0, 98.0, 12.0, 52.0, -18.0)
@@ -188,9 +188,9 @@ _AT_UNIT: Pose = (-64.0, -69.0, 117.0, -9.0, 43.0, 74.0)
 
 
 def _carry(begin_s: float, to: tuple[Pose, Pose], away: tuple[Pose, Pose], slow: float) -> list[tuple[float, Pose]]:
-    """Return the keys of a transfer: pick up the part, put it down, return home.
+    """Return the key poses of a transfer: pick up the part, put it down, return home.
 
-    ``slow`` stretches the times.
+    The times are multiplied by ``slow``.
     """
     at = ((0, HOME), (1.5, to[0]), (2.3, to[1]), (2.8, to[1]), (3.5, to[0]), (5.2, away[0]), (5.9, away[1]),
           (6.3, away[1]), (7.0, away[0]), (8.0, HOME))  # fmt: skip
@@ -225,7 +225,7 @@ ROBOTS: Mapping[str, Track] = {
     "Robot_850": Track(_transfers(BEGINS[60], BEGINS[110]), CYCLE_S, breath=0.03),
 }
 
-# Millimetres: parked, up to the engine when it is clamped, three strokes under load, back.
+# In mm: parked, up to the clamped engine, three strokes under load, back.
 _NC_STROKES = [(1.0, 180.0), (3.5, 320.0), (5.0, 240.0), (7.0, 350.0), (9.0, 210.0), (11.5, 180.0)]
 NC_AXES: Mapping[str, Track] = {
     name: Track(
@@ -241,7 +241,7 @@ NC_AXES: Mapping[str, Track] = {
 
 _INPUTS = struct.Struct("> BB H BBBx 3sx hh hh")
 _OUTPUTS = struct.Struct("> BB H I 2s BBB")
-_ORDERS = struct.Struct("< B HH")  # behind the outputs; of two bytes, the first has the lower bits
+_ORDERS = struct.Struct("< B HH")  # after the outputs; of two bytes, the first has the lower bits
 _AXES: Final = {f"Axs{axis}_Pos": "REAL" for axis in range(1, 7)}
 
 
@@ -258,9 +258,9 @@ class _CellState(NamedTuple):
 
 
 class A50Cell(Model):
-    """The cell and its controller's program: the signals of DB201.
+    """A model of the cell and of its controller's program, with the signals of DB201.
 
-    It runs on its own layout or on ``db201.db``.
+    It runs on the layout that it declares, or on that of ``db201.db``.
     """
 
     inputs = InOut("ARRAY[0..999] OF BYTE", path="Inputs", comment="plant to controller")
@@ -272,12 +272,12 @@ class A50Cell(Model):
     robot_850 = Output(_AXES, path="Robot_850", unit="deg")
 
     def start(self) -> None:
-        """Start a cycle."""
+        """Start the first cycle."""
         self._held_s = 0.0
-        self._cell_s: float | None = None  # the cell's own time, which stops while it is paused
+        self._cell_s: float | None = None  # time of the cell in s, which stops while the cell is paused
 
-    def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  all follows from the time
-        """Compute axes, inputs and outputs. The bytes behind them keep what was written."""
+    def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  everything depends only on the time
+        """Compute axes, inputs and outputs. The bytes after them keep their written values."""
         inputs, outputs = self.inputs.commanded, self.outputs.commanded
         hold, opened, closed = _ORDERS.unpack_from(outputs, _OUTPUTS.size)
         hold &= 1
@@ -312,7 +312,7 @@ class A50Cell(Model):
 
 
 def _inputs(now: _CellState) -> bytes:
-    heartbeat = _beat(now.time_s - 0.04)  # returned after the plant's delay
+    heartbeat = _beat(now.time_s - 0.04)  # the plant returns it with a delay
     phase_s = now.phase_s
     trolley_mm = 3000 * (smooth(phase_s / STEPS[10]) + smooth((phase_s - BEGINS[150]) / STEPS[150]))
     conveying = now.step in CONVEYING and not now.hold
@@ -350,7 +350,7 @@ def _beat(time_s: float) -> bool:
 
 
 def _drive(actuator: Actuator, phase_s: float, opened: int, closed: int) -> tuple[bool, int]:
-    """Return valve and limit switches. An order moves the drive to its end at once."""
+    """Return the valve and the limit switches; a command moves the drive to its end at once."""
     if closed:
         return False, 0b10
     if opened:

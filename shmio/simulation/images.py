@@ -1,4 +1,4 @@
-"""The two images of a model's block, the commanded and the shown one, and access to values in them."""
+"""The commanded and the shown image of a model's block, and access to the values in them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _BYTES: Final = (bytes, bytearray)
 
 
 class Images:
-    """Both images of one block, first with its initial values.
+    """The two images of one block, which begin with the initial values of the layout.
 
-    ``commanded`` has what others have written to inputs, to the ``/in`` of in-outs, and to
-    registers unknown to the model. ``shown`` is what consumers see. The model computes outputs and
-    the ``/out`` of in-outs.
+    ``commanded`` has the values that clients and connections have written: to inputs, to the
+    ``/in`` of in-outs, and to registers that the model does not declare. ``shown`` has the values
+    that readers see. The model computes the outputs and the ``/out`` of in-outs in it.
     """
 
     def __init__(self, layout: Layout, outputs: Sequence[Register], inouts: Sequence[Register] = ()) -> None:
@@ -35,8 +35,8 @@ class Images:
 
         Args:
             layout: The layout of the block.
-            outputs: Registers that nobody but the model writes.
-            inouts: Registers that others command and the model computes.
+            outputs: Registers that only the model writes.
+            inouts: Registers that clients write and the model computes.
 
         """
         initial, _ = initial_frame(layout)
@@ -47,20 +47,26 @@ class Images:
         self._all_computed = not self._given.any()
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Command bytes and bits.
+        """Write bytes and bits into the commanded image.
 
-        Return for each "" or why it is refused, which is that the model computes it.
+        Return for each write "", or why it is refused: it changes an output, or is outside the
+        block.
         """
         return [self._write(write) for write in writes]
 
     def resume(self, image: bytes) -> None:
-        """Continue from an image, as commanded and as shown; LayoutError if its size is wrong."""
+        """Set both images to ``image``.
+
+        Raises:
+            LayoutError: The image has the wrong size.
+
+        """
         if len(image) != len(self.shown):
             raise LayoutError(f"its block has {len(self.shown)} bytes, the image {len(image)}")
         self.shown[:] = self.commanded[:] = image
 
     def with_given(self, image: bytes | bytearray) -> bytes:
-        """Return an image with the commanded values of all that the model does not compute."""
+        """Return an image with the commanded values in all bits that the model does not compute."""
         if self._all_computed:
             return bytes(image)
         return (_array(self.commanded) & self._given | _array(image) & ~self._given).tobytes()
@@ -82,7 +88,7 @@ def _array(data: bytes | bytearray) -> npt.NDArray[np.uint8]:
 
 
 class Ends:
-    """The commanded and the shown value of an in-out register."""
+    """Access to the commanded and the shown value of an in-out register."""
 
     __slots__ = ("_commanded", "_shown")
 
@@ -92,12 +98,12 @@ class Ends:
 
     @property
     def commanded(self) -> Any:
-        """The value written to ``/in`` last; at first the initial value."""
+        """The value last written to ``/in``, or the initial value."""
         return self._commanded.read()
 
     @property
     def shown(self) -> Any:
-        """The value of ``/out`` that consumers see, as the model has set it last."""
+        """The value of ``/out`` that readers see. Set it to change it."""
         return self._shown.read()
 
     @shown.setter
@@ -106,23 +112,31 @@ class Ends:
 
 
 class Port(Protocol):
-    """Access to one declaration in one image."""
+    """Access to the value of one declaration in one image."""
 
     def read(self) -> Any:
-        """Return the value in the image."""
+        """Return the value from the image."""
 
     def write(self, value: object) -> None:
-        """Put a value into the image; ValueRangeError if it does not fit."""
+        """Write a value into the image.
+
+        Raises:
+            ValueRangeError: The value does not fit into the register.
+
+        """
 
 
 def port_of(path: str, registers: Mapping[str, Register], byte_order: ByteOrder, image: bytearray) -> Port:
-    """Return the port of a declaration: of a structure, or of the one register under ``""``."""
+    """Return the port of a declaration.
+
+    ``registers`` are the members of a structure by path, or a single register under ``""``.
+    """
     ports = {member: RegisterPort(register, byte_order, image) for member, register in registers.items()}
     return ports.get("") or _StructurePort(path, ports, _StructureCodec.of(registers, byte_order), image)
 
 
 class RegisterPort:
-    """Access to a register or an array."""
+    """Access to the value of a register or an array."""
 
     def __init__(self, register: Register, byte_order: ByteOrder, image: bytearray) -> None:
         self._path = register.path
@@ -132,14 +146,22 @@ class RegisterPort:
         self._is_row = register.type == "BYTE" and len(register.dims) == 1
 
     def read(self) -> Any:
-        """Return the value; an array as tuples, because changing a list would have no effect."""
+        """Return the value.
+
+        An array is returned as tuples, because a change of a list would not change the image.
+        """
         if self._is_row:
             return bytes(self._image[self._start : self._stop])
         value = self._codec.decode(self._image)
         return _frozen(value) if isinstance(value, list) else value
 
     def write(self, value: object) -> None:
-        """Put a Python or numpy value into the image, or change nothing if it does not fit."""
+        """Write a Python or numpy value into the image.
+
+        Raises:
+            ValueRangeError: The value does not fit. The image is unchanged.
+
+        """
         if self._is_row and isinstance(value, _BYTES) and len(value) == self._stop - self._start:
             self._image[self._start : self._stop] = value
             return
@@ -151,25 +173,25 @@ class RegisterPort:
 
 
 class _StructurePort:
-    """Access to the registers of a structure."""
+    """Access to the values of a structure's registers."""
 
     def __init__(
         self, path: str, ports: Mapping[str, RegisterPort], bulk: _StructureCodec | None, image: bytearray
     ) -> None:
-        """Create the port; ``bulk`` reads and writes all members at once, if that is possible."""
+        """Create the port; ``bulk`` is a faster codec for all members, or None."""
         self._path = path
         self._ports = ports
         self._bulk = bulk
         self._image = image
 
     def read(self) -> dict[str, Any]:
-        """Return all members, by path."""
+        """Return the values of all members by path."""
         if self._bulk is not None:
             return self._bulk.read(self._image)
         return {path: port.read() for path, port in self._ports.items()}
 
     def write(self, value: object) -> None:
-        """Change the members that are named."""
+        """Write the members that the dict ``value`` names; the others stay unchanged."""
         if isinstance(value, Mapping) and self._bulk is not None and self._bulk.write(value, self._image):
             return
         if not isinstance(value, Mapping) or value.keys() - self._ports.keys():
@@ -180,7 +202,7 @@ class _StructurePort:
 
 
 class _Run(NamedTuple):
-    """Adjacent numbers. ``values`` says which of all the numbers they are."""
+    """Adjacent numbers in a block; ``values`` are their indices among all numbers."""
 
     where: slice
     packing: struct.Struct
@@ -188,17 +210,17 @@ class _Run(NamedTuple):
 
 
 class _StructureCodec:
-    """Reads and writes all registers of a structure at once, if each is a single number."""
+    """Reads and writes all registers of a structure at once; each must be a single number."""
 
     def __init__(self, names: Sequence[str], runs: Sequence[_Run]) -> None:
-        """Create the codec for two or more names."""
+        """Create the codec for two or more registers with these names."""
         self._names = tuple(names)
         self._runs = tuple(runs)
         self._values = itemgetter(*names)
 
     @classmethod
     def of(cls, registers: Mapping[str, Register], byte_order: ByteOrder) -> _StructureCodec | None:
-        """Return a codec for two or more registers that are all numbers, else None."""
+        """Return a codec if there are two or more registers and all are numbers, else None."""
         codes = [_code(register, byte_order) for register in registers.values()]
         if len(codes) < 2 or not all(codes):
             return None
@@ -206,14 +228,14 @@ class _StructureCodec:
         return cls(tuple(registers), list(_runs(list(registers.values()), codes, order)))
 
     def read(self, image: bytearray) -> dict[str, Any]:
-        """Return all values, by name."""
+        """Return all values by name."""
         found: list[float] = []
         for run in self._runs:
             found += run.packing.unpack_from(image, run.where.start)
         return dict(zip(self._names, found, strict=True))
 
     def write(self, values: Mapping[str, object], image: bytearray) -> bool:
-        """Write all values; return False and write nothing unless all are numbers that fit."""
+        """Write all values and return True; if any of them does not fit, write none, return False."""
         try:
             found: Sequence[object] = self._values(values)
             if len(values) != len(self._names) or not _NUMBERS.issuperset(map(type, found)):
@@ -227,7 +249,7 @@ class _StructureCodec:
 
 
 def _code(register: Register, byte_order: ByteOrder) -> str:
-    """Return the code for ``struct``; empty if the register is not a single number."""
+    """Return the format character for ``struct``; empty if the register is not a single number."""
     if register.dims or register.type == "BOOL":
         return ""
     return scalar_codec(register.element, byte_order).plain

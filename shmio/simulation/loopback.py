@@ -1,6 +1,6 @@
-"""The loop-back model: a value written to a register comes out of it one step later.
+"""The loop-back model: readers see a value one step after it was written.
 
-Existing clients of SimlogAPI test themselves with these registers.
+Clients of SimlogAPI use these registers in their tests.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ POSITION: Final = "LREAL"
 
 
 class Loopback(Model):
-    """Four joint positions and a safety zone."""
+    """A model with four joint positions and a safety zone, which shows the values written to them."""
 
     r3200_link1 = InOut(POSITION, path="joints/R3200/Link1/R/position")
     kuka_j1 = InOut(POSITION, path="joints/Kuka.j1/R")
@@ -21,7 +21,7 @@ class Loopback(Model):
     r3_l2 = InOut(POSITION, path="joints/R3.L2/R")
     zone_1 = InOut("SafetyZone", {"zone": "Z1"}, path="safetyzones/Z1")
 
-    def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  it knows no time
-        """Show what was written before this step."""
+    def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  nothing depends on the time
+        """Show the values that were written before this step."""
         for ends in (self.r3200_link1, self.kuka_j1, self.kuka_j2, self.r3_l2, self.zone_1):
             ends.shown = ends.commanded

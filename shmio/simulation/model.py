@@ -1,4 +1,4 @@
-"""Models: their base class, what they declare, and loading a class from ``package.module:Class``."""
+"""The base class of models, their declarations, and loading a model by its name."""
 
 from __future__ import annotations
 
@@ -30,43 +30,44 @@ _OWN: Final = frozenset({"declarations", "random", "start", "step"})
 
 
 class _DeclaringModel(Protocol):
-    """A model, as its declarations see it."""
+    """The attributes of a model that its declarations use."""
 
     _ports: Mapping[str, Port]
     _ends: Mapping[str, Ends]
 
 
 class Declaration:
-    """One declaration of a model. On the class it is this object, on a model its value.
+    """A declaration of a model, such as a register or a parameter.
 
-    The value of a single register is a bool, int, float or str, see ``shmio.layout.values.codec``.
-    An array's is a tuple, of tuples for several dimensions; a one-dimensional array of BYTE is
-    bytes. A structure's is a dict of its members' values; setting it changes the members that are
-    named.
+    The attribute of the class is this object; the attribute of a model object is the value. The
+    value of a single register is a bool, int, float or str (see ``shmio.layout.values.codec``). The
+    value of an array is a tuple, nested for several dimensions, or bytes for a one-dimensional
+    array of BYTE. The value of a structure is a dict; if you set it, members that the dict does not
+    name stay unchanged.
     """
 
     kind: ClassVar[str]
-    """The name of the kind in messages."""
+    """The kind of declaration, for messages."""
 
     def __init__(
         self,
-        type: str | Mapping[str, str],  # noqa: A002  it is what the tables call it
+        type: str | Mapping[str, str],  # noqa: A002  tag tables use this name
         initial: object = None,
         *,
         path: str = "",
         unit: str = "",
         comment: str = "",
     ) -> None:
-        """Declare a value. Errors are raised as ModelError when the class is created.
+        """Declare a value. The creation of the model's class raises ModelError if it is invalid.
 
         Args:
-            type: The type as in a tag table: ``LREAL``, ``STRING[20]``, ``ARRAY[1..8] OF BOOL``,
-                ``SafetyZone``; or the types of a structure's members, by name.
-            initial: The initial value; default: that of the type. For an array a flat list, for a
-                structure a dict.
-            path: The path of the register; default: the attribute's name.
-            unit: The unit, for the layout.
-            comment: The comment, for the layout.
+            type: The type as in a tag table, such as ``LREAL``, ``STRING[20]``, ``SafetyZone`` or
+                ``ARRAY[1..8] OF BOOL``. For a structure, a dict with the types of its members.
+            initial: The initial value; for an array a flat list, for a structure a dict. Default:
+                the initial value of the type.
+            path: The path of the register. Default: the name of the attribute.
+            unit: The unit in the layout.
+            comment: The comment in the layout.
 
         """
         self.type = type
@@ -88,21 +89,23 @@ class Declaration:
 
     @cached_property
     def members(self) -> Mapping[str, str] | None:
-        """The types of a structure's members, by their paths in it.
-
-        None if it is not a structure.
-        """
+        """The types of a structure's members by their paths in it; None if it is no structure."""
         return members(self.type) if isinstance(self.type, str) else self.type
 
     @cached_property
     def paths(self) -> Mapping[str, str]:
-        """The path of each register by its member; a single register is under ``""``."""
+        """The path of each register by its member; the key of a single register is ``""``."""
         inside = {"": ""} if self.members is None else {member: f"/{member}" for member in self.members}
         return {member: canonical_path(self.path + end) for member, end in inside.items()}
 
     @property
     def tags(self) -> Mapping[str, object]:
-        """The entries for a tag table; ValueRangeError for an invalid type."""
+        """The entries of the declaration in a tag table.
+
+        Raises:
+            ValueRangeError: The type is invalid.
+
+        """
         if self.members is None:
             return {self.path: self._tag(self.type, self.initial)}
         initial = self.initial or {}
@@ -116,16 +119,13 @@ class Declaration:
 
 
 class Input(Declaration):
-    """A register that others write or a connection fills. The model reads it."""
+    """A register that the model reads. Clients write it, or it is connected to another source."""
 
     kind = "an input"
 
 
 class Parameter(Declaration):
-    """A constant that the configuration may set under the attribute's name.
-
-    It is not a register.
-    """
+    """A constant of the model, not a register. The configuration may set it by its name."""
 
     kind = "a parameter"
 
@@ -143,7 +143,10 @@ class Output(Declaration):
 
 
 class InOut(Declaration):
-    """A register that others command and the model computes. See :class:`Ends`."""
+    """A register that clients command and the model computes.
+
+    The value of the attribute is an :class:`Ends`.
+    """
 
     kind = "an in-out register"
 
@@ -155,7 +158,12 @@ class InOut(Declaration):
 
 
 def place_declarations(model: str, declarations: Iterable[Declaration]) -> Layout:
-    """Place declarations like a tag table; ModelError names the model and all errors."""
+    """Return the layout of the declarations, placed like the entries of a tag table.
+
+    Raises:
+        ModelError: A declaration is invalid. The message names the model and all errors.
+
+    """
     tags: dict[str, object] = {}
     for declaration in declarations:
         try:
@@ -178,19 +186,24 @@ def place_declarations(model: str, declarations: Iterable[Declaration]) -> Layou
 class Model(ABC):
     """Base class of all models. ``ModelRunner`` creates, seeds and steps them.
 
-    Do not override ``__init__``. What a model computes must depend only on its inputs, its
-    parameters, its time and ``random``: no clock, no other source of randomness, no thread. Then
+    Do not override ``__init__``. The outputs must depend only on the inputs, the parameters, the
+    time and ``random``. Do not use another clock, another source of randomness, or threads. Then
     the same steps with the same inputs and seed give the same bytes.
     """
 
     declarations: ClassVar[Mapping[str, Declaration]] = {}
-    """All declarations of this class and its bases, by attribute."""
+    """All declarations of this class and its base classes, by attribute name."""
 
     random: np.random.Generator
-    """The only source of randomness, seeded with the source's seed."""
+    """The model's only source of randomness, seeded with the ``seed`` of its source."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
-        """Check the declarations; ModelError names the class and what is wrong with them."""
+        """Check the declarations when a subclass is created.
+
+        Raises:
+            ModelError: A declaration is invalid. The message names the class.
+
+        """
         super().__init_subclass__(**keywords)
         if "__init__" in cls.__dict__:
             raise ModelError(f"model {cls.__qualname__}: a model has no __init__ of its own; prepare it in start()")
@@ -207,8 +220,8 @@ class Model(ABC):
         """Create the model. ``ModelRunner`` calls this.
 
         Args:
-            ports: Inputs, outputs and parameters, by attribute.
-            ends: In-out registers, by attribute.
+            ports: Inputs, outputs and parameters, by attribute name.
+            ends: In-out registers, by attribute name.
             seed: The seed of ``random``.
 
         """
@@ -216,10 +229,11 @@ class Model(ABC):
         self._ends = ends
         self.random = np.random.default_rng(seed)
 
-    def start(self) -> None:  # noqa: B027  not every model has something to prepare
-        """Prepare the model. Called once before the first step; all declared values are available.
+    def start(self) -> None:  # noqa: B027  not every model needs it
+        """Prepare the model. It is called once before the first step.
 
-        In a restarted process the registers have the values that the previous one published last.
+        All declared values are available. In a restarted process, the registers have the values
+        that the previous process published last.
         """
 
     @abstractmethod
@@ -240,7 +254,7 @@ def declared(model: type[Model], *kinds: type[Declaration]) -> list[Declaration]
 
 @lru_cache(maxsize=256)
 def layout_of(model: type[Model]) -> Layout:
-    """Return the layout of the registers that a model declares, placed like those of a tag table.
+    """Return the layout of a model's registers, placed like the entries of a tag table.
 
     Args:
         model: The model's class.
@@ -265,12 +279,12 @@ def load(text: str, folder: str | Path | None = None) -> type[Model]:
 
     Args:
         text: ``package.module:Class``.
-        folder: Where to look for modules that are not installed, such as the folder of the
+        folder: A folder to search for modules that are not installed, such as that of the
             configuration.
 
     Raises:
-        ConfigError: The text is malformed, the module or class does not exist or fails, or it is
-            not a model.
+        ConfigError: The text is malformed, the module or class does not exist, its import fails, or
+            the class is not a model.
 
     """
     name, colon, attribute = text.partition(":")
@@ -296,7 +310,7 @@ def _is_model(value: object) -> TypeGuard[type[Model]]:
 
 def _module(name: str, folder: str | Path | None) -> ModuleType:
     if folder is not None and str(folder) not in sys.path:
-        sys.path.append(str(folder))  # last, so that no file there hides an installed module
+        sys.path.append(str(folder))  # last, so that no file in the folder hides an installed module
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
@@ -309,7 +323,7 @@ def _module(name: str, folder: str | Path | None) -> ModuleType:
 
 
 def explain(error: BaseException, module: str) -> str:
-    """Return what was raised and at which line, preferring a line of the module."""
+    """Return a text with the error and its line, in ``module`` if the traceback has such a line."""
     if isinstance(error, SyntaxError) and error.filename:
         return _line(f"{error.msg} ({Path(error.filename).name}, line {error.lineno})")
     frames = list(traceback.walk_tb(error.__traceback__))

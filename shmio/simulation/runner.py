@@ -1,4 +1,4 @@
-"""Runs a model: on the images of its block, or for an instance elsewhere."""
+"""Runs a model, in the process of a source or in a client of an instance on another host."""
 
 from __future__ import annotations
 
@@ -30,11 +30,12 @@ NOTHING: Final[Mapping[str, object]] = MappingProxyType({})
 
 
 class ModelRunner:
-    """Runs one model. Not thread-safe.
+    """Runs one model on the images of its block. Not thread-safe.
 
-    It keeps two images of the block. The commanded one has what others have written to inputs, to
-    the ``/in`` of in-out registers, and to registers unknown to the model. The shown one is what
-    consumers see. Inputs and unknown registers show their commanded values from the next step on.
+    There are two images. The commanded image has the values that clients and connections have
+    written: to inputs, to the ``/in`` of in-out registers, and to registers that the model does not
+    declare. The shown image has the values that readers see. A value commanded to an input or to an
+    undeclared register is shown from the next step on.
     """
 
     def __init__(
@@ -48,14 +49,14 @@ class ModelRunner:
 
         Args:
             model: The model's class.
-            layout: A layout with at least the declared registers; default: the layout of the
+            layout: A layout with at least the declared registers. Default: the layout of the
                 declarations.
             parameters: Values of parameters, by name.
             seed: The seed of the model's randomness.
 
         Raises:
-            ConfigError: The layout lacks a register, or a parameter is unknown or does not fit. The
-                message begins with the key.
+            ConfigError: The layout lacks a register, a parameter is unknown, or its value does not
+                fit. The message begins with the key.
 
         """
         self.name = f"{model.__module__}:{model.__qualname__}"
@@ -65,7 +66,7 @@ class ModelRunner:
         both = [r for declaration in found if isinstance(declaration, InOut) for r in found[declaration].values()]
         self._images = Images(self.layout, outputs, both)
         self.computed = (*outputs, *both)
-        """The registers whose shown values the model computes."""
+        """The output and in-out registers, whose shown values the model computes."""
         self._inputs: dict[str, RegisterPort] = {}
         ports: dict[str, Port] = _parameters(model, parameters)
         ends: dict[str, Ends] = {}
@@ -88,35 +89,35 @@ class ModelRunner:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The paths that :meth:`connect` takes."""
+        """The paths of the registers that :meth:`connect` can set."""
         return tuple(self._inputs)
 
     @property
     def image(self) -> bytes:
-        """The shown image of the whole block."""
+        """A copy of the shown image of the whole block."""
         return bytes(self._images.shown)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Command bytes and bits for the next step.
+        """Write bytes and bits into the commanded image, for the next step.
 
         Args:
-            writes: What to write, in this order.
+            writes: The writes, in order.
 
         Returns:
-            For each write "" or why it is refused, which is that the model computes the register.
+            For each write "", or why it is refused: it changes an output, or is outside the block.
 
         """
         return self._images.write(writes)
 
     def connect(self, values: Mapping[str, object]) -> None:
-        """Command inputs. An input without a value keeps the one it has.
+        """Set the values of inputs for the next step. An input that is not named keeps its value.
 
         Args:
-            values: Values by the inputs' paths.
+            values: Values by the paths of the inputs.
 
         Raises:
-            PathError: There is no such input. Inputs before it are commanded.
-            ValueRangeError: The value does not fit. Inputs before it are commanded.
+            PathError: There is no such input. The inputs before it are set.
+            ValueRangeError: A value does not fit. The inputs before it are set.
 
         """
         for path, value in values.items():
@@ -127,7 +128,7 @@ class ModelRunner:
             port.write(value)
 
     def begin(self) -> bytes:
-        """Start the model unless it is started.
+        """Start the model, unless it was started before.
 
         Returns:
             The image before the first step.
@@ -163,10 +164,10 @@ class ModelRunner:
         return self.image
 
     def resume(self, image: bytes) -> None:
-        """Continue from an image, as commanded and as shown.
+        """Set both images to ``image``, to continue from it.
 
         Raises:
-            LayoutError: The image has another size.
+            LayoutError: The image has the wrong size.
 
         """
         try:
@@ -186,7 +187,9 @@ class ModelRunner:
     def _find(self, model: type[Model], declaration: Declaration) -> dict[str, Register]:
         """Return the registers of a declaration, by their paths in it.
 
-        ConfigError if the layout lacks one.
+        Raises:
+            ConfigError: The layout lacks a register, or it has another type there.
+
         """
         found: dict[str, Register] = {}
         for member, path in declaration.paths.items():
@@ -204,9 +207,11 @@ class ModelRunner:
 
 
 def _parameters(model: type[Model], given: Mapping[str, object]) -> dict[str, Port]:
-    """Return the ports of a model's parameters.
+    """Return the ports of a model's parameters, with the values in ``given``.
 
-    ConfigError for an unknown name or a wrong value.
+    Raises:
+        ConfigError: A name is unknown, or a value does not fit.
+
     """
     layout = place_declarations(model.__qualname__, declared(model, Parameter))
     values, _ = initial_frame(layout)
@@ -233,11 +238,11 @@ def _kind(register: Register) -> str:
 
 
 class Inputs(Protocol):
-    """The values of inputs, by the registers' paths; None if there is no value."""
+    """The values of a model's inputs by path; a value is None if it is not known."""
 
     @property
     def changed(self) -> Collection[str]:
-        """The paths of the values that have changed."""
+        """The paths of the inputs whose values have changed."""
 
     def __contains__(self, path: object, /) -> bool: ...
 
@@ -245,7 +250,7 @@ class Inputs(Protocol):
 
 
 class Source(Protocol):
-    """A source that a program has joined, such as ``shmio.client.Simulation``."""
+    """A source for which this program runs the model, such as ``shmio.client.Simulation``."""
 
     @property
     def source(self) -> str:
@@ -253,7 +258,7 @@ class Source(Protocol):
 
     @property
     def inputs(self) -> Inputs:
-        """The values for the model."""
+        """The values of the model's inputs."""
 
     @property
     def outputs(self) -> Mapping[str, Any]:
@@ -261,14 +266,14 @@ class Source(Protocol):
 
     @property
     def computed(self) -> bool:
-        """Whether a model has computed the outputs already."""
+        """True if a model has computed the outputs before."""
 
 
 class ServedModel:
-    """Runs a model for a source of connector "remote", as connector "simulation" runs it.
+    """Runs a model in a client, for a source with ``connector = "remote"``.
 
-    :meth:`shmio.client.Client.simulate` takes its ``step`` and ``start``. It continues from what
-    the source shows, like a model in a restarted process.
+    Pass its ``step`` and ``start`` to :meth:`shmio.client.Client.simulate`. The model runs as with
+    ``connector = "simulation"``. When the client connects, it continues from the source's values.
     """
 
     def __init__(self, model: type[Model], parameters: Mapping[str, object] = NOTHING, seed: int = 0) -> None:
@@ -294,13 +299,13 @@ class ServedModel:
         self._sent: bytes | None = None
 
     def start(self, joined: Source) -> None:
-        """Take the present state of the source, each time it is joined.
+        """Check the source's registers, and continue from its values. Call it after each connect.
 
         Args:
             joined: The source.
 
         Raises:
-            ModelError: The source lacks a register of the model.
+            ModelError: The source lacks a register that the model declares.
 
         """
         for path in self._runner.inputs:
@@ -319,7 +324,7 @@ class ServedModel:
             self._runner.resume(bytes(image))
 
     def step(self, time_s: float, dt_s: float, inputs: Inputs) -> dict[str, object]:
-        """Have the model compute a step.
+        """Let the model compute a step.
 
         Args:
             time_s: The simulation time at the end of the step, in s.
@@ -337,7 +342,7 @@ class ServedModel:
         self._runner.connect({path: value for path in self._new if (value := inputs[path]) is not None})
         self._new.clear()
         image = self._runner.step(round(time_s * 1e9), round(dt_s * 1e9))
-        self._begun = True  # a failed step computes nothing to continue from
+        self._begun = True  # set only after a successful step: a failed one has no values to continue from
         outputs = dict(self._changes(image))
         self._sent = image
         return outputs
