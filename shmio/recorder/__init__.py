@@ -1,1 +1,1 @@
-"""Writes recordings: `.mem` files with every frame and event of an instance (docs/reference/dump-format.md)."""
+"""The recorder writes frames and events of an instance to `.mem` files (docs/reference/dump-format.md)."""

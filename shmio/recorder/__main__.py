@@ -1,4 +1,4 @@
-"""The process of the recorder."""
+"""Runs the process of the recorder."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 
 NOTE = "to "
-"""Prefix of the note of a recorder without a problem; the name of its file follows."""
-WAITS = f"{NOTE}a file as soon as its trigger comes"
+"""Start of the recorder's status note if there is no problem; the name of its file follows."""
+WAITS = f"{NOTE}a file as soon as its trigger fires"
 
 
 def run(worker: Worker) -> None:
     """Record until the worker is stopped."""
     settings = msgspec.convert({k: v for k, v in worker.config.items() if k != "config_file"}, Settings)
     directory, segment = Path(settings.directory), worker.segment
-    worker.running()  # searching the predecessor's files may take a while
-    segment.clock.abstain(worker.slot.index)  # no step waits for that: the rings keep what comes meanwhile
+    worker.running()  # before the search in the previous recorder's files, which may take a while
+    segment.clock.abstain(worker.slot.index)  # steps must not wait for the search; the rings keep new frames
     known = last_positions(directory, segment, SUPERVISED, worker.slot.beat)
     elsewhere = _elsewhere(worker.before, directory)
     start = StartPositions(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
@@ -43,7 +43,7 @@ def run(worker: Worker) -> None:
         series = TriggeredRecorder(tap, settings, settings.trigger, SUPERVISED, attachments, going=going)
     else:
         series = RotatingRecorder(tap, settings, SUPERVISED, attachments)
-    goes_on = ", continuing where its predecessor ended" if known else ""
+    goes_on = ", continuing where the previous recorder ended" if known else ""
     worker.log.info("recording %s%s%s", _note(series), goes_on, elsewhere)
     keeper = Housekeeper(segment.instance, settings, SUPERVISED, series.present)
     keeper.start()
@@ -57,19 +57,22 @@ def run(worker: Worker) -> None:
 
 
 def _elsewhere(before: Report, directory: Path) -> str:
-    """Describe a previous recorder whose file is not in this folder; empty if there is no such file."""
+    """Return a log text if the previous recorder's file is not in this folder, else ""."""
     name = before.note.removeprefix(NOTE)
     if before.note in (name, WAITS) or (directory / name).exists():
         return ""
-    return f"; the previous recorder's {name} is not in this folder: only that file has what the rings no longer hold"
+    return f"; the previous recorder's {name} is not in this folder: only that file has what the rings have lost"
 
 
 def _record(worker: Worker, series: RotatingRecorder | TriggeredRecorder) -> None:
-    """Record in turns. In virtual time each step waits for a turn, so that nothing of it is missed."""
+    """Record in turns until the worker is stopped.
+
+    In virtual time, each step waits for a turn, so that the recorder misses nothing.
+    """
     clock, slot = worker.segment.clock, worker.slot.index
     bell = clock.slot_bell(slot)
     seen, more, problem, told_s = bell.value(), False, "", 0.0
-    clock.deliver(slot, 0)  # from now on each step waits for it
+    clock.deliver(slot, 0)  # from now on, each step waits for the recorder
     while not worker.stopping.is_set():
         if not more:
             seen = bell.wait(seen, round(series.tap.pause_s * 1e9))

@@ -1,4 +1,4 @@
-"""The output file of a recording, written by a thread so that a slow or full disk delays nobody."""
+"""Writes a recording's file in a separate thread, so that a slow or full disk delays no reader."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from typing import Final
 from shmio.errors import RecordingError
 
 RETRY_S: Final = 0.5
-"""How often to retry a failed write."""
+"""Time between attempts after a failed write."""
 WAIT_S: Final = 0.02
-"""How often to check whether the previous file is complete."""
+"""Period at which to check whether the previous file is complete."""
 SLOW_S: Final = 2.0
 """A write that takes longer is reported as a problem."""
 SUFFIX: Final = ".mem"
@@ -25,12 +25,12 @@ _NAMES: Final = 1000
 
 
 def create(directory: Path, instance: str, now: datetime | None = None) -> tuple[Path, int]:
-    """Create a new file, named after the instance and the time (UTC), and its directory if needed.
+    """Create a file named after the instance and the time (UTC), and its directory if needed.
 
-    An existing file is never touched. Only the user may read the new one.
+    An existing file is never changed. Only the user may read the new file.
 
     Returns:
-        Path and file descriptor.
+        The path and the file descriptor.
 
     Raises:
         RecordingError: No file can be created.
@@ -48,11 +48,11 @@ def create(directory: Path, instance: str, now: datetime | None = None) -> tuple
 
 
 class Output:
-    """Takes bytes from one thread and writes them in another.
+    """Queues bytes from one thread, and writes them to a file in another.
 
-    The bytes between two calls of :meth:`flush` are a piece. The file holds only whole pieces, even if the
-    disk is full: a piece that does not fit is removed and retried. The file is locked (flock) meanwhile,
-    so that nobody mistakes it for the file of a dead recorder.
+    The bytes between two calls of :meth:`flush` are a piece. The file contains only whole pieces,
+    even if the disk is full: a piece that does not fit is removed and retried. The file is locked
+    (flock) while it is being written, so that no process takes it for the file of a dead recorder.
     """
 
     def __init__(
@@ -63,25 +63,25 @@ class Output:
         Args:
             path: Path of the file.
             fd: Descriptor of the file.
-            limit_bytes: Above this number of waiting bytes the output is :attr:`full`.
-            fsync_s: Time between two fsyncs; 0: only at the end.
-            after: The previous file, which must be complete before this one is written.
+            limit_bytes: Number of waiting bytes above which the output is :attr:`full`.
+            fsync_s: Time between two fsyncs; 0 for an fsync only at the end.
+            after: The previous file, which must be complete before this file is written.
         """
         with suppress(OSError):  # a file system without locks
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self.path = path
         self.error = ""
-        """Why the disk does not accept the waiting bytes; empty while it does."""
+        """Reason why the waiting bytes cannot be written; empty if they can."""
         self.doubt = ""
-        """Why bytes of the file may be lost; empty: no fsync has failed.
+        """Reason why bytes of the file may be lost; empty if no fsync has failed.
 
-        It stays: after a failed fsync the kernel counts the pages as written, so that a later fsync of this
-        file does not report the failure again.
+        It is never cleared. After a failed fsync the kernel counts the pages as written, so a later
+        fsync of this file does not report the failure again.
         """
         self.written = 0
-        """Bytes in the file."""
+        """Number of bytes in the file."""
         self.synced = 0
-        """Bytes that are certainly on the disk: an fsync has confirmed them, and none failed before."""
+        """Number of bytes that an fsync has confirmed; it does not grow after a failed fsync."""
         self._fd = fd
         self._limit = limit_bytes
         self._fsync_s = fsync_s
@@ -92,7 +92,7 @@ class Output:
         self._news = threading.Condition()
         self._after = after
         self.whole = False
-        """Whether the file is complete: everything was written, and no more will come."""
+        """True if the file is complete: all bytes were written, and no more will come."""
         self._ending = False
         self._closing = False
         self._busy_since_s: float | None = None
@@ -100,15 +100,15 @@ class Output:
         self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
         self._thread.start()
 
-    # ---- the recorder's thread ---------------------------------------------------------------------------------------
+    # ---- called by the recorder's thread -----------------------------------------------------------------------------
 
     def write(self, data: bytes | memoryview) -> int:
-        """Append to the present piece, without waiting."""
+        """Append to the present piece, without waiting for the disk."""
         self._piece += data
         return len(data)
 
     def tell(self) -> int:
-        """Return the number of bytes given so far."""
+        """Return the number of bytes passed to :meth:`write` so far."""
         return self._given + len(self._piece)
 
     def flush(self) -> None:
@@ -127,13 +127,13 @@ class Output:
 
     @property
     def full(self) -> bool:
-        """Whether too many bytes wait. It stays True until only half the limit waits."""
+        """True if too many bytes wait. It stays True until fewer than half the limit wait."""
         self._full = self.waiting > (self._limit // 2 if self._full else self._limit)
         return self._full
 
     @property
     def problem(self) -> str:
-        """The present problem of the file or its disk, with the path; empty: none."""
+        """The present problem of the file or its disk, with the path; empty if there is none."""
         since_s = self._busy_since_s
         if self.error:
             return f"{self.path}: {self.error}"
@@ -144,12 +144,12 @@ class Output:
         return ""
 
     def check(self) -> None:
-        """Raise RecordingError if the file was removed: nobody could find what is written now."""
+        """Raise RecordingError if the file was removed, so that no one could find new data."""
         if os.fstat(self._fd).st_nlink == 0:
             raise RecordingError(f"{self.path} was removed while it was being written")
 
     def end(self) -> None:
-        """End the file: the waiting bytes are written, however long the disk takes."""
+        """Accept no more bytes. The thread writes the waiting bytes, however long the disk takes."""
         self.flush()
         with self._news:
             self._ending = True
@@ -157,11 +157,11 @@ class Output:
 
     @property
     def ended(self) -> bool:
-        """Whether the thread has ended, so that :meth:`close` will not wait."""
+        """True if the thread has ended, so that :meth:`close` does not wait."""
         return not self._thread.is_alive()
 
     def close(self, patience_s: float) -> bool:
-        """Write the waiting bytes within ``patience_s``; returns whether all of them are certainly there."""
+        """Write the waiting bytes within ``patience_s``; return whether all were written safely."""
         self.flush()
         with self._news:
             self._ending = self._closing = True
@@ -174,7 +174,7 @@ class Output:
         os.close(self._fd)
         return whole
 
-    # ---- the disk's thread -------------------------------------------------------------------------------------------
+    # ---- run by the writing thread -----------------------------------------------------------------------------------
 
     def _run(self) -> None:
         if not self._is_next():
@@ -198,7 +198,7 @@ class Output:
         self._sync()
 
     def _is_next(self) -> bool:
-        """Wait until the previous file is complete; returns False if it will not be."""
+        """Wait until the previous file is complete; return False if it was not written completely."""
         after, self._after = self._after, None
         while after is not None and not (after.whole or after.ended or self._closing):
             after._thread.join(WAIT_S)
@@ -208,7 +208,7 @@ class Output:
         return False
 
     def _put(self, piece: bytes) -> bool:
-        """Write a whole piece, or nothing of it."""
+        """Write a whole piece; if it does not fit, remove what was written of it."""
         self._busy_since_s = time.monotonic()
         view, at = memoryview(piece), 0
         try:
@@ -225,7 +225,7 @@ class Output:
         return True
 
     def _wait(self) -> bool:
-        """Wait before a retry; returns False if the file is being closed."""
+        """Wait before the next attempt; return False if the file is being closed."""
         with self._news:
             if not self._closing:
                 self._news.wait_for(lambda: self._closing, RETRY_S)

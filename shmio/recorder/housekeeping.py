@@ -1,6 +1,6 @@
-"""Close recordings that earlier recorders left unclosed, and delete those that are too old or too many.
+"""Closes recordings that earlier recorders left unclosed, and deletes old ones.
 
-This runs in a thread of its own, so that many files or a slow disk do not delay the recording.
+This runs in a separate thread, so that many files or a slow disk do not delay the recording.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ from shmio.recording.format.records import (
 from shmio.recording.reading.reader import Reader
 
 LOOK_S: Final = 60.0
-"""How often the folder is checked."""
+"""Period at which the folder is checked."""
 DAY_S: Final = 86_400
 CHECKED: Final = 128
-"""How many chunks at the end are verified: a power cut may have left zeros, and the index names only intact chunks."""
+"""Number of chunks at the end of a file that are verified, because a power cut may leave zeros."""
 ZEROS_BYTES: Final = 1 << 20
 
 _MESSAGE: Final = struct.Struct("<HIQ")  # channel, sequence, log time
@@ -65,7 +65,7 @@ log = logging.getLogger("shmio.recorder")
 
 
 class _File(NamedTuple):
-    """Identity and size of a file when it was checked; it is read again only after a change."""
+    """Identity and size of a file at a check; it is read again only if they have changed."""
 
     path: Path
     inode: int
@@ -76,29 +76,29 @@ class _File(NamedTuple):
 class Housekeeper:
     """Thread that closes and deletes recordings.
 
-    It touches only this user's recordings of this instance by this kind of recorder (``by``), and never
-    a file that somebody is writing.
+    It changes only this user's recordings of this instance by the same kind of recorder (``by``),
+    and never a file that another process is writing.
     """
 
     def __init__(self, instance: str, settings: Settings, by: str, present: Callable[[], set[Path]]) -> None:
-        """``present`` returns the files that this recorder is writing."""
+        """Create the thread; ``present`` returns the files that this recorder is writing."""
         self._instance = instance
         self._settings = settings
         self._by = by
         self._present = present
         self._own: dict[_File, bool] = {}
-        """The recordings by this kind of recorder, and whether each is closed."""
+        """The recordings by this kind of recorder; the value is True if the recording is closed."""
         self._strange: set[_File] = set()
         self._undeletable: set[_File] = set()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
 
     def start(self) -> None:
-        """Start the thread; it checks the folder at once."""
+        """Start the thread, which checks the folder at once."""
         self._thread.start()
 
     def stop(self, patience_s: float = 0.5) -> None:
-        """Stop the thread; it ends at the next file."""
+        """Stop the thread; it ends before the next file."""
         self._stop.set()
         self._thread.join(patience_s)
 
@@ -111,7 +111,7 @@ class Housekeeper:
             self._stop.wait(LOOK_S)
 
     def look(self) -> None:
-        """Check the folder once: close and delete files."""
+        """Check the folder once, and close and delete files."""
         present = self._present()
         files = [_file(path) for path in own_files(Path(self._settings.directory), self._instance)]
         found = [file for file in files if file is not None]
@@ -122,7 +122,7 @@ class Housekeeper:
             if self._stop.is_set():
                 return
             known = file.path in present or self._own.get(file) or file in self._strange
-            if file.size and not known:  # an empty file is new, or was never used
+            if file.size and not known:  # an empty file is new, or its recorder wrote nothing
                 self._take_in(file)
         self._delete([file for file in found if file.path in present])
 
@@ -134,15 +134,15 @@ class Housekeeper:
             with Reader(file.path, own=True) as reader:
                 closed = reader.records.footer() is not None
             if not closed and finalise(file.path):
-                log.info("%s is closed now: its recorder died before it could do that", file.path)
+                log.info("%s is closed now: its recorder died before it could close it", file.path)
                 file, closed = _file(file.path) or file, True
             self._own[file] = closed
         except (OSError, RecordingError) as error:
             self._strange.add(file)
-            log.warning("%s stays as it is: %s", file.path, error)
+            log.warning("%s is left unchanged: %s", file.path, error)
 
     def _delete(self, present: list[_File]) -> None:
-        """Delete closed files that are too old, then the oldest while there are too many bytes."""
+        """Delete closed files that are too old, then the oldest ones until the rest is small enough."""
         settings = self._settings
         left = sum(file.size for file in (*present, *self._own))
         oldest = sorted((file for file, closed in self._own.items() if closed), key=lambda file: file.changed_ns)
@@ -173,7 +173,7 @@ class Housekeeper:
 
 
 def _is_held(path: Path) -> bool:
-    """Return whether a replay uses the file; a restarted replay would need it again."""
+    """Return whether a replay uses the file. It must stay, because a restart needs it again."""
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -187,7 +187,7 @@ def _is_held(path: Path) -> bool:
 
 
 def _file(path: Path) -> _File | None:
-    """Return the file's present state; None if it is gone, or not a regular file of this user."""
+    """Return the file's present state; None if it does not exist or is not this user's own file."""
     try:
         found = path.lstat()
     except OSError:
@@ -196,18 +196,18 @@ def _file(path: Path) -> _File | None:
 
 
 def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
-    """Close a file that this user's recorder has left unclosed.
+    """Close a recording that a recorder of this user has left unclosed.
 
     Args:
         file: The file.
-        beat: Called regularly, as a sign of life.
+        beat: Called regularly, as a heartbeat.
 
     Returns:
-        False if somebody is still writing the file.
+        False if another process is still writing the file.
 
     Raises:
-        RecordingError: It is not a recording, or is damaged so that only ``recover`` can save it.
-        OSError: There is no room; apart from the cut-off end the file is unchanged.
+        RecordingError: The file is not a recording, or is damaged: only ``recover`` can save it.
+        OSError: The disk is full. Only the incomplete end was cut off.
     """
     with Reader(file, own=True, beat=beat) as reader:
         fd = os.open(file, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -220,14 +220,14 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
             if before.st_size != reader.records.size:
                 return False
             _write(fd, _RecordingEnd(reader))
-            os.utime(fd, ns=(before.st_atime_ns, before.st_mtime_ns))  # nothing was recorded since
+            os.utime(fd, ns=(before.st_atime_ns, before.st_mtime_ns))  # keep the times: nothing was recorded since
         finally:
             os.close(fd)
     return True
 
 
 def _write(fd: int, ending: _RecordingEnd) -> None:
-    """Cut off the incomplete end, and append index and footer."""
+    """Cut off the incomplete end of a file, and append the index and the footer."""
     data = ending.data()
     os.ftruncate(fd, ending.cut)
     try:
@@ -242,7 +242,7 @@ def _write(fd: int, ending: _RecordingEnd) -> None:
 
 @dataclass(slots=True)
 class _Chunk:
-    """A chunk, with its number of messages by channel."""
+    """A chunk of a recording, with the number of its messages by channel."""
 
     record: Record
     index: ChunkIndex
@@ -250,10 +250,14 @@ class _Chunk:
 
 
 class _RecordingEnd:
-    """The index and footer to write behind the last complete record."""
+    """Builds the index and the footer that close a recording after its last complete record."""
 
     def __init__(self, reader: Reader) -> None:
-        """Read the file. RecordingError: not a recording, or more would be cut off than a dead recorder leaves."""
+        """Read the file.
+
+        Raises:
+            RecordingError: It is not a recording, or is damaged before its end.
+        """
         self._reader = reader
         self._records = reader.records
         self._schemas: dict[int, bytes] = {}
@@ -262,9 +266,9 @@ class _RecordingEnd:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self.cut = len(MAGIC)
-        """Offset of the end of the last complete record."""
+        """Offset in the file at which the last complete record ends."""
         self._anew = b""
-        """New indexes of the last chunk."""
+        """New message indexes of the last chunk."""
         self._walk()
         self._check()
 
@@ -296,7 +300,7 @@ class _RecordingEnd:
             self._index_anew()
 
     def _tail(self) -> None:
-        """Check that only the start of one record, or zeros, will be cut off."""
+        """Check that only zeros or the start of one record follow the last complete record."""
         size = self._records.size - self.cut
         if size < HEAD.size:
             return
@@ -312,9 +316,9 @@ class _RecordingEnd:
         )
 
     def _damaged(self, at: int, why: str) -> RecordingError:
-        return RecordingError(f"{self._reader.file}: {why}, at byte {at}: shmio-dump recover saves what is whole")
+        return RecordingError(f"{self._reader.file}: {why}, at byte {at}: shmio-dump recover saves what is intact")
 
-    # ---- what there is -----------------------------------------------------------------------------------------------
+    # ---- reading the records of the file -----------------------------------------------------------------------------
 
     def _chunk(self, record: Record) -> None:
         head = self._records.read(record.at, min(record.size, LOOK_BYTES))
@@ -337,7 +341,7 @@ class _RecordingEnd:
         self._chunks.append(_Chunk(record, index))
 
     def _index(self, record: Record) -> None:
-        """Take a message index of the last chunk. New channels are described in that chunk."""
+        """Add a message index to the last chunk. Read the descriptions of new channels from it."""
         chunk = self._chunks[-1]
         number, size = INDEX.unpack(self._records.read(record.at, INDEX.size))
         if number not in self._channels:
@@ -354,12 +358,12 @@ class _RecordingEnd:
                 known[number] = HEAD.pack(opcode, len(content)) + bytes(content)
 
     def _index_anew(self) -> None:
-        """Create the indexes of the last chunk, which may be missing or cut off."""
+        """Create the message indexes of the last chunk again; they may be missing or incomplete."""
         chunk = self._chunks[-1]
         self.cut = chunk.record.at + chunk.record.size
         found: dict[int, MessageIndex] = {}
         at = 0
-        with suppress(RecordingError, struct.error):  # _check() finds damage
+        with suppress(RecordingError, struct.error):  # _check() reports the damage
             self._describe(chunk.record)
             for opcode, content in self._records.chunk(chunk.record):
                 if opcode == Opcode.MESSAGE:
@@ -390,7 +394,7 @@ class _RecordingEnd:
         self._metadata.append(MetadataIndex(record.start, record.size + HEAD.size, name))
 
     def _check(self) -> None:
-        """Leave damaged chunks near the end out of the index."""
+        """Remove damaged chunks near the end from the index."""
         whole = self._chunks[:-CHECKED]
         for chunk in self._chunks[-CHECKED:]:
             with suppress(RecordingError):
@@ -398,10 +402,10 @@ class _RecordingEnd:
                 whole.append(chunk)
         self._chunks = whole
 
-    # ---- what is missing ---------------------------------------------------------------------------------------------
+    # ---- the index and footer to write -------------------------------------------------------------------------------
 
     def data(self) -> bytes:
-        """Return the bytes to write from :attr:`cut` on."""
+        """Return the bytes to write at offset :attr:`cut`."""
         builder = RecordBuilder()
         builder.write(self._anew)
         DataEnd(zlib.crc32(self._anew, self._records.crc(0, self.cut))).write(builder)
@@ -421,7 +425,7 @@ class _RecordingEnd:
         return b"".join((data, summary, builder.end(), MAGIC))
 
     def _groups(self) -> Iterator[tuple[Opcode, bytes]]:
-        """Yield the records of the summary, by kind."""
+        """Yield the records of the summary, grouped by kind."""
         yield Opcode.SCHEMA, b"".join(self._schemas.values())
         yield Opcode.CHANNEL, b"".join(self._channels.values())
         yield Opcode.STATISTICS, _written(self._statistics())

@@ -1,4 +1,4 @@
-"""Follow an instance: everything its blocks publish, steps, and changes of processes, in order."""
+"""Reads the frames, events, steps and process changes of an instance, in order."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from shmio.segment.events import EVENT_SIZE
 from shmio.segment.processes import Phase, ProcessSlot
 
 TURN_S: Final = 0.1
-"""Longest pause between two turns."""
+"""Longest pause between two turns of the recorder."""
 LIVELY: Final = 256
-"""With more entries of a block in a turn the next turn comes sooner: many commands fill an event ring fast."""
+"""Entries of one block in a turn above which the next turn comes sooner.
+
+Many commands fill an event ring fast.
+"""
 BATCH_BYTES: Final = 2 << 20
-"""About how much of one block is read in a turn; the rest follows at once in the next."""
+"""Approximate number of bytes to read from one block in a turn; the next turn reads the rest."""
 
 _DOWN: Final[Mapping[Phase, ProcessEvent]] = {Phase.BACKOFF: ProcessEvent.DIED, Phase.FATAL: ProcessEvent.GAVE_UP}
 
@@ -26,7 +29,7 @@ Item = TypeVar("Item", bound=Frame | Event)
 
 
 class BlockEntry(NamedTuple):
-    """A frame, event or gap of a block, with its time in the recording."""
+    """A frame, an event or a gap of a block, with its time in the recording."""
 
     log_ns: int
     follower: BlockFollower
@@ -34,14 +37,14 @@ class BlockEntry(NamedTuple):
 
 
 class InstanceEntry(NamedTuple):
-    """A step or a change of a process, with its time in the recording."""
+    """A step or a process change of the instance, with its time in the recording."""
 
     log_ns: int
     item: StepMark | ProcessChange
 
 
 class _Stream(Generic[Item]):
-    """Position in the frames, or in the events, of a block."""
+    """The frames or the events of a block, with the position up to which they were read."""
 
     def __init__(self, what: str, cursor: Cursor[Item], log_ns: int, reason: Reason) -> None:
         self.what = what
@@ -58,7 +61,10 @@ class _Stream(Generic[Item]):
 
 
 class BlockFollower:
-    """Follows one block. ``done`` is True once a reload has retired the block and all of it was taken."""
+    """Reads the frames and events of one block in order.
+
+    ``done`` is True if a reload has retired the block and everything was read from it.
+    """
 
     def __init__(
         self,
@@ -76,11 +82,11 @@ class BlockFollower:
         Args:
             block: The block.
             number: Number of the block in the recording.
-            place: The position to start behind.
-            reason: Why entries at the start may be missing.
+            place: The position after which to start.
+            reason: Reason for a gap at the start.
             log_time: Converts CLOCK_MONOTONIC to the time in the recording.
-            over: Whether a reload had already retired the block.
-            part: The registers to record; None: all.
+            over: True if a reload has already retired the block.
+            part: The registers to record; None for all.
         """
         self.block = block
         self.number = number
@@ -94,8 +100,8 @@ class BlockFollower:
         self._events = _Stream("events", block.events.cursor(after=place.event), place.log_ns, reason)
 
     def take(self, limit: int) -> Iterator[BlockEntry]:
-        """Yield the entries published by now, at most about ``limit``."""
-        retired = self.block.retired  # before reading: what was published before the end is still read
+        """Yield the entries that were published so far, at most about ``limit``."""
+        retired = self.block.retired  # before the read, so that the last entries are read, too
         for _ in range(limit):
             side = self._next()
             if side is None:
@@ -105,25 +111,25 @@ class BlockFollower:
             yield from self._entries(side)
 
     def rest(self) -> Iterator[BlockEntry]:
-        """Yield the gaps at the end, behind the last entry."""
+        """Yield gaps for the missing frames and events after the last entry."""
         for side in (self._frames, self._events):
             if side.cursor.last > side.last and side.held is None:
                 yield BlockEntry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
 
     def _next(self) -> _Stream[Frame] | _Stream[Event] | None:
-        """Return the stream whose entry comes first."""
+        """Return the stream with the next entry; None if there is none."""
         frame = self._frames.peek()
         event = self._events.peek()
         if event is None:
             return None if frame is None else self._frames
         if frame is None and event.frame > self._frames.cursor.last:
-            frame = self._frames.peek()  # published between the two reads
+            frame = self._frames.peek()  # it was published between the two reads
         return self._events if frame is None or event.frame < frame.number else self._frames
 
     def _entries(self, side: _Stream[Frame] | _Stream[Event]) -> Iterator[BlockEntry]:
         item = side.held
-        assert item is not None  # noqa: S101  _next has looked
-        # Never decreasing: entries of a block stay in the order of their numbers, whatever its clock does.
+        assert item is not None  # noqa: S101  _next has polled it
+        # The time never decreases, so that entries stay in order even if the block's clock goes back.
         self._log_ns = log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(item.clock_ns)))
         if item.number > side.last + 1:
             yield BlockEntry(log_ns, self, self._gap(side, item.number - 1, log_ns))
@@ -146,7 +152,7 @@ class BlockFollower:
 
 
 class _ProcessState(NamedTuple):
-    """State of a process at one check."""
+    """The state of a process at one check."""
 
     kind: str
     phase: Phase
@@ -156,7 +162,7 @@ class _ProcessState(NamedTuple):
 
 
 class ProcessWatch:
-    """Finds changes in the process table. It reports an end even if the process is back at once."""
+    """Finds changes in the process table, including an end that is followed at once by a restart."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -174,7 +180,7 @@ class ProcessWatch:
         return changes
 
     def standing(self) -> list[ProcessChange]:
-        """Return the processes that run, or fail to, as of the last check."""
+        """Return the running and the failed processes at the last check, as changes."""
         found = []
         for name, state in self._known.items():
             what = ProcessEvent.IS if state.phase is Phase.RUNNING else _DOWN.get(state.phase)
@@ -199,7 +205,7 @@ def _between(name: str, old: _ProcessState | None, now: _ProcessState) -> Iterat
     phase = old.phase if old else Phase.STOPPED
     again = now.phase is Phase.STARTING or (old is not None and now.restarts > old.restarts)
     if old and phase is Phase.RUNNING and again and now.phase not in _DOWN:
-        crashed = now.restarts > old.restarts and now.why  # a requested restart leaves no reason
+        crashed = now.restarts > old.restarts and now.why  # a requested restart has no reason
         yield _change(name, old._replace(why=now.why), ProcessEvent.DIED if crashed else ProcessEvent.ENDED)
     if now.phase in _DOWN and now.phase is not phase:
         yield _change(name, now, _DOWN[now.phase])
@@ -210,39 +216,42 @@ def _between(name: str, old: _ProcessState | None, now: _ProcessState) -> Iterat
 
 
 class StartPositions(NamedTuple):
-    """Where to start: behind these positions, by section. Other blocks start at their first frame, or now."""
+    """The positions after which to start reading, by the section of each block.
+
+    Blocks without a position start at their oldest frame if ``first`` is True, else now.
+    """
 
     places: Mapping[int, BlockPosition] = {}
     first: bool = True
     reason: Reason = Reason.NOT_RUNNING
-    """Why entries at the start may be missing."""
+    """Reason for a gap at the start."""
 
 
 FROM_THE_FIRST: Final = StartPositions()
 
 
 class InstanceFollower:
-    """Reads everything that the blocks of an instance publish, each entry once. Use it from one thread.
+    """Reads each entry of an instance once, in order. Use it from one thread only.
 
-    It also follows blocks that a reload adds or replaces. Several files may be recorded from it one after
-    another, without losses in between.
+    It also follows blocks that a reload adds or replaces. Several files may be written from it one
+    after another; no entry is lost between them.
     """
 
     def __init__(
         self, segment: Segment, start: StartPositions = FROM_THE_FIRST, selection: Selection | None = None
     ) -> None:
-        """``selection``: the sources and registers to record; None: all."""
+        """Create the follower; ``selection`` has the sources and registers to record, None for all."""
         self.segment = segment
         self.start = start
         self.followers: list[BlockFollower] = []
-        """Followers of the present blocks, and of retired ones that are not read to their end."""
+        """Followers of present blocks, and of retired blocks that were not read to their end."""
         self.done = 0
-        """The last step of virtual time that was read completely."""
+        """Number of the last step of virtual time that was read completely."""
         self._selection = selection or Selection()
         self._watched: set[str] = set()
         self._watching: list[BlockFollower] = []
         self._seen: set[int] = set()
-        """Sections of the blocks that were already considered."""
+        """Sections of all blocks that were found so far."""
         self._blocks = 0
         self._lively = False
         self._watch = ProcessWatch(segment)
@@ -250,15 +259,16 @@ class InstanceFollower:
         self._follow(start)
 
     def again(self, start: StartPositions) -> InstanceFollower:
-        """Create a follower of the same instance and selection with another start."""
+        """Return a follower of the same instance and selection that starts at other positions."""
         tap = InstanceFollower(self.segment, start, self._selection)
         tap.done = self.done
         return tap
 
     def watch(self, sources: Collection[str]) -> None:
-        """Read these sources, too, from now on, even if they are not recorded.
+        """From now on, also read these sources, even if they are not recorded.
 
-        The followers of sources that are not recorded have number 0, and are not in :attr:`followers`.
+        The followers of sources that are not recorded have number 0. They are not in
+        :attr:`followers`.
         """
         self._watched |= set(sources)
         followed = {follower.block.section for follower in (*self.followers, *self._watching)}
@@ -271,17 +281,20 @@ class InstanceFollower:
         self._watching.append(BlockFollower(block, 0, place, Reason.OVERTAKEN, self.log_time))
 
     def log_time(self, monotonic_ns: int) -> int:
-        """Convert CLOCK_MONOTONIC to log time: UTC that no change of the host's clock affects."""
+        """Convert CLOCK_MONOTONIC to log time, in ns.
+
+        Log time is UTC, but changes of the host's clock do not affect it.
+        """
         head = self.segment.header
         return max(0, head.started_utc_ns + monotonic_ns - head.started_ns)
 
     def now(self) -> int:
-        """Return the present log time."""
+        """Return the present log time in ns."""
         return self.log_time(time.monotonic_ns())
 
     def take(self) -> tuple[list[BlockEntry | InstanceEntry], bool]:
-        """Read what has been published, in order; also returns whether there is more."""
-        state = self.segment.clock.read()  # before reading, so that all frames of the finished step are there
+        """Return new entries in order, and whether there are more."""
+        state = self.segment.clock.read()  # before the blocks, so that all frames of a finished step are read
         self.segment.refresh()
         if self.segment.blocks is not self._known:
             self._follow(FROM_THE_FIRST)
@@ -298,7 +311,7 @@ class InstanceFollower:
         self._lively = most > LIVELY
         self.followers = [follower for follower in self.followers if not follower.done]
         self._watching = [follower for follower in self._watching if not follower.done]
-        entries.sort(key=lambda entry: entry.log_ns)  # stable: a block's own order stays
+        entries.sort(key=lambda entry: entry.log_ns)  # stable: entries of a block stay in order
         if state.virtual and state.done > self.done and not more:
             entries += self._step(state)
         now_s = time.monotonic()
@@ -316,19 +329,19 @@ class InstanceFollower:
         return [InstanceEntry(now_ns, change) for change in changes]
 
     def rest(self) -> list[BlockEntry]:
-        """Return the gaps at the very end, behind the last entries."""
+        """Return gaps for what is missing after the last entries."""
         return [entry for follower in self.followers for entry in follower.rest()]
 
     @property
     def pause_s(self) -> float:
-        """Time to wait between two turns, far less than any ring holds."""
+        """Time to wait before the next turn, in s; rings keep entries much longer."""
         rings = [follower.block.ring for follower in (*self.followers, *self._watching)]
         return min(
             [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]
         )
 
     def _step(self, state: Clock) -> list[InstanceEntry]:
-        """Return the end of a step that was read completely."""
+        """Return the mark of a step that was read completely."""
         self.done = state.done
         if state.done != state.step or not state.dt_ns:  # the length of that step is unknown
             return []
@@ -336,7 +349,7 @@ class InstanceFollower:
         return [InstanceEntry(log_ns, StepMark(state.step, state.time_ns, state.dt_ns))]
 
     def _follow(self, start: StartPositions) -> None:
-        """Follow new blocks, and retired ones that are not recorded completely."""
+        """Follow new blocks, and retired blocks that were not read completely."""
         self._known = self.segment.blocks
         ended = self.segment.ended
         for block in (*ended, *self._known.values()):

@@ -1,4 +1,4 @@
-"""Find recordings of earlier recorders, and where the last of them stopped."""
+"""Finds recordings of earlier recorders, and the position at which the last one ended."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from shmio.recording.reading.survey import survey
 from shmio.segment import Block, Segment
 
 ABOUT_BYTES: Final = 1 << 20
-"""How far to read for the metadata about the instance, which is the second record of a file."""
+"""Number of bytes to read for the metadata about the instance, the second record of a file."""
 MAX_FILES: Final = 256
-"""How many recordings are checked, the newest by name first."""
+"""Largest number of recordings to check, from the newest by name on."""
 
 log = logging.getLogger("shmio.recorder")
 
 
 def own_files(directory: Path, instance: str) -> list[Path]:
-    """Return the regular files of this user with names of recordings of this instance.
+    """Return this user's regular files whose names are those of recordings of this instance.
 
-    Files of other users are logged, and never touched.
+    Other files with such names are ignored, with a warning in the log.
     """
-    name = re.compile(rf"{re.escape(instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # not of a50-test
+    name = re.compile(rf"{re.escape(instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # does not match a50-test
     found: list[Path] = []
     strange: list[Path] = []
     for file in directory.glob(f"{instance}-*{SUFFIX}"):
         if name.fullmatch(file.name):
-            with suppress(OSError):  # removed just now
+            with suppress(OSError):  # it was removed meanwhile
                 (found if is_own(file.lstat()) else strange).append(file)
     if strange:
         more = f", and {len(strange) - 1} others," if len(strange) > 1 else ""
@@ -47,7 +47,7 @@ def own_files(directory: Path, instance: str) -> list[Path]:
 
 
 def is_own(status: os.stat_result) -> bool:
-    """Whether a status is that of a regular file of this user."""
+    """Return whether a file's status is that of a regular file of this user."""
     return stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
 
 
@@ -58,15 +58,15 @@ def about_of(file: Path, instance: str, by: str, beat: Callable[[], object] = la
         file: The file.
         instance: Name of the instance.
         by: Kind of recorder.
-        beat: Called regularly, as a sign of life.
+        beat: Called regularly, as a heartbeat.
 
     Returns:
-        The metadata; empty if the file is of another instance or kind of recorder, or was made from
-        other recordings.
+        The metadata. It is empty if the file is of another instance or another kind of recorder, or
+        was made from other recordings.
 
     Raises:
         OSError: The file is not a regular file of this user, or cannot be read.
-        RecordingError: It is not a recording.
+        RecordingError: The file is not a recording.
     """
     with Reader(file, own=True, beat=beat) as reader:
         for record in reader.records.walk(to=ABOUT_BYTES):
@@ -82,16 +82,16 @@ def about_of(file: Path, instance: str, by: str, beat: Callable[[], object] = la
 def last_positions(
     directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None
 ) -> dict[int, BlockPosition]:
-    """Find the last recorded frame and event of each block in this run of the instance.
+    """Find the last recorded frame and event of each block, in recordings of this run.
 
     Args:
         directory: Directory of the recordings.
         segment: The instance's segment.
         by: Kind of recorder.
-        beat: Called regularly, as a sign of life.
+        beat: Called regularly, as a heartbeat.
 
     Returns:
-        The positions by section; blocks that were not recorded are missing.
+        The positions by the sections of blocks. Blocks that were not recorded are not included.
     """
     found: dict[int, BlockPosition] = {}
     blocks = {block.section: block for block in (*segment.ended, *segment.blocks.values())}
@@ -101,14 +101,14 @@ def last_positions(
             with Reader(file, own=True, beat=beat) as reader:
                 found = _positions(reader, blocks) | found
         except (OSError, RecordingError) as error:
-            log.warning("it is unknown where the previous recording ended: %s", error)
+            log.warning("cannot find where the previous recording ended: %s", error)
         if found.keys() >= blocks.keys():
             break
     return found
 
 
 def trigger_interrupted(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> bool:
-    """Whether the previous recorder died while it wrote a triggered recording."""
+    """Return whether the previous recorder died while it wrote a triggered recording."""
     for file in _of_this_run(directory, segment, by, beat)[:1]:
         with suppress(OSError, RecordingError), Reader(file, own=True, beat=beat) as reader:
             return reader.records.footer() is None and "trigger" in about_of(file, segment.instance, by)
@@ -116,7 +116,10 @@ def trigger_interrupted(directory: Path, segment: Segment, by: str, beat: Callab
 
 
 def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], object]) -> list[Path]:
-    """Return the recordings of this run, the newest first; not by name, as the host's clock may go back."""
+    """Return the recordings of this run of the instance, from the newest to the oldest.
+
+    They are not sorted by name, because the host's clock may have been set back.
+    """
     epoch = f"{segment.header.epoch:016x}"
     found: list[tuple[int, Path]] = []
     for file in sorted(own_files(directory, segment.instance), reverse=True)[:MAX_FILES]:
@@ -131,7 +134,10 @@ def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], 
 
 
 def _positions(reader: Reader, blocks: dict[int, Block]) -> dict[int, BlockPosition]:
-    """Return the positions at the end of a file, or at its start for a block without intact entries."""
+    """Return the position of each block at the end of a file.
+
+    For a block without intact entries, it is the position at the start of the file.
+    """
     found = survey(reader)
     positions = {section: place for section, place in reader.places.items() if section in blocks}
     for channel in reader.channels.values():
@@ -145,7 +151,7 @@ def _positions(reader: Reader, blocks: dict[int, Block]) -> dict[int, BlockPosit
             try:
                 number = track.last(reader)
             except RecordingError as error:
-                log.warning("where the recording before ended is known from its beginning only: %s", error)
+                log.warning("the end of the previous recording is damaged; recording its entries again: %s", error)
                 track = None
         number = max(number, found.missed_to.get((channel.source, channel.block, what), 0))
         frame, event, log_ns = positions.get(channel.section, BlockPosition())

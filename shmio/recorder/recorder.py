@@ -1,4 +1,4 @@
-"""Record what an instance publishes: to one file, or to a sequence of files with rotation by size and age."""
+"""Records an instance to one file, or to a sequence of files rotated by size and age."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from shmio.segment import Event, Frame
 from shmio.version import __version__
 
 MAX_FILE_BYTES: Final = 16 << 20
-"""Limit on an attached file."""
+"""Largest size of a file that is attached to a recording."""
 CHUNK_S: Final = 0.8
-"""Maximum duration of a chunk. With a turn and the time to write it, a kill costs less than a second."""
+"""Longest duration of a chunk, so that a killed recorder loses less than a second."""
 CLOSE_S: Final = 3.0
 CHECK_S: Final = 1.0
-"""How often to check whether the file was removed."""
+"""Period at which to check whether the file was removed."""
 CONFIG_S: Final = 5.0
-"""How often to check whether the configuration has changed."""
+"""Period at which to check whether the configuration has changed."""
 RENEWAL: Final = Backoff(1.0, 600.0)
-"""Waits between new files for a disk whose fsync keeps failing."""
+"""Back-off between new files while fsync fails repeatedly."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -54,23 +54,26 @@ class AttachedFile(NamedTuple):
 
 
 AttachedFiles = Callable[[str | None, int], list[AttachedFile]]
-"""Returns the files to attach, given a source's name and its block's number; for None those of the instance."""
+"""Returns the files to attach for a source's name and its block's number.
+
+With None, it returns the files of the instance.
+"""
 
 
 def no_attachments(_source: str | None, _block: int) -> list[AttachedFile]:
-    """Attach no files."""
+    """Return no files to attach."""
     return []
 
 
 class ConfigFiles:
-    """Reads the files that a configuration names. One that cannot be read is left out and logged."""
+    """Reads the files that a configuration names; skips and logs those that cannot be read."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._told: set[str] = set()
 
     def __call__(self, source: str | None, block: int) -> list[AttachedFile]:
-        """Read the configuration (for None), or the files of a source's layout, as they are now."""
+        """Return the present files of a source's layout, or the configuration file if it is None."""
         if source is None:
             return self._read("config", [self._file], TOML)
         try:
@@ -99,7 +102,7 @@ class ConfigFiles:
         return found
 
     def _tell(self, why: str) -> None:
-        """Log a reason once, although the files are read again and again."""
+        """Log each message only once, although the files are read repeatedly."""
         if why not in self._told:
             self._told.add(why)
             log.warning("%s", why)
@@ -107,7 +110,7 @@ class ConfigFiles:
 
 @dataclass(slots=True)
 class _LostRange:
-    """Numbers of frames or events that were lost for want of room."""
+    """The first and the last number of frames or events that were lost because the buffer was full."""
 
     first: int
     last: int
@@ -120,7 +123,10 @@ class _LostRange:
 
 @dataclass(slots=True)
 class RecordedBlock:
-    """A block in one file: where it begins there, and the last frame and event written, or in a gap."""
+    """A block in one file, with its first position and the last frame and event recorded.
+
+    Frames and events in a gap count as recorded.
+    """
 
     follower: BlockFollower
     begin: BlockPosition
@@ -129,11 +135,11 @@ class RecordedBlock:
     log_ns: int
     channels: Channels | None = None
     lost: dict[str, _LostRange] = field(default_factory=dict)
-    """Lost frames and events, not yet recorded as gaps."""
+    """Lost frames and events that are not yet recorded as gaps."""
 
     @property
     def place(self) -> BlockPosition:
-        """The position behind the last written entry."""
+        """The position after the last recorded entry."""
         return BlockPosition(self.frame, self.event, self.log_ns)
 
     @property
@@ -142,7 +148,7 @@ class RecordedBlock:
         return sum(lost.count for lost in self.lost.values())
 
     def come_to(self, what: str, number: int, log_ns: int) -> None:
-        """Note that frames or events up to this number were written, or are in a written gap."""
+        """Store that all frames or events up to this number were recorded."""
         self.log_ns = log_ns
         if what == "frames":
             self.frame = number
@@ -150,7 +156,7 @@ class RecordedBlock:
             self.event = number
 
     def lose(self, item: Frame | Event | Gap) -> int:
-        """Note that there is no room for an item; returns how many frames or events are lost."""
+        """Count an item as lost, and return the number of its frames or events."""
         if isinstance(item, Gap):
             what, first, last = item.what, item.first, item.last
         else:
@@ -160,7 +166,7 @@ class RecordedBlock:
         return last - first + 1
 
     def found(self, before_ns: int) -> list[Gap]:
-        """Return the lost entries as gaps, and forget them."""
+        """Return gaps for the lost entries, and reset these."""
         block = self.follower.block
         lost, self.lost = self.lost, {}
         return [
@@ -174,7 +180,7 @@ class RecordedBlock:
 
 @dataclass(slots=True)
 class Counters:
-    """Numbers of recorded frames and events, and of missed ones."""
+    """Numbers of recorded frames and events, and of missed frames and events."""
 
     frames: int = 0
     events: int = 0
@@ -182,7 +188,7 @@ class Counters:
 
 
 class Recorder:
-    """Records to one file. From one thread, call :meth:`turn` repeatedly, then :meth:`close`."""
+    """Records to one file. Call :meth:`turn` repeatedly, then :meth:`close`, from one thread."""
 
     def __init__(
         self,
@@ -201,21 +207,22 @@ class Recorder:
             tap: Follows the instance.
             output: The file.
             by: Kind of recorder.
-            places: Positions by section where the previous file ended; None: where ``tap`` started.
-            about: Further metadata about the recording.
-            counters: Counters to continue; None: new ones.
+            places: Positions by section at which the previous file ended; None for those at which
+                ``tap`` started.
+            about: More metadata about the recording.
+            counters: Counters to continue; None for new ones.
             attachments: Returns the files to attach.
         """
         self.tap = tap
         self.output = output
         self.counters = counters or Counters()
         self.places = dict(tap.start.places if places is None else places)
-        """Positions of the recording by section, as of the last :meth:`settle`."""
+        """Positions by section up to which entries were recorded, as of the last :meth:`settle`."""
         self.confirmed: Mapping[int, BlockPosition] = dict(self.places)
-        """Positions of the recording by section up to which it is certainly on the disk."""
+        """Positions by section up to which an fsync has confirmed the recording."""
         self._ended = False
         self.empty = True
-        """Whether nothing was recorded yet except changes of processes."""
+        """True if nothing was recorded yet except process changes."""
         self._attachments = attachments
         self._writer = Writer(output, {**self._about(by), **(about or {})})
         self._followed: dict[int, RecordedBlock] = {}
@@ -223,7 +230,7 @@ class Recorder:
         self._config = attachments(None, 0)
         self._attach(self._config)
         self._unaware = True
-        """Whether the file does not have the state of the processes yet."""
+        """True if the present state of the processes must be recorded next."""
         self._to_confirm: tuple[int, dict[int, BlockPosition]] | None = None
         self._writer.places(self.places)
         for follower in tap.followers:
@@ -249,13 +256,21 @@ class Recorder:
         }
 
     def turn(self) -> bool:
-        """Record what has been published; returns whether there is more. RecordingError: the file was removed."""
+        """Record new entries, and return whether there are more.
+
+        Raises:
+            RecordingError: The file was removed.
+        """
         entries, more = self.tap.take()
         self.put(entries)
         return more
 
     def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
-        """Record entries, and end the chunk if it is due. RecordingError: the file was removed."""
+        """Record entries, and end the chunk if it is due.
+
+        Raises:
+            RecordingError: The file was removed.
+        """
         for follower in self.tap.followers:
             self._known(follower)
         full = self.output.full
@@ -269,7 +284,7 @@ class Recorder:
                 self._write(entry)
         if not full:
             for followed in self._followed.values():
-                if followed.lost and followed.follower.done:  # no later entry would trigger the gap
+                if followed.lost and followed.follower.done:  # no later entry will record the gap
                     self._tell_lost(followed, 0)
         now_s = time.monotonic()
         if now_s - self._flushed_s >= CHUNK_S - TURN_S / 2:
@@ -284,7 +299,10 @@ class Recorder:
             self._look()
 
     def _confirm(self) -> None:
-        """Update :attr:`confirmed` from the synced bytes, and note the present position as the next one."""
+        """Update :attr:`confirmed` if the bytes of the stored positions were synced.
+
+        Then store the present positions for the next update.
+        """
         if self._to_confirm and self.output.synced >= self._to_confirm[0]:
             self.confirmed, self._to_confirm = self._to_confirm[1], None
         if not self._to_confirm and not self.losing:
@@ -292,23 +310,23 @@ class Recorder:
             self._to_confirm = self.output.tell(), dict(self.places)
 
     def settle(self) -> None:
-        """Bring :attr:`places` up to date."""
+        """Update :attr:`places`."""
         self.places |= {section: followed.place for section, followed in self._followed.items()}
 
     @property
     def losing(self) -> bool:
-        """Whether entries were lost for want of room, and are not yet recorded as gaps."""
+        """True if entries were lost because the buffer was full, and no gap is recorded for them yet."""
         return any(followed.lost for followed in self._followed.values())
 
     @property
     def problem(self) -> str:
-        """Description of the present problem; empty: none."""
+        """The present problem of the file or its disk; empty if there is none."""
         problem = self.output.problem
         lost = sum(followed.losses for followed in self._followed.values())
         return f"{problem}; {lost} frames and events lost so far" if problem and lost else problem
 
     def end(self) -> None:
-        """Write index and footer, without waiting for the disk. Further calls do nothing."""
+        """Write the index and the footer, without waiting for the disk. Later calls do nothing."""
         if self._ended:
             return
         self._ended = True
@@ -319,7 +337,7 @@ class Recorder:
         self.output.end()
 
     def close(self, patience_s: float = CLOSE_S) -> bool:
-        """Record what is there, and close the file; returns False if the disk was too slow."""
+        """Record all remaining entries, and close the file. Return False if the disk was too slow."""
         while self.turn():
             pass
         self.put(self.tap.rest())
@@ -332,7 +350,7 @@ class Recorder:
         return self._followed.get(follower.block.section) or self._follow(follower)
 
     def _follow(self, follower: BlockFollower) -> RecordedBlock:
-        """Start with a block: attach the files that are needed to read it."""
+        """Begin to record a block, and attach the files that are needed to read it."""
         block = follower.block
         place = self.places.get(block.section, follower.begin)
         followed = self._followed[block.section] = RecordedBlock(follower, place, *place)
@@ -340,12 +358,12 @@ class Recorder:
         if layout.hash not in self._attached:
             self._attached.add(layout.hash)
             self._attach([AttachedFile(f"layouts/{layout.hash.hex()}.json", JSON, layout.to_json())])
-        if not follower.over:  # the files on disk belong to the block's successor
+        if not follower.over:  # otherwise the files on disk are those of a newer block
             self._attach(self._attachments(block.source, follower.number))
         return followed
 
     def _look(self) -> None:
-        """Attach the configuration again if it has changed."""
+        """Attach the configuration file again if it has changed."""
         now = self._attachments(None, 0)
         if now and [(one.name, one.data) for one in now] != [(one.name, one.data) for one in self._config]:
             self._config = now
@@ -397,7 +415,7 @@ class Recorder:
             self.counters.missed += self._known(entry.follower).lose(entry.item)
 
     def _tell_lost(self, followed: RecordedBlock, before_ns: int) -> None:
-        """Record lost entries as gaps, before the entry that follows them."""
+        """Record gaps for lost entries, before the entry that follows them."""
         for gap in followed.found(before_ns):
             log_ns = before_ns or self.tap.now()
             self._writer.gap(gap, log_ns)
@@ -405,16 +423,17 @@ class Recorder:
 
 
 def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:
-    """Whether an entry is a change of a process."""
+    """Return whether an entry is a process change."""
     return isinstance(entry.item, ProcessChange)
 
 
 class RotatingRecorder:
-    """Records to a new file whenever the present one is large or old enough; nothing is lost in between.
+    """Records to a sequence of files: starts a new file when the present one is large or old enough.
 
-    It also starts a new file after a failed fsync, when it is unknown what the disk has of the old one. The
-    new file begins where the old one is certainly on the disk: it records again what the rings still hold,
-    and a gap for the rest.
+    No entry is lost between two files. It also starts a new file after a failed fsync, because part
+    of the old file may be lost. The new file begins at the last position that an fsync has
+    confirmed: it has the entries after this position that are still in the rings, and a gap for the
+    others.
     """
 
     def __init__(
@@ -435,10 +454,10 @@ class RotatingRecorder:
             settings: Settings of the recorder.
             by: Kind of recorder.
             attachments: Returns the files to attach.
-            places: Positions by section where the recording begins. With them the caller reads from
-                ``tap`` and calls :meth:`put`.
-            about: Further metadata about the recording.
-            counters: Counters to continue; None: new ones.
+            places: Positions by section at which the recording begins. If given, the caller reads
+                from ``tap`` and calls :meth:`put`.
+            about: More metadata about the recording.
+            counters: Counters to continue; None for new ones.
 
         Raises:
             RecordingError: No file can be created.
@@ -449,7 +468,7 @@ class RotatingRecorder:
         self._renewals = 0
         self._again_s = 0.0
         self._ending: list[Recorder] = []
-        """Recorders of earlier files that still wait for the disk."""
+        """Recorders of earlier files that are not completely written yet."""
         self.counters = counters or Counters()
         self._takes = places is None
         self._why = dict(about or {})
@@ -472,26 +491,34 @@ class RotatingRecorder:
         )  # fmt: skip
 
     def turn(self) -> bool:
-        """Record what has been published; returns whether there is more. RecordingError: the file was removed."""
+        """Record new entries, and return whether there are more.
+
+        Raises:
+            RecordingError: The file was removed.
+        """
         return self.recorder.turn()
 
     def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
-        """Record entries. RecordingError: the file was removed."""
+        """Record entries.
+
+        Raises:
+            RecordingError: The file was removed.
+        """
         self.recorder.put(entries)
 
     def end(self) -> Mapping[int, BlockPosition]:
-        """End the recording, without waiting for the disk; returns the last positions by section."""
+        """End the recording without waiting for the disk, and return the last positions by section."""
         self.recorder.end()
         return self.recorder.places
 
     @property
     def ended(self) -> bool:
-        """Whether the disk has everything, after :meth:`end`."""
+        """True if all files are completely written after :meth:`end`."""
         return all(recorder.output.ended for recorder in (*self._ending, self.recorder))
 
     @property
     def tap(self) -> InstanceFollower:
-        """The follower of the instance; it is replaced when a file is given up."""
+        """The follower of the instance; a new one replaces it after a failed fsync."""
         return self.recorder.tap
 
     @property
@@ -511,11 +538,11 @@ class RotatingRecorder:
 
     @property
     def problem(self) -> str:
-        """Description of the present problem; empty: none."""
+        """The present problem of a file or its disk; empty if there is none."""
         return next(filter(None, (recorder.problem for recorder in (*self._ending, self.recorder))), "")
 
     def tend(self) -> bool:
-        """Start a new file if one is due; returns whether a doubtful file was given up."""
+        """Start a new file if one is due. Return True if it replaces a file with a failed fsync."""
         for old in [old for old in self._ending if old.output.ended and not old.output.doubt]:
             old.output.close(0)
             self._ending.remove(old)
@@ -529,12 +556,12 @@ class RotatingRecorder:
         return False
 
     def present(self) -> set[Path]:
-        """Return the files being written. Another thread may call it."""
+        """Return the files that are being written. Any thread may call it."""
         return {recorder.output.path for recorder in (*self._ending, self.recorder)}
 
     @property
     def _due(self) -> bool:
-        """Whether rotation is due; never while the disk has a problem, which a new file would not solve."""
+        """True if rotation is due and the disk has no problem, which a new file would not solve."""
         settings, recorder = self._settings, self.recorder
         old = bool(settings.rotate_min) and time.monotonic() - self._begun_s >= settings.rotate_min * 60
         large = bool(settings.rotate_mb) and recorder.output.tell() >= settings.rotate_mb * 1e6
@@ -563,7 +590,7 @@ class RotatingRecorder:
         tap, places = self.tap, None
         if self._takes:
             tap = tap.again(StartPositions(doubtful.confirmed, True, Reason.UNSURE))
-        else:  # the caller reads the instance, and cannot repeat the doubtful entries
+        else:  # the caller reads the instance, and cannot record the doubtful entries again
             self.recorder.settle()
             places = self.recorder.places
         try:
@@ -586,7 +613,10 @@ class RotatingRecorder:
         return self.recorder.output.close(patience_s)
 
     def close(self, patience_s: float = CLOSE_S) -> list[str]:
-        """Record what is there, and close all files; returns a problem for each incomplete one."""
+        """Record all remaining entries, and close all files.
+
+        Return the problem of each file that is incomplete.
+        """
         until_s = time.monotonic() + patience_s
         files = [*self._ending, self.recorder]
         closed = [old.output.close(max(0.0, until_s - time.monotonic())) for old in self._ending]

@@ -1,4 +1,4 @@
-"""Record when a trigger fires: a file for each trigger, including the seconds before it."""
+"""Records to a file when a trigger fires, including the seconds before it."""
 
 from __future__ import annotations
 
@@ -22,30 +22,34 @@ from shmio.segment import Block, Frame, Quality
 from shmio.segment.block import Layouts
 
 ENTRY_BYTES: Final = 800
-"""Approximate memory of an entry besides its images."""
+"""Approximate memory of an entry without its images, in bytes."""
 
 log = logging.getLogger("shmio.recorder")
 
 
 class Trigger:
-    """The trigger's condition, evaluated at each frame of a source that it reads.
+    """Evaluates the trigger's condition at each frame of a source that it reads.
 
-    It uses the values that consumers see, and ignores bad frames.
+    The condition reads the values that readers see. The values of a bad frame are unknown.
     """
 
     def __init__(self, when: str, blocks: Mapping[str, Block]) -> None:
-        """Compile the condition. ConfigError: it is invalid, or reads unknown registers."""
+        """Compile the condition.
+
+        Raises:
+            ConfigError: The condition is invalid, or reads unknown registers.
+        """
         self.when = when
         self._blocks = blocks
         self._bind(blocks)
 
     def follow(self, blocks: Mapping[str, Block]) -> None:
-        """Find the registers again after a reload. While one is missing, the condition is false."""
+        """Find the registers again after a reload. If one is missing, the trigger does not fire."""
         if blocks is not self._blocks:
             try:
                 self._bind(blocks)
             except ConfigError as error:
-                log.warning("the trigger waits for what it reads: %s", error)
+                log.warning("the trigger cannot fire until its registers are there again: %s", error)
                 self._blocks, self._condition = blocks, NEVER
 
     def _bind(self, blocks: Mapping[str, Block]) -> None:
@@ -58,7 +62,7 @@ class Trigger:
         self._memory = Memory()
 
     def sees(self, entry: BlockEntry | InstanceEntry) -> bool:
-        """Whether the condition is true with this entry."""
+        """Return whether the condition is true at this entry."""
         if isinstance(entry, InstanceEntry) or not isinstance(entry.item, Frame):
             return False
         source = self._sections.get(entry.follower.block.section, "")
@@ -76,20 +80,20 @@ class Trigger:
 
 
 class PreTriggerBuffer:
-    """The entries of the last seconds before a trigger, within a limit of memory."""
+    """Stores the entries of the last seconds before a trigger, within a limit of memory."""
 
     def __init__(self, before_s: float, limit_bytes: int, places: Mapping[int, BlockPosition]) -> None:
-        """``places``: positions by section behind which the buffer starts."""
+        """Create the buffer; ``places`` are the positions by section after which it starts."""
         self._before_ns = round(before_s * 1e9)
         self._limit = limit_bytes
         self._entries: deque[BlockEntry | InstanceEntry] = deque()
         self._size = 0
         self._told = False
         self.places = dict(places)
-        """Positions by section behind which the buffer starts now."""
+        """Positions by section after which the buffer starts at present."""
 
     def add(self, entry: BlockEntry | InstanceEntry) -> None:
-        """Add an entry. Gaps from before this recorder ran are ignored."""
+        """Add an entry. A gap from before this recorder was started is not stored."""
         item = entry.item
         if isinstance(item, Gap) and item.reason is not Reason.OVERTAKEN:
             self._pass(entry)
@@ -107,7 +111,7 @@ class PreTriggerBuffer:
             self._drop()
 
     def before(self, log_ns: int) -> list[BlockEntry | InstanceEntry]:
-        """Return the entries of the seconds before a time, the oldest first, from :attr:`places` on."""
+        """Return the stored entries of the seconds before a time, the oldest first."""
         self._trim(log_ns)
         return list(self._entries)
 
@@ -140,18 +144,22 @@ def _size(entry: BlockEntry | InstanceEntry) -> int:
 
 
 class TriggeredRecorder:
-    """Records from some seconds before each trigger until some seconds after it, to a file of its own.
+    """Records a file for each trigger, from some seconds before it until some seconds after it.
 
-    A trigger that comes while a file is being written prolongs that file.
+    If the trigger fires again while a file is being written, that file becomes longer.
     """
 
     def __init__(
         self, tap: InstanceFollower, settings: Settings, trigger: TriggerSettings, by: str, attachments: AttachedFiles,
         *, going: bool = False,
     ) -> None:  # fmt: skip
-        """Wait for the trigger, or continue.
+        """Create the recorder, which waits for the trigger.
 
-        ``going``: the previous recorder died during a triggered recording. ConfigError: the condition is wrong.
+        If ``going`` is True, it records at once, because the previous recorder died during a
+        triggered recording.
+
+        Raises:
+            ConfigError: The condition is invalid.
         """
         self.counters = Counters()
         self.tap = tap
@@ -167,12 +175,16 @@ class TriggeredRecorder:
         self._until_ns = 0
         self._came_s = time.monotonic()
         self._problem = ""
-        self._held = False  # whether no file was started because too much of earlier files waits for the disk
+        self._held = False  # no file was started, because too many bytes of earlier ones wait
         if going:
             self._begin(tap.now())
 
     def turn(self) -> bool:
-        """Read what was published, and record it if triggered; returns whether there is more. RecordingError."""
+        """Read new entries, and record them if the trigger has fired. Return whether there are more.
+
+        Raises:
+            RecordingError: The file was removed.
+        """
         self._trigger.follow(self.tap.segment.blocks)
         entries, more = self.tap.take()
         if entries:
@@ -185,7 +197,7 @@ class TriggeredRecorder:
             if self._trigger.sees(entry):
                 self._begin(entry.log_ns)
             if isinstance(entry, BlockEntry) and not entry.follower.number:
-                continue  # only the condition needs it
+                continue  # it is read only for the condition
             if self._series:
                 batch.append(entry)
             else:
@@ -194,11 +206,11 @@ class TriggeredRecorder:
             self._series.put(batch)
             silent_s = time.monotonic() - self._came_s
             if not self.tap.segment.clock.read().virtual and silent_s > self._times.after_s + TURN_S:
-                self._end([])  # no later entry would end it; a replay's times are not the host's
+                self._end([])  # no later entry will end the file; not in virtual time, whose times are not the host's
         return more
 
     def _begin(self, log_ns: int) -> None:
-        """Start a file with the seconds before, or prolong the present one."""
+        """Start a file with the stored entries, or record to the present file for longer."""
         self._until_ns = log_ns + round(self._times.after_s * 1e9)
         if self._series is not None:
             return
@@ -215,7 +227,7 @@ class TriggeredRecorder:
                 self.tap, self._settings, self._by, self._attachments,
                 places=self._backlog.places, about=about, counters=self.counters,
             )  # fmt: skip
-        except RecordingError as error:  # retried with the next frame that fires
+        except RecordingError as error:  # the next frame that fires the trigger retries
             if not self._problem:
                 log.error("%s: %s", self._trigger.when, error)
             self._problem = str(error)
@@ -229,7 +241,7 @@ class TriggeredRecorder:
         if series := self._series:
             series.put(last)
             self._backlog = self._anew(series.end())
-            self._ending.append(series)  # first, as another thread may call present()
+            self._ending.append(series)  # before the next line: another thread may call present()
             self._series = None
 
     def _anew(self, places: Mapping[int, BlockPosition]) -> PreTriggerBuffer:
@@ -241,7 +253,7 @@ class TriggeredRecorder:
         return [*self._ending, *([present] if present else [])]
 
     def tend(self) -> bool:
-        """Close finished files; returns whether a doubtful file was given up."""
+        """Close finished files. Return True if a new file replaces one with a failed fsync."""
         for series in [series for series in self._ending if series.ended]:
             for unclosed in series.close(0):
                 log.error("%s", unclosed)
@@ -250,12 +262,12 @@ class TriggeredRecorder:
 
     @property
     def problem(self) -> str:
-        """Description of the present problem; empty: none."""
+        """The present problem of a file or its disk; empty if there is none."""
         return next(filter(None, (series.problem for series in self._all)), self._problem)
 
     @property
     def file(self) -> Path | None:
-        """Path of the present file; None while it waits for the trigger."""
+        """Path of the present file; None while the recorder waits for the trigger."""
         return self._series.file if self._series else None
 
     @property
@@ -264,11 +276,14 @@ class TriggeredRecorder:
         return self._series.written if self._series else 0
 
     def present(self) -> set[Path]:
-        """Return the files being written. Another thread may call it."""
+        """Return the files that are being written. Any thread may call it."""
         return {path for series in self._all for path in series.present()}
 
     def close(self, patience_s: float = CLOSE_S) -> list[str]:
-        """Record what is there, and close all files; returns a problem for each incomplete one."""
+        """Record all remaining entries, and close all files.
+
+        Return the problem of each file that is incomplete.
+        """
         while self.turn():
             pass
         self._end(self.tap.rest())

@@ -211,9 +211,9 @@ def test_a_full_disk_leaves_the_file_unchanged_with_a_log_line(segment: Segment,
     before = old.read_bytes()
     limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({len(before)}, resource.RLIM_INFINITY))"
     with Process(segment, tmp_path, before=limit) as second:
-        until(lambda: "stays as it is: " in second.log.read_text() if second.log.exists() else False, "the log line")
+        until(lambda: "is left unchanged: " in second.log.read_text() if second.log.exists() else False, "the log line")
         second.popen.kill()
-    assert f"{old} stays as it is: [Errno {errno.EFBIG}]" in second.log.read_text()
+    assert f"{old} is left unchanged: [Errno {errno.EFBIG}]" in second.log.read_text()
     assert before.startswith(old.read_bytes())
     assert numbers(old) == list(range(1, 21))
 

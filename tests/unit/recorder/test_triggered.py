@@ -240,10 +240,10 @@ def test_the_process_reports_that_it_waits_and_closes_the_file_by_itself(segment
     writer = segment.writer("cell")
     trigger = {"when": "cell/count = 5", "before_s": 60, "after_s": 0.2}
     with Process(segment, tmp_path, trigger=trigger) as process:
-        until(lambda: process.slot.report.note == "to a file as soon as its trigger comes", "the trigger awaited")
+        until(lambda: process.slot.report.note == "to a file as soon as its trigger fires", "the trigger awaited")
         publish(writer, 6)
         until(lambda: process.slot.report.note.endswith(".mem"), "its file")
-        until(lambda: process.slot.report.note == "to a file as soon as its trigger comes", "the trigger awaited again")
+        until(lambda: process.slot.report.note == "to a file as soon as its trigger fires", "the trigger awaited again")
         assert process.stop() == 0
     [file] = files(process.folder)
     assert numbers(file) == [1, 2, 3, 4, 5, 6]
@@ -253,7 +253,7 @@ def test_a_recorder_killed_during_a_triggered_file_continues_it(segment: Segment
     writer = segment.writer("cell")
     trigger = {"when": "cell/count = 5", "before_s": 60, "after_s": 60}
     with Process(segment, tmp_path, trigger=trigger) as first:
-        until(lambda: first.slot.report.note == "to a file as soon as its trigger comes", "the trigger awaited")
+        until(lambda: first.slot.report.note == "to a file as soon as its trigger fires", "the trigger awaited")
         publish(writer, 10)
         until(lambda: first.counts("bytes") > 2000, "its file")
         kill(first.popen.pid)
