@@ -277,7 +277,7 @@ def test_invalid_requests_are_refused(rig: Rig) -> None:
     with pytest.raises(CommandError, match="there is no injection"):
         rig.client.lift(number + 1)
     del rig.owners[5]
-    with pytest.raises(CommandError, match=r"command queue .* has no owner"):
+    with pytest.raises(CommandError, match="owns its command queue"):
         rig.other.inject(["speed"])
 
 

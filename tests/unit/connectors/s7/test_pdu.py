@@ -55,10 +55,10 @@ def test_reads_octets_and_a_padded_odd_length() -> None:
 @pytest.mark.parametrize(
     ("frame", "text"),
     [
-        (changed(GOOD_ANSWER, _4=3), "several parts"),
+        (changed(GOOD_ANSWER, _4=3), "several TPDUs"),
         (changed(GOOD_ANSWER, _5=0x80), "ended the session"),
         (changed(GOOD_ANSWER, _5=0x70), "TPDU 0x70"),
-        (changed(GOOD_ANSWER, _6=0), "several parts"),
+        (changed(GOOD_ANSWER, _6=0), "several TPDUs"),
         (changed(GOOD_ANSWER, _7=0x72), "does not speak S7"),
         (changed(GOOD_ANSWER, _8=1), "ROSCTR 1"),
         (changed(GOOD_ANSWER, _8=2), "without data"),
@@ -71,7 +71,7 @@ def test_reads_octets_and_a_padded_odd_length() -> None:
         (changed(GOOD_ANSWER, _20=2), "not an answer to a read"),
         (changed(GOOD_ANSWER, _22=3), "transport size 0x03"),
         (changed(GOOD_ANSWER, _24=0x21), "transport size 0x04"),
-        (changed(GOOD_ANSWER, _24=0x28), "4 bytes of data names 5"),
+        (changed(GOOD_ANSWER, _24=0x28), "4 bytes of data, its header says 5"),
         (memoryview(GOOD_ANSWER[:18]), "too short"),
     ],
 )
@@ -114,7 +114,7 @@ def test_session_has_the_lower_limits_of_both_sides() -> None:
 @pytest.mark.parametrize(
     ("frame", "text"),
     [
-        (changed(GRANT, _12=8), "not made"),
+        (changed(GRANT, _12=8), "not sent"),
         (changed(GRANT, _19=4), "not an answer to 'setup"),
         (changed(GRANT, _25=0, _26=20), "only 20 bytes"),
         (changed(GRANT, _17=0x81, _18=0x04), "PUT/GET"),
