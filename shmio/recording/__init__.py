@@ -1,1 +1,1 @@
-"""Recordings (docs/reference/dump-format.md): read, write, rewrite, compare and export them."""
+"""Reads, writes, rewrites, compares and exports recordings (docs/reference/dump-format.md)."""

@@ -1,4 +1,4 @@
-"""Derive declared injections that repeat the injections of a recording."""
+"""Derives declared injections that repeat the injections of a recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NS = 1e9
 
 @dataclass(slots=True)
 class _HeldValue:
-    """A value that a client gave, and its time."""
+    """A value that a client has set with an injection, and its time."""
 
     place: Place
     since_ns: int
@@ -26,23 +26,23 @@ class _HeldValue:
 
 @dataclass(slots=True)
 class _RecordedInjection:
-    """An injection of the recording, the ``place``-th of its source."""
+    """An injection in the recording; ``place`` is its number among those of its source."""
 
     place: int
     name: str
     since_ns: int
     declaration: Declaration | None
-    """None: a client gave it values."""
+    """The declaration; None if a client has set the values."""
     priority: int = 0
     held: dict[str, _HeldValue] = field(default_factory=dict)
-    """The last given value of each path."""
+    """The last value that the client has set, by path."""
 
 
 @dataclass(slots=True)
 class Derived:
-    """Declarations by source, in the order in which they were laid.
+    """Declarations that repeat the injections of a recording, in the order of their begin per source.
 
-    ``left_out`` describes the injections of the recording that cannot be declared.
+    ``left_out`` has a message for each injection that cannot be repeated.
     """
 
     declarations: list[Declaration] = field(default_factory=list)
@@ -50,11 +50,11 @@ class Derived:
 
     @property
     def begin_s(self) -> float:
-        """Start of the first declaration in s; 0 if there is none, or it has no start."""
+        """The earliest start of the declarations in s; 0 if there are none or one has no start."""
         return min((one.start_s or 0.0 for one in self.declarations), default=0.0)
 
     def shifted(self, by_s: float) -> list[Declaration]:
-        """Return the declarations with times that are ``by_s`` earlier."""
+        """Return the declarations with all times ``by_s`` earlier."""
         return [
             msgspec.structs.replace(
                 one,
@@ -66,11 +66,12 @@ class Derived:
 
 
 def derive(dump: Dump) -> Derived:
-    """Derive declarations that repeat the injections of a recording, by times of the instance's clock.
+    """Derive declarations that repeat the injections of a recording at the same instance times.
 
-    A declared injection keeps its declaration and seed, limited to the time from laying to lifting. Each value
-    that a client's injection gave to consumers becomes a ``set`` until the next value. A client's injection
-    over ``/in`` cannot be declared, because its values depend on what is written.
+    A declared injection keeps its declaration and seed, limited to the time in which it existed.
+    Each value that a client has set over ``/out`` becomes a ``set``, until the next value. A
+    client's injection over ``/in`` cannot be declared, because its values depend on the writes of
+    other clients.
     """
     found = Derived()
     for source in dump.sources:
@@ -106,7 +107,7 @@ class _Source:
         declaration = None
         if event.writer == NO_WRITER:
             self._found.left_out.append(
-                f"{event.text}: no client laid it, but the configuration or a replayed recording"
+                f"{event.text}: no client has added it, but the configuration or a replayed recording"
             )
             return
         if "operation" in how:
@@ -117,7 +118,7 @@ class _Source:
                 return
         elif explained.direction == "in":
             self._found.left_out.append(
-                f"{event.text or event.injection}: a client gave it values over /in that depended on other writes"
+                f"{event.text or event.injection}: a client has set its values over /in, which depended on other writes"
             )
             return
         priority = how.get("priority", 0)
@@ -131,7 +132,7 @@ class _Source:
         if laid is None:
             if event.injection not in self._unknown:
                 self._unknown.add(event.injection)
-                self._found.left_out.append(f"{event.text or event.injection}: it was laid before the recording began")
+                self._found.left_out.append(f"{event.text or event.injection}: it was added before the recording began")
             return
         for place in explained.places:
             before = laid.held.get(place.path)
@@ -150,7 +151,7 @@ class _Source:
             self._declare(laid, laid.declaration, None if event.text == "over" else event.clock_ns)
 
     def end(self) -> None:
-        """End the recording; injections that are still active get no end."""
+        """Add the declarations of the source; injections that are still there get no end time."""
         for laid in self._laid.values():
             for held in laid.held.values():
                 self._set(laid, held, None)
@@ -171,9 +172,9 @@ class _Source:
     def _declare(
         self, laid: _RecordedInjection, one: Declaration, until_ns: int | None, since_ns: int | None = None
     ) -> None:
-        """Add a declaration, limited to a time.
+        """Add a declaration, limited to a range of time.
 
-        The extra ns is there because consumers see a change from the next cycle on.
+        1 ns is added to the times, because readers see a change from the next cycle on.
         """
         since_s = (max(0, laid.since_ns if since_ns is None else since_ns) + 1) / NS
         if since_s > max(one.start_s or 0.0, 1 / NS):
@@ -185,7 +186,10 @@ class _Source:
 
 
 def _named(found: Derived) -> Iterator[Declaration]:
-    """Yield the declarations with unique names. A new name changes the random values of an injection."""
+    """Yield the declarations with unique names.
+
+    A new name changes the random values of an injection, which is noted in ``left_out``.
+    """
     seen: dict[str, int] = {}
     for one in found.declarations:
         count = seen[one.name] = seen.get(one.name, 0) + 1
@@ -201,5 +205,5 @@ def _named(found: Derived) -> Iterator[Declaration]:
 
 
 def _round(seconds: float) -> float:
-    """Round to 1 ns, the resolution of recorded times."""
+    """Return the time, rounded to the 1 ns resolution of recorded times."""
     return round(seconds, 9)

@@ -1,4 +1,4 @@
-"""Verify a recording completely against its format (docs/reference/dump-format.md)."""
+"""Verifies a recording completely against its format (docs/reference/dump-format.md)."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
 
 MAX_TOLD: Final = 1000
-"""How many damaged places and problems are listed; all are counted."""
+"""Largest number of damaged places and problems that are listed; all are counted."""
 
 
 @dataclass(slots=True)
 class Findings:
-    """Result of a check."""
+    """The result of a check."""
 
     chunks: int = 0
     """Number of intact chunks."""
     messages: int = 0
     damage: list[Damage] = field(default_factory=list)
-    """The first unreadable places."""
+    """The first places that cannot be read."""
     problems: list[str] = field(default_factory=list)
-    """The first readable but inconsistent places."""
+    """The first places that can be read, but are inconsistent."""
     count: int = 0
     """Total number of damaged places and problems."""
 
     @property
     def whole(self) -> bool:
-        """Whether the recording is intact."""
+        """True if the recording is intact."""
         return self.count == 0
 
 
 def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findings:
-    """Verify all CRCs and messages, and that each block's numbers have no holes except gaps.
+    """Verify all CRCs and messages, and that each missing frame or event is in a gap.
 
     If the file was not closed, the existing part is checked.
 
     Args:
         reader: Reader of the file.
-        at: Called with the byte offset reached, as progress.
+        at: Called with the present byte offset, as progress.
 
     Raises:
         RecordingError: The file is not a recording of shmio.
@@ -65,7 +65,7 @@ class _Check:
         self._log = DamageLog(self._damaged)
         self._numbers = _Numbers(self._problem)
         self._chunk: Record | None = None
-        """The last chunk, whose messages are compared with its indexes."""
+        """The last chunk; its messages are compared with the indexes that follow it."""
         self._counts: dict[int, Count] = {}
         self._indexes: dict[int, Count] = {}
 
@@ -92,7 +92,11 @@ class _Check:
             self._log.add(record, error)
 
     def end(self) -> Findings:
-        """Return the findings; RecordingError if the file is not a recording of shmio."""
+        """Return the findings.
+
+        Raises:
+            RecordingError: The file is not a recording of shmio.
+        """
         self._log.end()
         self._reader.require_ours()
         return self._found
@@ -133,7 +137,7 @@ class _Check:
             self._problem(f"the chunk at byte {record.at}: its times differ from those of its messages")
 
     def _message(self, channel: Channel, data: memoryview) -> None:
-        if channel.encoding in (EVENT, FRAME) and len(data) >= U64.size:  # even if the rest cannot be decoded
+        if channel.encoding in (EVENT, FRAME) and len(data) >= U64.size:  # count it even if it cannot be decoded
             self._numbers.take(channel, *U64.unpack_from(data))
         item = self._reader.decode(channel, data)
         if isinstance(item, Gap):
@@ -144,17 +148,17 @@ class _Check:
         if count is None:
             raise RecordingError(f"{self._reader.file}: the index at byte {record.at} is damaged")
         channel = self._reader.channel(count.channel)
-        if channel is None or channel.encoding:  # or a message of another program
+        if channel is None or channel.encoding:  # not a message of another program
             self._indexes[count.channel] = count
 
     def _compare_indexes(self) -> None:
         if self._chunk is not None and self._indexes != self._counts:
             self._problem(f"the chunk at byte {self._chunk.at}: its indexes do not match its content")
 
-    # ---- the rest ----------------------------------------------------------------------------------------------------
+    # ---- the checksum of all data ------------------------------------------------------------------------------------
 
     def _check_data(self, record: Record) -> None:
-        """Check the CRC of the whole data, which covers metadata, times and indexes."""
+        """Check the CRC of all data, which also covers metadata, times and indexes."""
         self._log.end()
         (crc,) = U32.unpack(self._records.read(record.at, U32.size))
         if crc and self._found.whole and self._records.crc(0, record.start) != crc:
@@ -162,7 +166,7 @@ class _Check:
 
 
 class _Numbers:
-    """Checks that the numbers of each block's frames and events have no holes except gaps."""
+    """Checks that each missing number of a block's frames and events is in a gap."""
 
     def __init__(self, problem: Callable[[str], None]) -> None:
         self._problem = problem
@@ -171,7 +175,7 @@ class _Numbers:
         self._known: set[int] = set()
 
     def take(self, channel: Channel, number: int) -> None:
-        """Check the number of a frame or event."""
+        """Check the number of the next frame or event."""
         key = channel.source, channel.block, "frames" if channel.encoding == FRAME else "events"
         if channel.number not in self._known:
             self._known.add(channel.number)
@@ -181,7 +185,7 @@ class _Numbers:
         self._go_on(key, number, number)
 
     def gap(self, gap: Gap) -> None:
-        """Take a gap into account."""
+        """Check the numbers of the next gap."""
         self._go_on((gap.source, gap.block, gap.what), gap.first, gap.last)
 
     def _go_on(self, key: tuple[str, int, str], first: int, last: int) -> None:

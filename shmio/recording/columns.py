@@ -1,4 +1,4 @@
-"""Registers of a recording as numpy arrays, or as tables of pyarrow, pandas and polars."""
+"""The registers of a recording as numpy arrays, or as tables of pyarrow, pandas and polars."""
 
 from __future__ import annotations
 
@@ -27,24 +27,27 @@ if TYPE_CHECKING:
 Array = npt.NDArray[Any]
 
 FIELDS: Final = ("number", "cycle", "source_ns", "quality", "provenance")
-"""Fields of a frame's header that become columns."""
+"""The fields of a frame's header that become columns."""
 OF_FRAMES: Final = frozenset({"time", "source_time", "number", "cycle", "quality", "provenance"})
-"""Names of these columns and the times in tables."""
+"""The names of table columns that do not belong to registers."""
 DECODED_BYTES: Final = 1 << 20
-"""How many bytes of frames to decode at once."""
+"""Number of bytes of frames to decode at once."""
 
 
 @dataclass(frozen=True)
 class Columns(Mapping[str, Array]):
-    """Registers of one source over n frames: a mapping of paths to arrays of shape (n, …).
+    """The values of registers of one source in n frames, as a mapping.
+
+    The keys are the paths without the source; the values are arrays of shape (n, …).
 
     Attributes:
         source: Name of the source.
         registers: The registers.
-        time_ns: Log times, UTC, shape (n,).
+        time_ns: Log times, UTC, in ns, shape (n,).
         number: Numbers of the frames, shape (n,).
         cycle: Cycles of the source's schedule, shape (n,).
-        source_ns: The source's time stamps, shape (n,); 0 while it had no image, and values are zeros.
+        source_ns: Times at which the source had the values, in ns, shape (n,); 0 while it had none.
+            The values are zeros there.
         quality: 0 bad, 1 uncertain, 2 good; shape (n,).
         provenance: 0 live, 1 simulated, 2 replayed, 3 injected; shape (n,).
         values_by_path: The values, by path without the source.
@@ -61,7 +64,7 @@ class Columns(Mapping[str, Array]):
     values_by_path: Mapping[str, Array]
 
     def __getitem__(self, path: str) -> Array:
-        """Return a register's values, by its path without the source."""
+        """Return the values of the register with this path (without the source)."""
         return self.values_by_path[path]
 
     def __iter__(self) -> Iterator[str]:
@@ -71,11 +74,12 @@ class Columns(Mapping[str, Array]):
         return len(self.values_by_path)
 
     def to_arrow(self) -> pyarrow.Table:
-        """Convert to a pyarrow table: time (UTC, ns), source time, number, cycle, quality, provenance, registers.
+        """Return a pyarrow table with a row for each frame.
 
-        Types are native: arrays are lists of fixed size, POINTER and ANY are bytes. Null means that
-        the bytes are not a valid value of the type, or that the source never had an image. A register with
-        the name of another column is prefixed by its source.
+        The columns are time (UTC, ns), source time, number, cycle, quality, provenance, and the
+        registers with native types: arrays are lists of fixed size, POINTER and ANY are bytes. A
+        value is null if the bytes are not valid for the type, or if the source had no image yet. If
+        a register has the name of another column, its source is put before it.
 
         Raises:
             MissingLibraryError: pyarrow is not installed.
@@ -96,7 +100,10 @@ class Columns(Mapping[str, Array]):
         return arrow.Table.from_arrays(list(fields.values()), names=list(fields))
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Convert to a pandas data frame, indexed by time, with a column for each register and array element.
+        """Return a pandas data frame with a row for each frame.
+
+        The index is the time (UTC). The columns are number, cycle, quality, and one for each
+        register or array element.
 
         Raises:
             MissingLibraryError: pandas is not installed.
@@ -106,7 +113,7 @@ class Columns(Mapping[str, Array]):
         return pandas.DataFrame(data, index=pandas.to_datetime(self.time_ns, utc=True).rename("time"))
 
     def to_polars(self) -> polars.DataFrame:
-        """Convert to a polars data frame, with ``time`` as the first column, otherwise as :meth:`to_pandas`.
+        """Return a polars data frame with the columns of :meth:`to_pandas` after a column ``time``.
 
         Raises:
             MissingLibraryError: polars is not installed.
@@ -125,14 +132,14 @@ class Columns(Mapping[str, Array]):
 
 
 def heading(source: str, path: str, taken: Collection[str] = OF_FRAMES) -> str:
-    """Return a register's column name: its path, with the source before it if the name is taken."""
+    """Return a register's column name: its path; if that is in ``taken``, with its source before."""
     return f"{source}/{path}" if path in taken else path
 
 
 def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:
-    """Yield a column (path, values) for the register, or for each element of an array.
+    """Yield a column (path, values) for a register, or for each element of an array.
 
-    POINTER and ANY become hex digits.
+    Values of POINTER and ANY are converted to hex digits.
     """
     if values.dtype.kind == "V":
         texts = [bytes(value).hex() for value in values.reshape(-1)]
@@ -161,11 +168,15 @@ class Collector:
 
     @property
     def begun(self) -> bool:
-        """Whether the registers are known."""
+        """True if :meth:`begin` has set the registers."""
         return self._codec is not None
 
     def begin(self, block: DumpBlock, registers: Sequence[Register]) -> None:
-        """Set the registers of a block. RecordingError: their types differ from the previous ones."""
+        """Set the registers of the block whose frames follow.
+
+        Raises:
+            RecordingError: The types of the registers differ from those in the previous block.
+        """
         codec = record_codec(tuple(registers), block.layout.size, block.layout.byte_order)
         if self._codec is codec:
             return
@@ -177,7 +188,11 @@ class Collector:
         self._codec, self._registers = codec, tuple(registers)
 
     def add(self, block: DumpBlock, registers: Sequence[Register], batch: Batch) -> None:
-        """Add frames. RecordingError: as :meth:`begin`."""
+        """Add frames of a block.
+
+        Raises:
+            RecordingError: The types of the registers differ from those in the previous block.
+        """
         self.begin(block, registers)
         self._waiting.append(batch)
         self._waiting_bytes += batch.records.nbytes
@@ -198,13 +213,13 @@ class Collector:
 
     @property
     def bytes(self) -> int:
-        """Approximate number of bytes held."""
+        """Approximate number of bytes of the frames added since :meth:`columns`."""
         return self._waiting_bytes + sum(some.nbytes for some in self._decoded)
 
     def columns(self) -> Columns:
         """Return the columns of the frames added since the last call."""
         self._flush()
-        assert self._codec is not None  # noqa: S101  begin() came first
+        assert self._codec is not None  # noqa: S101  begin() was called before
         decoded = np.concatenate([np.empty(0, self._codec.dtype), *self._decoded])
         heads = np.concatenate([np.empty(0, [(name, HEAD[name]) for name in FIELDS]), *self._heads])
         header = {name: np.ascontiguousarray(heads[name]) for name in FIELDS}
@@ -216,7 +231,10 @@ class Collector:
 
 @lru_cache(maxsize=64)
 def record_codec(registers: tuple[Register, ...], size: int, byte_order: ByteOrder) -> FrameCodec:
-    """Return a codec for registers in a batch's records: images of ``size`` bytes behind a header."""
+    """Return a codec for registers in the records of a batch.
+
+    Each record is a header, followed by an image of ``size`` bytes.
+    """
     shifted = tuple(msgspec.structs.replace(register, offset=register.offset + HEAD.itemsize) for register in registers)
     return FrameCodec(Layout("", None, HEAD.itemsize + size, False, shifted, byte_order))
 
@@ -227,7 +245,7 @@ def _categories(arrow: Any, codes: npt.NDArray[np.uint8], names: tuple[str, ...]
 
 
 def _lists(arrow: Any, values: npt.NDArray[Any], unknown: npt.NDArray[np.bool_]) -> Any:
-    """Convert values of shape (n, …) to an array of n values or nested lists."""
+    """Return values of shape (n, …) as a pyarrow array of n values or nested lists."""
     mask = np.repeat(unknown, values[0].size) if len(values) and values.ndim > 1 else unknown
     plain = np.ascontiguousarray(values).reshape(-1)
     if plain.dtype.kind in "mM":

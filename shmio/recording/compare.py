@@ -1,4 +1,4 @@
-"""Compare two recordings, frame by frame and event by event."""
+"""Compares two recordings, frame by frame and event by event."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.playhead import OWN_WORDS
 
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
-"""Content of an event, which does not depend on the run."""
+"""The fields of an event that do not depend on the run."""
 MAX_EVENTS: Final = 4096
-"""Limit on events of one key in memory: while time is paused, one cycle may have any number."""
+"""Largest number of events with one key in memory; a cycle may have any number in paused time."""
 MAX_SHIFT: Final = 64
-"""Limit on the frames that one of two recordings lacks at the beginning of the first common key."""
+"""Largest number of frames with the first common key that one of two recordings may lack."""
 
 T = TypeVar("T", Frame, Event)
 _Pair = tuple[Entry[T] | None, Entry[T] | None]
@@ -33,10 +33,10 @@ _Groups = Iterator[tuple[int, Iterable[Entry[T]]]]
 
 @dataclass(slots=True)
 class RegisterDifference:
-    """A register that differs in ``count`` frames.
+    """A register whose values differ in ``count`` frames.
 
-    ``first`` has the log times, and ``values`` the values, of the first frames that differ;
-    ``largest`` is the largest difference of numbers.
+    ``first`` has the log times and ``values`` the values in the first pair of frames that differ.
+    ``largest`` is the largest difference, if the values are numbers.
     """
 
     count: int
@@ -47,9 +47,9 @@ class RegisterDifference:
 
 @dataclass(slots=True)
 class Difference:
-    """The first difference: log times, and numbers of the frames or events, in both recordings.
+    """The first difference, with the log times and numbers of the frames or events in both recordings.
 
-    None stands for a recording that lacks the frame or event.
+    They are None for a recording that lacks the frame or event.
     """
 
     times_ns: tuple[int | None, int | None]
@@ -59,7 +59,7 @@ class Difference:
 
 @dataclass(slots=True)
 class Side:
-    """Result of comparing the frames, or the events, of one source."""
+    """The result of comparing either the frames or the events of one source."""
 
     compared: int = 0
     differing: int = 0
@@ -69,14 +69,15 @@ class Side:
 
     @property
     def same(self) -> bool:
-        """Whether both recordings have the same frames or events."""
+        """True if both recordings have the same frames or events."""
         return not (self.differing or self.only_first or self.only_second)
 
 
 class Timing:
-    """Timing errors: how much the times of frames, measured from the first one, differ.
+    """Statistics of the differences between the times of matching frames.
 
-    Percentiles are accurate to 5 %, and memory use is small for any number of frames.
+    Times are relative to the first frame of each recording. Percentiles are accurate to 5 %. Memory
+    use is small for any number of frames.
     """
 
     def __init__(self) -> None:
@@ -96,7 +97,7 @@ class Timing:
         self._count += 1
 
     def percentile_ns(self, percent: float) -> int:
-        """Return the percentile of the errors in ns; 0 if there are no frames."""
+        """Return a percentile of the differences in ns; 0 if there are no frames."""
         rest = self._count * percent / 100
         for place in sorted(self._bins):
             rest -= self._bins[place]
@@ -107,7 +108,7 @@ class Timing:
 
 @dataclass(slots=True)
 class SourceDifference:
-    """Differences of one source between two recordings."""
+    """The differences between two recordings in one source."""
 
     source: str
     frames: Side = field(default_factory=Side)
@@ -121,15 +122,15 @@ class SourceDifference:
 
     @property
     def same(self) -> bool:
-        """Whether the recordings agree in everything that was compared."""
+        """True if no difference was found in this source."""
         return self.frames.same and self.events.same and not self.missing
 
 
 IGNORABLE: Final = ("times", "cycle", "reason", "events", "ends")
-"""What a comparison may ignore.
+"""The items that a comparison can ignore.
 
-``ends`` are the frames and events of one recording before the first, or after the last, that both
-have.
+``ends`` are the frames and events of only one recording that come before the first one, or after
+the last one, that both recordings have.
 """
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
 
@@ -139,13 +140,13 @@ _Chosen = tuple[Mapping[DumpBlock, Sequence[Register]], Mapping[DumpBlock, Seque
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Options of a comparison.
+    """The options of a comparison.
 
     Attributes:
-        ignore: Items of :data:`IGNORABLE`.
+        ignore: The items of :data:`IGNORABLE` to ignore.
         only: Paths of the registers to compare, as for :meth:`Dump.select`; empty for all.
         tolerance: Absolute difference up to which REAL and LREAL values count as equal.
-        relative: The same, relative to the larger value.
+        relative: Relative difference, to the larger value, up to which they count as equal.
     """
 
     ignore: Collection[str] = ()
@@ -163,21 +164,21 @@ def compare(
 ) -> Iterator[SourceDifference]:
     """Compare two recordings source by source.
 
-    Frames are matched by cycle; if cycles are ignored, by source time; if times are ignored, too,
-    by their order.
+    Frames are matched by cycle. If cycles are ignored, they are matched by source time; if times
+    are ignored, too, by their order.
 
     Args:
-        first: A recording.
-        second: The other recording.
-        how: Options.
+        first: The first recording.
+        second: The second recording.
+        how: The options.
         sources: Names of the sources to compare; None for all.
-        progress: Called with log times of the first recording.
+        progress: Called with the present log time in the first recording.
 
     Yields:
         The differences of each source.
 
     Raises:
-        PathError: A source or register is in neither recording.
+        PathError: A source or register is not in any of the recordings.
     """
     names = list(dict.fromkeys((*first.sources, *second.sources)))
     chosen = _chosen(first, how), _chosen(second, how)
@@ -257,9 +258,10 @@ class _Source:
         self._alone(side, self._of_end(since, inside))
 
     def _of_end(self, since: _Alone, inside: _Alone) -> _Alone:
-        """Return what counts before or after everything that both have.
+        """Return the entries that count at an end of the recordings.
 
-        If ends are ignored, only entries between the first and last common frame count.
+        ``since`` are all entries there that only one recording has; ``inside`` are those between
+        the first and the last common frame, which count if ends are ignored.
         """
         return inside if "ends" in self._how.ignore else since
 
@@ -298,7 +300,7 @@ class _Source:
         return what
 
     def _registers(self, one: DumpBlock | None, other: DumpBlock | None) -> _Registers | None:
-        """Return the registers of two blocks to compare, or None if a block is not selected."""
+        """Return the registers of two blocks to compare; None if a block is not selected."""
         if one is None or other is None or one not in self._chosen[0] or other not in self._chosen[1]:
             return None
         if (one, other) not in self._pairs:
@@ -328,7 +330,7 @@ class _Source:
 
 
 class _Alone:
-    """Entries that only one recording has, since the last that both have."""
+    """Counts the entries that only one recording has, and stores the first of them."""
 
     def __init__(self) -> None:
         self.counts = [0, 0]
@@ -340,7 +342,7 @@ class _Alone:
 
 
 class _Common:
-    """Span, in each recording, from the first to the last entry that both have."""
+    """The span in each recording from the first to the last entry that both have."""
 
     def __init__(self) -> None:
         self._ends: list[tuple[_Position, _Position]] = []
@@ -353,14 +355,14 @@ class _Common:
         ]
 
     def begins_after(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
-        """Return whether an entry of only one recording is before the first common entry."""
+        """Return whether an entry that only one recording has comes before the first common entry."""
         return bool(self._ends) and any(
             entry is not None and _position(entry) < first
             for entry, (first, _) in zip((one, other), self._ends, strict=True)
         )
 
     def has(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
-        """Return whether an entry of only one recording is within the span."""
+        """Return whether an entry that only one recording has is within the span."""
         return bool(self._ends) and all(
             entry is None or first <= _position(entry) <= last
             for entry, (first, last) in zip((one, other), self._ends, strict=True)
@@ -371,7 +373,7 @@ _Position = tuple[int, int, bool]
 
 
 def _position(entry: Entry[Any]) -> _Position:
-    """Return the position of an entry: its time and number, because virtual time may be paused."""
+    """Return the position of an entry by time and number; times are equal while time is paused."""
     item = entry.item
     return (entry.time_ns, item.frame, True) if isinstance(item, Event) else (entry.time_ns, item.number, False)
 
@@ -393,9 +395,10 @@ class _Registers:
         self._of_array: dict[str, _Places] = {}
 
     def differing(self, one: Frame, other: Frame) -> Iterator[tuple[str, tuple[Value, Value]]]:
-        """Yield path and values of each register, or array element, that differs in two frames.
+        """Yield the path and both values of each register or array element that differs.
 
-        Values are those that consumers saw, or those delivered by the source if only these differ.
+        The values are those that readers saw. If these are all equal, they are the values that the
+        source delivered, without injections.
         """
         seen = set()
         for path, values in self._images(one.image, other.image):
@@ -423,7 +426,7 @@ class _Registers:
 
 
 class _Places:
-    """Compares registers, or array elements, whose places in two layouts may differ."""
+    """Compares registers or array elements whose offsets in two layouts may differ."""
 
     def __init__(
         self,
@@ -433,9 +436,10 @@ class _Places:
         *,
         alike: bool,
     ) -> None:
-        """Take pairs of registers; ``alike`` if both layouts have them at the same places.
+        """Create the comparison for pairs of registers.
 
-        In that case bytes are compared.
+        Set ``alike`` if both layouts have them at the same offsets. Then bytes are compared first,
+        which is faster.
         """
         self._pairs = pairs
         self._how = how
@@ -447,11 +451,11 @@ class _Places:
         self._scan = ChangeScan([one for one, _ in pairs]) if alike else None
 
     def like(self, pairs: Sequence[tuple[Register, Register]]) -> _Places:
-        """Return an object that compares other registers of the same layouts."""
+        """Return a comparison of other registers of the same layouts."""
         return _Places(pairs, self._layouts, self._how, alike=self._scan is not None)
 
     def differing(self, one: bytes, other: bytes) -> Iterator[tuple[tuple[Register, Register], tuple[Value, Value]]]:
-        """Yield the registers, and their values, that differ in two images."""
+        """Yield the pairs of registers that differ in two images, with their values."""
         if self._scan is not None and one == other:
             return
         places = range(len(self._pairs)) if self._scan is None else self._scan.changed(one, other)
@@ -482,7 +486,7 @@ def _kind(register: Register) -> tuple[str, object]:
 
 
 def _frames(dump: Dump, source: str) -> Iterator[Entry[Frame]]:
-    """Yield the frames of the source, without the bad frames that a replay adds on its own."""
+    """Yield the frames of the source, without the bad frames that a replay has added."""
     if source in dump.sources:
         for entry in dump.frames(source):
             if entry.item.provenance is not Provenance.REPLAYED or not entry.item.reason.startswith(OWN_WORDS):
@@ -490,7 +494,7 @@ def _frames(dump: Dump, source: str) -> Iterator[Entry[Frame]]:
 
 
 def _events(dump: Dump, source: str) -> Iterator[Entry[Event]]:
-    """Yield the events of the source, without those of its process and those of a replay."""
+    """Yield the events of the source, without those about its process and those of a replay."""
     if source in dump.sources:
         for entry in dump.events(source):
             if entry.item.kind not in _OF_PROCESSES and not _is_replays(entry.item):
@@ -505,7 +509,7 @@ def _is_replays(event: Event) -> bool:
 
 
 def _grouped(entries: Iterable[Entry[T]], key: Callable[[Entry[T]], int], most: int) -> _Groups[T]:
-    """Yield groups of at most ``most`` consecutive entries with the same key."""
+    """Yield groups of consecutive entries with the same key, each of at most ``most`` entries."""
     for value, some in groupby(entries, key):
         while group := list(islice(some, most)):
             yield value, group
@@ -516,9 +520,10 @@ def _joined(
     second: _Groups[T],
     align: Callable[[Iterable[Entry[T]], Iterable[Entry[T]]], Iterable[_Pair[T]]],
 ) -> Iterator[_Pair[T]]:
-    """Yield pairs of matching entries, with None for an entry that one recording lacks.
+    """Yield pairs of matching entries; an entry that one recording lacks is None.
 
-    The keys of both recordings must ascend. ``align`` matches the entries of two groups.
+    The keys of both recordings must ascend. ``align`` matches the entries of two groups with the
+    same key.
     """
     one, other = next(first, None), next(second, None)
     while one is not None or other is not None:
@@ -534,17 +539,17 @@ def _joined(
 
 
 class _InOrder:
-    """Pairs frames of one key in their order.
+    """Pairs the frames of two groups with the same key in their order.
 
-    If ``shifted``, one of the recordings may lack the beginning of the first common key. Its frames
-    are paired with those of the other that have the same content.
+    If ``shifted`` is True, one recording may lack the first frames of the first common key. The
+    offset between the groups is then chosen so that most pairs have the same content.
     """
 
     def __init__(self, *, shifted: bool) -> None:
         self._shifted = shifted
 
     def __call__(self, ones: Iterable[Entry[Frame]], others: Iterable[Entry[Frame]]) -> Iterator[_Pair[Frame]]:
-        """Yield pairs, with None for a frame that one group lacks."""
+        """Yield the pairs; a frame that one group lacks is None."""
         if self._shifted:
             self._shifted = False
             first, second = iter(ones), iter(others)
@@ -557,9 +562,10 @@ class _InOrder:
 
 
 def _shift(ones: Sequence[Entry[Frame]], others: Sequence[Entry[Frame]]) -> int:
-    """Return how many of ``ones`` are before the first of the others; negative: the other way round.
+    """Return the number of entries in ``ones`` before the first of ``others``, or the reverse (< 0).
 
-    Most pairs have the same content, or else there are most pairs, or else the last ones are paired.
+    With this offset, the largest number of pairs have the same content. Of several such offsets,
+    the one with most pairs is returned, then the largest.
     """
 
     def alike(shift: int) -> tuple[int, int, int]:
@@ -574,7 +580,7 @@ def _image(frame: Frame) -> Hashable:
 
 
 def _aligned(ones: Iterable[Entry[Event]], others: Iterable[Entry[Event]]) -> Iterator[_Pair[Event]]:
-    """Pair events with the same content in any order, then by kind and place, then by kind."""
+    """Pair events with the same content in any order, the others by kind and offset, then by kind."""
     left: list[Entry[Event]] = list(ones)
     right: list[Entry[Event]] = list(others)
     for alike in (_content, _place, _event_kind):

@@ -1,4 +1,4 @@
-"""Read recordings from a program: :func:`shmio.open_dump`."""
+"""Reads recordings from a program: :func:`shmio.open_dump`."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ from shmio.segment.changed_registers import runs
 
 MAX_FILES: Final = 512
 OVERLAP_NS: Final = 1_000_000_000
-"""How long two consecutive files of a recorder may overlap: more than a turn of the recorder."""
+"""Longest time by which two consecutive files of a recorder overlap; more than a turn of it."""
 
 Chosen = dict[DumpBlock, list[Register]]
 
 
 def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], damaged: Damaged | None = None) -> Dump:
-    """Open a recording: one file, or several files of one run of an instance, in any order.
+    """Open a recording that consists of one file, or of several files of one run in any order.
 
-    Only the index of a file is read, or, if it was not closed, the headers of its chunks.
+    Opening reads only the index of each file, or the headers of its chunks if it was not closed.
 
     Args:
-        files: Path of a file, or paths of several.
-        damaged: Called with the file and the damage for each place that cannot be read; reading then
-            continues behind it. None: reading such a place raises RecordingError.
+        files: The path of a file, or the paths of several files.
+        damaged: Called with the file and the damage for each place that cannot be read; reading
+            continues after it. If None, such a place raises RecordingError when it is read.
 
     Returns:
         The recording, a context manager.
 
     Raises:
         OSError: A file cannot be opened.
-        RecordingError: A file is not a recording, or not of the same run as the others.
+        RecordingError: A file is not a recording, or it comes from another run than the others.
     """
     paths = [Path(files)] if isinstance(files, str | os.PathLike) else [Path(file) for file in files]
     if not 0 < len(paths) <= MAX_FILES:
@@ -73,18 +73,23 @@ def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], 
 
 
 class Dump:
-    """A recording: one file, or several files of one run. All times are log times: ns, UTC.
+    """An open recording of one file, or of several files of one run.
 
-    Use it as a context manager, or call :meth:`close`. Iterators read one chunk at a time, on demand; several
-    may be in use at once, in one thread. In all methods ``from_ns`` and ``to_ns`` belong to the range.
+    All times are log times: UTC, in ns. A range of time includes both ``from_ns`` and ``to_ns``.
+    Use the recording as a context manager, or call :meth:`close`. Iterators read one chunk at a
+    time, on demand. You may use several iterators at once, in one thread.
     """
 
     def __init__(self, parts: Iterable[Part]) -> None:
-        """Open with :func:`open_dump` instead. RecordingError: the files are of different runs."""
+        """Open the files. Call :func:`open_dump` instead.
+
+        Raises:
+            RecordingError: The files come from different runs.
+        """
         self._parts = sorted(parts, key=lambda part: (part.begin_ns, part.end_ns))
         first = self._parts[0]
         self.about = first.reader.about
-        """The first file's metadata about the instance (docs/reference/dump-format.md)."""
+        """The metadata about the instance in the first file (docs/reference/dump-format.md)."""
         for part in self._parts[1:]:
             for key in ("instance", "epoch"):
                 if part.reader.about.get(key) != self.about.get(key):
@@ -92,7 +97,7 @@ class Dump:
         blocks: dict[tuple[str, int, str], DumpBlock] = {}
         self._contents = [contents(part, blocks) for part in self._parts]
         self.blocks = tuple(blocks.values())
-        """The blocks, in the order in which they began."""
+        """The blocks in the order in which they began."""
         self._names = _Names(self.blocks)
         spans = [(part.begin_ns, part.end_ns) for part in self._parts if part.begin_ns]
         self.begin_ns = min((begin for begin, _ in spans), default=0)
@@ -103,7 +108,7 @@ class Dump:
         )
 
     def _has_twice(self) -> bool:
-        """Whether a file may repeat frames or events of an earlier file."""
+        """Return whether a file may repeat frames or events of an earlier file."""
         come_to: dict[tuple[DumpBlock, str], int] = {}
         for part, within in zip(self._parts, self._contents, strict=True):
             for number, block in within.blocks.items():
@@ -116,12 +121,12 @@ class Dump:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files, in the order of time."""
+        """The files in the order of time."""
         return tuple(part.file for part in self._parts)
 
     @property
     def readers(self) -> tuple[Reader, ...]:
-        """The readers of the files, which give access to attachments."""
+        """The readers of the files, with which you can read attachments."""
         return tuple(part.reader for part in self._parts)
 
     @property
@@ -136,30 +141,34 @@ class Dump:
 
     @property
     def closed(self) -> bool:
-        """Whether all files were closed properly."""
+        """True if the recorder has closed all files."""
         return all(part.reader.records.closed for part in self._parts)
 
     @property
     def gaps(self) -> list[Gap]:
-        """The gaps in the files, at most 1000 of each; ``block`` is the block's number within the file."""
+        """The gaps in the files, at most 1000 of each file.
+
+        ``block`` of a gap is the number of the block in its file.
+        """
         return [gap for part in self._parts for gap in part.found.gaps]
 
     @property
     def damage(self) -> list[str]:
-        """Descriptions of the damage that was found when the files were opened."""
+        """Messages about the damage that was found when the files were opened."""
         return list(dict.fromkeys(text for part in self._parts for text in part.found.damage))
 
-    # ---- one by one --------------------------------------------------------------------------------------------------
+    # ---- single entries ----------------------------------------------------------------------------------------------
 
     def items(
         self, sources: str | Collection[str] | None = None, from_ns: int = 0, to_ns: int = MAX_NS
     ) -> Iterator[Entry[Item]]:
-        """Iterate over everything of some sources, and of the instance, in recorded order.
+        """Iterate over all entries of some sources and of the instance, in recorded order.
 
-        An entry that is in two files comes once. What is missing between two files comes as a gap.
+        An entry that is in two files is yielded once. Entries that are missing between two files
+        are yielded as a gap.
 
         Args:
-            sources: Names of sources; None: all.
+            sources: Names of the sources; None for all.
             from_ns: Start of the range.
             to_ns: End of the range.
 
@@ -206,7 +215,7 @@ class Dump:
         """Iterate over the events of some sources. Chunks without events are not read.
 
         Args:
-            sources: Names of sources; None: all.
+            sources: Names of the sources; None for all.
             from_ns: Start of the range.
             to_ns: End of the range.
 
@@ -226,7 +235,7 @@ class Dump:
             time_ns: The time.
 
         Returns:
-            The frame; None before the first.
+            The frame; None if there is none.
 
         Raises:
             PathError: There is no such source.
@@ -245,7 +254,7 @@ class Dump:
         """Return the first event after a time; None if there is none.
 
         Args:
-            source: Name of the source; None: any source.
+            source: Name of the source; None for any source.
             after_ns: The time.
 
         Raises:
@@ -254,12 +263,12 @@ class Dump:
         return next(self.events(source, after_ns + 1), None)
 
     def next_change(self, path: str, after_ns: int = -1, to_ns: int = MAX_NS) -> Entry[Frame] | None:
-        """Return the first frame after a time in which registers changed for consumers.
+        """Return the first frame after a time in which readers saw a change of some registers.
 
         Args:
-            path: Register, structure or pattern of one source.
+            path: A register, a structure or a pattern of one source.
             after_ns: The time after which to search.
-            to_ns: End of the search.
+            to_ns: The time at which the search ends.
 
         Returns:
             The frame; None if there is no change.
@@ -280,7 +289,7 @@ class Dump:
                 return next(entry for entry in self.frames(source, time_ns) if entry.item.number == number)
         return None
 
-    # ---- many at once ------------------------------------------------------------------------------------------------
+    # ---- arrays ------------------------------------------------------------------------------------------------------
 
     def batches(
         self, source: str | None = None, from_ns: int = 0, to_ns: int = MAX_NS, *, raw: bool = False
@@ -291,13 +300,14 @@ class Dump:
             source: Name of the source; None if there is only one.
             from_ns: Start of the range.
             to_ns: End of the range.
-            raw: Whether the images are those that the source delivered, not those that consumers saw.
+            raw: True for the images that the source delivered, without injections; False for those
+                that readers saw.
 
         Raises:
             PathError: There is no such source.
         """
         name = self._names.one(source)
-        if self._overlap:  # one file may have what another missed
+        if self._overlap:  # a file may have entries that the other one lacks
             yield from batches_of(self.frames(name, from_ns, to_ns), raw=raw)
             return
         last: dict[DumpBlock, int] = {}
@@ -311,18 +321,20 @@ class Dump:
     def columns(
         self, paths: str | Iterable[str], from_ns: int = 0, to_ns: int = MAX_NS, *, raw: bool = False
     ) -> Columns:
-        """Read registers of one source as numpy arrays of their own types, one value for each frame.
+        """Read registers of one source as numpy arrays, with one value for each frame.
 
-        Blocks of the source without any of the registers are left out. The result is held in memory.
+        The arrays have the types of the registers. Frames of blocks without any of the registers
+        are skipped. The whole result is in memory.
 
         Args:
-            paths: Registers, elements, structures or globs.
+            paths: Registers, elements, structures or patterns.
             from_ns: Start of the range.
             to_ns: End of the range.
-            raw: Whether to read what the source delivered, not what consumers saw.
+            raw: True for the values that the source delivered, without injections; False for those
+                that readers saw.
 
         Returns:
-            Arrays of shape (n, …) by path, for n frames, with the frames' times and qualities.
+            Arrays of shape (n, …) by path, for n frames, with the times and qualities of the frames.
 
         Raises:
             PathError: There is no such register, or the registers are of several sources.
@@ -339,11 +351,18 @@ class Dump:
         return collector.columns()
 
     def select(self, paths: Iterable[str]) -> dict[DumpBlock, list[Register]]:
-        """Return the registers that paths name, by block. Paths are as in :meth:`columns`; PathError."""
+        """Return the registers that the paths name, by block. Paths are as in :meth:`columns`.
+
+        Raises:
+            PathError: There is no such register.
+        """
         return self._names.select(paths)
 
     def _channels(self, source: str, from_ns: int, to_ns: int) -> Iterator[tuple[Part, int, DumpBlock]]:
-        """Yield the files and their channels that may have frames of a source in a range, in order."""
+        """Yield the channels that may have frames of a source in a range, in order.
+
+        Each item is a file, the number of the channel, and its block.
+        """
         for part, within in zip(self._parts, self._contents, strict=True):
             if part.end_ns >= from_ns and part.begin_ns <= to_ns:
                 for number in within.frames(source):
@@ -387,14 +406,18 @@ class Dump:
 
 
 class _Names:
-    """Resolves names in the blocks of a dump."""
+    """Finds the sources and registers of a recording by name."""
 
     def __init__(self, blocks: Sequence[DumpBlock]) -> None:
         self._blocks = blocks
         self.sources = tuple(dict.fromkeys(block.source for block in blocks))
 
     def one(self, name: str | None) -> str:
-        """Check a source's name, and return it; None stands for the only one. PathError: unknown source."""
+        """Check and return the name of a source; None is the only source.
+
+        Raises:
+            PathError: There is no such source, or several.
+        """
         if name is None and len(self.sources) == 1:
             return self.sources[0]
         if name not in self.sources:
@@ -403,13 +426,21 @@ class _Names:
         return name
 
     def several(self, names: str | Collection[str] | None) -> set[str]:
-        """Check names of sources, and return them; None stands for all. PathError: unknown source."""
+        """Check and return the names of sources; None is all sources.
+
+        Raises:
+            PathError: There is no such source.
+        """
         if names is None:
             return set(self.sources)
         return {self.one(name) for name in ([names] if isinstance(names, str) else names)}
 
     def select(self, paths: Iterable[str]) -> Chosen:
-        """Return the registers that paths of any form name, by block. PathError: no such register."""
+        """Return the registers that the paths name, by block.
+
+        Raises:
+            PathError: There is no such register.
+        """
         default = self.sources[0] if len(self.sources) == 1 else None
         chosen: dict[DumpBlock, dict[str, Register]] = {}
         for path in paths:
@@ -421,7 +452,11 @@ class _Names:
         return {block: list(chosen[block].values()) for block in self._blocks if block in chosen}
 
     def of_one_source(self, paths: str | Iterable[str]) -> Chosen:
-        """Return the registers that paths name, by block. PathError: none, or of several sources."""
+        """Return the registers of one source that the paths name, by block.
+
+        Raises:
+            PathError: There is no such register, or the registers are of several sources.
+        """
         chosen = self.select([paths] if isinstance(paths, str) else paths)
         sources = sorted({block.source for block in chosen})
         if len(sources) != 1:
@@ -429,7 +464,7 @@ class _Names:
         return chosen
 
     def _named(self, path: str, topic: Topic) -> Chosen:
-        """Look in all blocks of the source, as a reload may have changed the layout."""
+        """Return the registers in all blocks of the source, because a reload may change the layout."""
         found: Chosen = {}
         problem = PathError(f"{path}: no register of this recording has such a path")
         for block in self._blocks:
@@ -447,17 +482,20 @@ class _Names:
 
 
 class _FileJoin:
-    """Joins the numbered frames and events of several files.
+    """Joins the frames and events of several files by their numbers.
 
-    It removes duplicates, and finds what is missing between two files.
+    It removes duplicates, and finds the entries that are missing between two files.
     """
 
     def __init__(self) -> None:
         self._last: dict[tuple[DumpBlock, str], tuple[Contents, int, int]] = {}
-        """File, number and log time of the last item."""
+        """The file, number and log time of the last frame or event, by block and kind."""
 
     def next(self, file: Contents, block: DumpBlock, time_ns: int, item: Item) -> tuple[Gap | None, Item | None]:
-        """Return the gap before an item, or None, and the item without what came before, or None."""
+        """Return the gap before an item, or None; and the item, or None if it came before.
+
+        If the item is a gap that came before in part, only the rest of it is returned.
+        """
         if isinstance(item, Gap):
             what, first, last = item.what, item.first, item.last
         elif isinstance(item, Frame | Event):
@@ -485,7 +523,7 @@ _Bytes = npt.NDArray[np.uint8]
 
 
 def _register_bytes(registers: Sequence[Register]) -> tuple[npt.NDArray[np.intp], _Bytes]:
-    """Return offset and mask of each byte of an image that holds data of the registers, without padding."""
+    """Return the offset and the mask of each byte of an image that belongs to the registers."""
     places: list[int] = []
     masks: list[int] = []
     for register in registers:
@@ -513,7 +551,10 @@ class _Changes:
         return found
 
     def first(self, block: DumpBlock, batch: Batch) -> int | None:
-        """Return the index of the first frame that differs; the first frame of a block counts as unchanged."""
+        """Return the index of the first frame that differs from the one before; None if none does.
+
+        The first frame of a block counts as unchanged.
+        """
         if block not in self._bytes:
             return None
         now = self._of(block, batch.images)

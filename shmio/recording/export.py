@@ -1,4 +1,4 @@
-"""Export recordings for other programs: tables (CSV, Parquet), and MCAP with JSON for viewers."""
+"""Exports recordings for other programs: as tables (CSV, Parquet), or as MCAP with JSON."""
 
 from __future__ import annotations
 
@@ -29,9 +29,12 @@ from shmio.segment.explain import Explainer, cells_of, kind_of, object_of
 from shmio.version import __version__
 
 PIECE_BYTES: Final = 8 << 20
-"""Approximate size of a piece in memory."""
+"""Approximate size of a piece in memory, in bytes."""
 GROUP_BYTES: Final = 16 << 20
-"""Approximate size of a row group. Each one costs some hundred bytes of memory a column until the file is closed."""
+"""Approximate size of a row group, in bytes.
+
+Each row group takes some hundred bytes of memory per column until the file is closed.
+"""
 
 _HEADINGS: Final = ("time", "number", "cycle", "quality", "provenance")
 _EVENT_NUMBERS: Final = ("frame", "cycle", "injection", "command", "item", "items", "offset", "mask", "size")
@@ -41,7 +44,7 @@ _EVENT_COLUMNS: Final = (
 _EVENT_BATCH: Final = 4096
 _FRAME: Final = "frame"
 _FRAME_FIELDS: Final = {"number": "integer", "cycle": "integer", "quality": "integer", "provenance": "integer"}
-"""Header fields of a frame, which stand under _FRAME in its message."""
+"""The header fields of a frame with their JSON types; a message has them under the key _FRAME."""
 _JSON_TYPES: Final = {"b": "boolean", "i": "integer", "u": "integer", "f": "number", "m": "integer"}
 _EVENT_TYPES: Final = {
     "kind": "string", "text": "string", "quality": "string", "number": "integer", "frame": "integer",
@@ -60,7 +63,7 @@ def pieces(
     *,
     raw: bool = False,
 ) -> Iterator[tuple[DumpBlock, Columns]]:
-    """Yield the chosen registers of one source in order; each piece belongs to one block.
+    """Yield the values of the chosen registers of one source, in pieces that belong to one block.
 
     Raises:
         PathError: There is no such source.
@@ -82,11 +85,11 @@ def pieces(
 class CsvTable:
     """A CSV file with a column for each register and each element of an array.
 
-    Times are in UTC, and durations are numbers in the unit of their type. A cell is empty if the
-    bytes are no value of the type, or if the source never had a value.
+    Times are in UTC. Durations are numbers in the unit of their type. A cell is empty if the bytes
+    are not a valid value of the type, or if the source had no value yet.
     """
 
-    def __init__(self, stream: IO[bytes], registers: Sequence[Register]) -> None:  # noqa: ARG002  as all tables
+    def __init__(self, stream: IO[bytes], registers: Sequence[Register]) -> None:  # noqa: ARG002  all tables take it
         self.rows = 0
         self._text = io.TextIOWrapper(stream, "utf-8", newline="", write_through=True)
         self._writer = csv.writer(self._text)
@@ -120,7 +123,7 @@ class CsvTable:
 
 
 def _texts(values: npt.NDArray[Any], suffix: str = "") -> list[Any]:
-    """Convert values for CSV: floats in the fewest digits that read back to the same value."""
+    """Convert values for CSV; floats have the fewest digits that give the same value when read."""
     kind = values.dtype.kind
     if kind == "b":
         values = np.where(values, "true", "false")
@@ -136,17 +139,21 @@ def _texts(values: npt.NDArray[Any], suffix: str = "") -> list[Any]:
 
 
 class ParquetTable:
-    """A Parquet file, compressed with zstd; columns as of ``Columns.to_arrow``."""
+    """A Parquet file, compressed with zstd, with the columns of :meth:`Columns.to_arrow`."""
 
-    def __init__(self, stream: IO[bytes], registers: Sequence[Register]) -> None:  # noqa: ARG002  as all tables
-        """MissingLibraryError: pyarrow is not installed."""
+    def __init__(self, stream: IO[bytes], registers: Sequence[Register]) -> None:  # noqa: ARG002  all tables take it
+        """Create the table.
+
+        Raises:
+            MissingLibraryError: pyarrow is not installed.
+        """
         self.rows = 0
         self._arrow = library("pyarrow", ANALYSIS)
         self._parquet = library("pyarrow.parquet", ANALYSIS)
         self._stream = stream
         self._writer: Any = None
         self._waiting: list[Any] = []
-        """Tables that together become the next row group."""
+        """The tables that together become the next row group."""
 
     def write(self, columns: Columns) -> None:
         """Write the next rows."""
@@ -171,7 +178,7 @@ class ParquetTable:
 
 
 class Table(Protocol):
-    """A file with a row for each frame of a block."""
+    """The protocol of a file with a row for each frame of a block."""
 
     rows: int
 
@@ -179,7 +186,7 @@ class Table(Protocol):
         """Write the next rows."""
 
     def close(self) -> None:
-        """Complete the file."""
+        """Write the rest of the file."""
 
 
 TABLES: dict[str, Callable[[IO[bytes], Sequence[Register]], Table]] = {"parquet": ParquetTable, "csv": CsvTable}
@@ -187,23 +194,23 @@ TABLES: dict[str, Callable[[IO[bytes], Sequence[Register]], Table]] = {"parquet"
 
 @contextmanager
 def _new_folder(path: Path) -> Iterator[None]:
-    """Create a folder and its parents if they do not exist; on an error remove those created."""
+    """Create a folder and its missing parents; remove the created ones again after an error."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
-        with suppress(OSError):  # the folder is not empty: others have put something into it
+        with suppress(OSError):  # the folder is not empty: another program has written to it
             for folder in made:
                 folder.rmdir()
         raise
 
 
 class BlockTables:
-    """Writes a file for each block, named after its source; further blocks of a source are numbered."""
+    """Writes a file for each block, named after its source; later blocks of a source get a number."""
 
     def __init__(self, stack: ExitStack, output: Path, form: str, chosen: Chosen, *, named: bool) -> None:
-        """``named``: whether ``output`` is the only file and not a folder for several."""
+        """Create the writer; ``output`` is the only file if ``named``, else a folder for several."""
         self._stack = stack
         self._output = output
         self._form = form
@@ -219,7 +226,7 @@ class BlockTables:
             path = self._path(block)
             stream = self._stack.enter_context(new_file(path))
             table = TABLES[self._form](stream, self._chosen[block])
-            self._stack.callback(table.close)  # before its file is closed, even if that is removed then
+            self._stack.callback(table.close)  # before its file is closed, even if the file is removed after that
             self._tables[block] = path, table
         self._tables[block][1].write(columns)
 
@@ -231,7 +238,7 @@ class BlockTables:
 
     @property
     def files(self) -> list[tuple[Path, int]]:
-        """Path and rows of each file."""
+        """The path and the number of rows of each file."""
         return [(path, table.rows) for path, table in self._tables.values()]
 
 
@@ -244,16 +251,16 @@ def export_events(
     to_ns: int,
     progress: Callable[[int], None],
 ) -> int:
-    """Write a row for each event of these sources.
+    """Write a table with a row for each event of some sources.
 
     Args:
         dump: The recording.
-        sources: Names of sources.
+        sources: Names of the sources.
         stream: The new file.
         form: ``csv`` or ``parquet``.
         from_ns: Start of the range.
         to_ns: End of the range.
-        progress: Called with the ns of the recording that are done.
+        progress: Called with the length in ns of the part that is done.
 
     Returns:
         The number of rows.
@@ -268,7 +275,7 @@ def export_events(
 def _event_rows(
     dump: Dump, sources: Collection[str], from_ns: int, to_ns: int, progress: Callable[[int], None]
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows in the order of _EVENT_COLUMNS, with the time in ns."""
+    """Yield the rows of the events with the columns of _EVENT_COLUMNS; times are in ns."""
     explainers: dict[DumpBlock, Explainer] = {}
     for time_ns, block, event in dump.events(sources, from_ns, to_ns):
         if block is None:
@@ -327,7 +334,9 @@ def export_mcap(
     raw: bool,
     progress: Callable[[int], None],
 ) -> int:
-    """Write a message for each frame to the topic ``/<source>``, for each event to ``/<source>/events``.
+    """Write an MCAP file with a JSON message for each frame and each event.
+
+    The topic of frames is ``/<source>``, and that of events ``/<source>/events``.
 
     Args:
         dump: The recording.
@@ -335,8 +344,8 @@ def export_mcap(
         stream: The new file.
         from_ns: Start of the range.
         to_ns: End of the range.
-        raw: Whether to export what the source delivered, without injections.
-        progress: Called with the ns of the recording that are done.
+        raw: True to export the values that the source delivered, without injections.
+        progress: Called with the length in ns of the part that is done.
 
     Returns:
         The number of messages.
@@ -372,7 +381,7 @@ def _frames(
         rows = zip(columns.time_ns.tolist(), columns.source_ns.tolist(), heads, values, strict=True)
         for log_ns, source_ns, head, row in rows:
             message = {_FRAME: dict(zip(_FRAME_FIELDS, head, strict=True))}
-            if source_ns:  # else it never had any values
+            if source_ns:  # otherwise the source had no values yet
                 message |= _filled(tree, row)
             yield _Row(log_ns, channels[block], source_ns if source_ns > 0 else log_ns, msgspec.json.encode(message))
 
@@ -405,7 +414,7 @@ def _channel(writer: Writer, topic: str, name: str, properties: dict[str, Any]) 
 def _tree(registers: Sequence[Register], source: str) -> dict[str, Any]:
     """Return a tree of the registers by path segments; its leaves are indices of registers.
 
-    A register with the name of a field of the frame has its source before it.
+    If a register has the name of a field of the frame, its source is put before it.
     """
     tree: dict[str, Any] = {}
     for place, register in enumerate(registers):
@@ -414,7 +423,7 @@ def _tree(registers: Sequence[Register], source: str) -> dict[str, Any]:
         node = tree
         for segment in above:
             below = node.setdefault(segment, {})
-            if not isinstance(below, dict):  # a register has the name of a structure
+            if not isinstance(below, dict):  # a register and a structure have the same name
                 node, name = tree, register.path
                 break
             node = below
@@ -441,7 +450,7 @@ def _schema(tree: dict[str, Any], columns: Columns) -> dict[str, Any]:
 
 
 def _plain(values: npt.NDArray[Any]) -> list[Any]:
-    """Convert values for JSON: durations to numbers, dates to text, invalid or infinite ones to null."""
+    """Convert values for JSON: durations to numbers, dates to texts, invalid and infinite to null."""
     kind = values.dtype.kind
     found: Any = values
     if kind == "f" and not np.isfinite(values).all():

@@ -1,4 +1,4 @@
-"""Import optional libraries."""
+"""Imports optional libraries."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from typing import Any, Final
 from shmio.errors import MissingLibraryError
 
 ANALYSIS: Final = "pip install 'shmio[analysis]'"
-"""Command that installs the libraries for tables of recordings."""
+"""The command that installs the libraries for tables of recordings."""
 
 
 def library(name: str, remedy: str) -> Any:
-    """Import a module. MissingLibraryError: it is not installed; the message has the remedy."""
+    """Import an optional module.
+
+    Raises:
+        MissingLibraryError: The library is not installed. The message contains ``remedy``.
+    """
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

@@ -1,1 +1,1 @@
-"""The messages and records of a recording (docs/reference/dump-format.md)."""
+"""Encodes and decodes the messages and records of recordings (docs/reference/dump-format.md)."""

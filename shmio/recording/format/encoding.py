@@ -1,6 +1,7 @@
-"""The messages of a recording: channels, frames, events, gaps, steps and processes (docs/reference/dump-format.md).
+"""Encodes and decodes the messages of a recording (docs/reference/dump-format.md).
 
-Decoding checks everything, and raises ValueError for malformed bytes.
+Messages are frames, events, gaps, steps and process changes. Decoding checks all fields, and raises
+ValueError for malformed bytes.
 """
 
 from __future__ import annotations
@@ -24,27 +25,32 @@ MAX_CHANNEL_BYTES: Final = 4096
 
 PROFILE: Final = "shmio"
 ABOUT: Final = "shmio"
-"""Name of the metadata about the instance."""
+"""Name of the metadata record about the instance."""
 SUPERVISED: Final = "supervised"
-"""Value of their key ``recorder`` if the instance's own recorder records."""
+"""Value of the key ``recorder`` in this record if the supervisor has started the recorder."""
 PLACES: Final = "places"
-"""Name of the metadata with the positions behind which the recording begins."""
+"""Name of the metadata record with the positions after which the recording begins."""
 GAPS_TOPIC: Final = "gaps"
 STEPS_TOPIC: Final = "steps"
 PROCESSES_TOPIC: Final = "processes"
 
 FRAME: Final = "shmio.frame.v1"
 FRAME_V2: Final = "shmio.frame.v2"
-"""The same, with differences from the message's own header in five fields: see :func:`differ`."""
+"""The encoding FRAME with five fields as differences from the message's header: see :func:`differ`."""
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"
 GAP: Final = "gap"
 STEP: Final = "step"
 PROCESS: Final = "process"
-"""Names of gaps, steps and changes of processes in this code; in the file all are PLAIN, and their topics differ."""
+"""Encodings of gaps, steps and process changes in this code.
+
+In the file, all three have the encoding PLAIN, and different topics.
+"""
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
-_COUNTED: Final = struct.Struct("<QQQQQ")  # how a frame begins: number, cycle, publish, clock, source
+_COUNTED: Final = struct.Struct(
+    "<QQQQQ"
+)  # the first fields of a frame: number, cycle, publish, clock, source
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
 _QUALITIES: Final = (*Quality, Quality.BAD)  # an unknown quality counts as bad
 _PROVENANCES: Final = tuple(Provenance)
@@ -86,26 +92,30 @@ PROCESS_SCHEMA: Final = b"""{"type": "object", "properties": {"name": {"type": "
 
 
 class Reason(StrEnum):
-    """Reason of a gap."""
+    """The reason of a gap."""
 
     OVERTAKEN = "overtaken"
     """The source overwrote the entries before the recorder read them."""
     NOT_RUNNING = "not running"
     """The entries were overwritten while no recorder ran."""
     ELSEWHERE = "elsewhere"
-    """The previous recorder's file is not in this folder: it was moved, or ``recorder.directory`` has changed."""
+    """The file of the previous recorder is not in the folder.
+
+    It was moved, or ``recorder.directory`` has changed.
+    """
     NO_ROOM = "no room"
-    """The disk was full or too slow, and the buffer for that was full."""
+    """The disk was full or too slow, so that the recorder's buffer was full."""
     UNSURE = "unsure"
-    """The entries are in the previous file, whose fsync failed: they may be lost."""
+    """The entries are in the previous file, but may be lost because its fsync failed."""
     DAMAGED = "damaged"
-    """The entries could not be read in a file that this one was made from."""
+    """The entries could not be read from a file from which this one was made."""
 
 
 class Gap(msgspec.Struct, frozen=True):
-    """Frames or events of a block that are missing in the recording: numbers ``first`` to ``last``.
+    """Frames or events of a block that are missing in the recording, from ``first`` to ``last``.
 
-    ``after_ns``, ``before_ns``: log times of the entries before and after them; 0: none.
+    ``after_ns`` is the log time of the entry before the gap, and ``before_ns`` that of the entry
+    after it; 0 if there is none.
     """
 
     source: str
@@ -120,9 +130,9 @@ class Gap(msgspec.Struct, frozen=True):
 
 
 class StepMark(msgspec.Struct, frozen=True):
-    """The end of a step of virtual time; all its frames come before.
+    """The end of a step of virtual time, recorded after all frames of the step.
 
-    ``time_ns``: the instance's clock after the step. ``dt_ns``: length of the step.
+    ``time_ns`` is the instance time after the step, and ``dt_ns`` the length of the step.
     """
 
     step: int
@@ -131,24 +141,24 @@ class StepMark(msgspec.Struct, frozen=True):
 
 
 class ProcessEvent(StrEnum):
-    """Kind of a change of a process."""
+    """The kind of a process change."""
 
     IS = "is"
-    """The process runs at the start of the recording."""
+    """The process was running when the recording began."""
     STARTED = "started"
-    """The process runs now; the end of its predecessor was recorded before."""
+    """The process was started or restarted."""
     ENDED = "ended"
     """The process ended, or was restarted, on request."""
     DIED = "died"
-    """The process ended unexpectedly; it is restarted."""
+    """The process ended unexpectedly; the supervisor restarts it."""
     GAVE_UP = "gave up"
-    """The process cannot work as configured; it is not restarted."""
+    """The process cannot work as configured; the supervisor does not restart it."""
     REMOVED = "removed"
     """A reload has removed the process from the instance."""
 
 
 class ProcessChange(msgspec.Struct, frozen=True):
-    """A change of a process, with the reason. ``pid`` is 0 if unknown."""
+    """A process change, with its reason. ``pid`` is 0 if it is unknown."""
 
     name: str
     kind: str
@@ -159,7 +169,7 @@ class ProcessChange(msgspec.Struct, frozen=True):
 
 
 class BlockPosition(NamedTuple):
-    """A position in a block: behind these numbers of a frame and an event, recorded at ``log_ns``."""
+    """A position in a block: the last frame and the last event before it, and their log time."""
 
     frame: int = 0
     event: int = 0
@@ -167,7 +177,7 @@ class BlockPosition(NamedTuple):
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """Encode a frame, with all fields that it has in its ring."""
+    """Encode a frame with all its fields."""
     reason = frame.reason.encode()
     head = _FRAME.pack(
         frame.number, frame.cycle, frame.publish_ns, frame.clock_ns, frame.source_ns, frame.event, frame.incarnation,
@@ -178,7 +188,7 @@ def encode_frame(frame: Frame) -> bytes:
 
 
 def decode_frame(data: bytes) -> Frame:
-    """Decode a frame. ValueError: it is malformed."""
+    """Decode a frame; raise ValueError if it is malformed."""
     if len(data) < _FRAME.size:
         raise ValueError("a frame is shorter than its header")
     number, cycle, publish_ns, clock_ns, source_ns, event, incarnation, *rest = _FRAME.unpack_from(data)
@@ -197,10 +207,10 @@ def decode_frame(data: bytes) -> Frame:
 
 
 def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """Convert a frame to FRAME_V2: replace its numbers and times by differences modulo 2^64.
+    """Convert a frame from FRAME to FRAME_V2.
 
-    The differences refer to the header of the message, and hardly change from frame to frame, so
-    that they compress well; absolute times do not.
+    Its numbers and times are replaced by differences, modulo 2^64, from those in the message's
+    header. The differences hardly change from frame to frame, so they compress well.
     """
     number, cycle, publish, clock, source = _COUNTED.unpack_from(data)
     head = _COUNTED.pack(
@@ -211,7 +221,7 @@ def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
 
 
 def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """Convert a frame from FRAME_V2; bytes that are too short stay unchanged for the decoder."""
+    """Convert a frame from FRAME_V2 to FRAME. Bytes that are too short for a frame are unchanged."""
     if len(data) < _FRAME.size:
         return data
     number, cycle, publish, clock, source = _COUNTED.unpack_from(data)
@@ -225,7 +235,7 @@ def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
 
 
 def encode_event(event: Event) -> bytes:
-    """Encode an event, with all fields that it has in its ring."""
+    """Encode an event with all its fields."""
     text = event.text.encode()
     head = _EVENT.pack(
         event.number, event.frame, event.cycle, event.publish_ns, event.clock_ns, event.utc_ns, event.command,
@@ -236,7 +246,7 @@ def encode_event(event: Event) -> bytes:
 
 
 def decode_event(data: bytes) -> Event:
-    """Decode an event. ValueError: it is malformed."""
+    """Decode an event; raise ValueError if it is malformed."""
     if len(data) < _EVENT.size:
         raise ValueError("an event is shorter than its header")
     number, frame, cycle, publish_ns, clock_ns, utc_ns, command, injection, incarnation, *rest = _EVENT.unpack_from(
@@ -255,7 +265,7 @@ def decode_event(data: bytes) -> Event:
 
 
 def encode_json(item: Gap | StepMark | ProcessChange) -> bytes:
-    """Encode a gap, the end of a step or a change of a process as JSON."""
+    """Encode a gap, a step or a process change as JSON."""
     return msgspec.json.encode(item)
 
 
@@ -266,7 +276,7 @@ def _decode_json(data: bytes, kind: type[T], name: str) -> T:
 
 
 def decode_gap(data: bytes) -> Gap:
-    """Decode a gap. ValueError: it is malformed."""
+    """Decode a gap; raise ValueError if it is malformed."""
     gap = _decode_json(data, Gap, "a gap")
     if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
         raise ValueError("a gap contradicts itself")
@@ -276,7 +286,7 @@ def decode_gap(data: bytes) -> Gap:
 
 
 def decode_step(data: bytes) -> StepMark:
-    """Decode the end of a step. ValueError: it is malformed."""
+    """Decode the end of a step; raise ValueError if it is malformed."""
     mark = _decode_json(data, StepMark, "a step")
     if min(mark.step, mark.time_ns, mark.dt_ns) < 0:
         raise ValueError("a step is negative")
@@ -284,7 +294,7 @@ def decode_step(data: bytes) -> StepMark:
 
 
 def decode_process(data: bytes) -> ProcessChange:
-    """Decode a change of a process. ValueError: it is malformed."""
+    """Decode a process change; raise ValueError if it is malformed."""
     return _decode_json(data, ProcessChange, "a change of a process")
 
 
@@ -294,7 +304,7 @@ def encode_position(place: BlockPosition) -> str:
 
 
 def decode_position(text: str) -> BlockPosition:
-    """Decode a position. ValueError: it is malformed."""
+    """Decode a position; raise ValueError if it is malformed."""
     frame, event, log_ns = (int(number) for number in text.split(" ") if len(number) <= 20)
     if min(frame, event, log_ns) < 0:
         raise ValueError("a place is negative")
@@ -303,10 +313,10 @@ def decode_position(text: str) -> BlockPosition:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """The channel of a block's frames or events, or of gaps, steps or processes.
+    """A channel with a block's frames or events, or with gaps, steps or process changes.
 
-    ``layout``: hash of the block's layout, in hex. ``encoding`` is FRAME for frames of either version, and
-    empty for messages that no recorder wrote.
+    ``layout`` is the hash of the block's layout in hex. ``encoding`` is FRAME for frames of both
+    versions, and empty for the messages of other programs.
     """
 
     number: int
@@ -316,18 +326,22 @@ class Channel:
     block: int = 0
     section: int = 0
     after: int = 0
-    """Number before the first recorded frame or event."""
+    """Number of the frame or event before the first recorded one."""
     layout: str = ""
     period_ns: int = 0
     stale_ns: int = 0
     of: str = ""
-    """Hash of the whole layout, if only some of its registers were recorded."""
+    """Hash of the whole layout, if only some of its registers were recorded; else empty."""
     differences: bool = False
-    """Whether frames are encoded as FRAME_V2."""
+    """True if frames are encoded as FRAME_V2."""
 
 
 def decode_channel(content: memoryview) -> Channel:
-    """Decode a channel's record. ValueError, KeyError, struct.error, McapError: it is malformed."""
+    """Decode a channel's record.
+
+    Raises:
+        ValueError, KeyError, struct.error, McapError: The record is malformed.
+    """
     found = ChannelRecord.read(stream(content))
     about = found.metadata
     if found.message_encoding in (FRAME, FRAME_V2, EVENT):
@@ -341,4 +355,4 @@ def decode_channel(content: memoryview) -> Channel:
         )  # fmt: skip
     if found.message_encoding == PLAIN and found.topic in _OWN:
         return Channel(found.id, _OWN[found.topic], found.topic)
-    return Channel(found.id, "", found.topic)  # another program's
+    return Channel(found.id, "", found.topic)  # a channel of another program

@@ -1,8 +1,8 @@
-"""Read the records of an MCAP file from front to back, without an index.
+"""Reads the records of an MCAP file from front to back, without an index.
 
-A file may therefore end anywhere. Nothing in it is trusted: lengths are checked against the file,
-each other and limits, and chunks against their CRC. At most one chunk is in memory at a time. After
-a damaged place, reading continues with the next intact chunk or attachment.
+So a file may end anywhere. Nothing in it is trusted: lengths are checked against the file, each
+other and limits, and chunks against their CRC. At most one chunk is in memory at a time. After a
+damaged place, reading continues with the next intact chunk or attachment.
 """
 
 from __future__ import annotations
@@ -28,17 +28,20 @@ from shmio.errors import RecordingError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES: Final = 1 << 20
-"""Limit on any other record that is read as a whole."""
+"""Largest size of a record, other than a chunk, that is read as a whole."""
 
 BROKEN: Final = 0
-"""Opcode of bytes that are no valid record; no record of MCAP has it."""
+"""Opcode that stands for bytes without a valid record; MCAP does not use it."""
 ONLY_BEGUN: Final = "has no content: its recorder was killed before it wrote anything, or has just started"
 LOOK_BYTES: Final = 4096
-"""Bytes at a record's beginning that suffice for the lengths in it: names of attachments and metadata fit in."""
+"""Number of bytes to read from the beginning of a record in order to check the lengths in it.
+
+The names of attachments and metadata fit in.
+"""
 BEAT_BYTES: Final = 1 << 20
-"""Bytes that are read or unpacked between two calls of ``beat``."""
+"""Number of bytes that are read or decompressed between two calls of ``beat``."""
 MAX_CHUNK_BYTES: Final = 32 << 20
-"""Limit far above a recorder's chunks, which have 1 MiB and one message of at most 2 MiB."""
+"""Largest size of a chunk; a recorder's chunks have 1 MiB and one message of at most 2 MiB."""
 
 HEAD: Final = struct.Struct("<BQ")  # of any record: opcode, size of its content
 CHUNK: Final = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC; then the compression's name, size, data
@@ -52,12 +55,12 @@ _MARK: Final = re.compile(  # beginning of each chunk and attachment that shmio 
 _MARK_BYTES: Final = 64
 _SEARCH_BYTES: Final = 1 << 20
 _MAX_SEARCHED: Final = 100
-"""The search ends after this many places that look like a chunk or attachment but are not."""
+"""Number of places that look like a chunk or attachment but are not, after which a search ends."""
 _SIZES: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: FOOTER.size}
 
 
 class Record(NamedTuple):
-    """Place of a record: byte at which its content begins, and size of the content."""
+    """The place of a record in a file: opcode, offset of its content, and size of its content."""
 
     opcode: int
     at: int
@@ -65,20 +68,20 @@ class Record(NamedTuple):
 
     @property
     def start(self) -> int:
-        """Byte at which the record itself begins."""
+        """Offset at which the record itself begins."""
         return self.at - HEAD.size
 
 
 class Records:
-    """Records of a file; ``closed`` and ``damage`` are valid after :meth:`walk`."""
+    """Reads the records of a file; ``closed`` and ``damage`` are valid after :meth:`walk`."""
 
     def __init__(self, file: Path, *, own: bool, beat: Callable[[], object]) -> None:
         """Open a file.
 
         Args:
             file: The path.
-            own: Whether to accept only a regular file of this user, and no symbolic link.
-            beat: Called after each BEAT_BYTES of work, because a large file takes long.
+            own: True to accept only a regular file of this user, and no symbolic link.
+            beat: Called after each BEAT_BYTES of work, as a heartbeat.
 
         Raises:
             RecordingError: The file is not an MCAP file.
@@ -88,9 +91,9 @@ class Records:
         self._beat = beat
         self._worked_bytes = 0
         self.closed = False
-        """Whether the recorder closed the file, so that index and footer exist."""
+        """True if the recorder has closed the file, so that it has an index and a footer."""
         self.damage = ""
-        """Where and why the walk ended before the footer; empty if it did not."""
+        """Message that says where and why the walk ended before the footer; empty if it did not."""
         flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # opening a FIFO would block
         self._fd = os.open(file, flags | os.O_NOFOLLOW if own else flags)
         try:
@@ -117,9 +120,9 @@ class Records:
     def walk(self, to: int | None = None) -> Iterator[Record]:
         """Yield all records up to the footer, or to the end of the file.
 
-        Damaged bytes are one record with opcode BROKEN, up to the next intact chunk or attachment,
-        or the footer. With ``to``, reading stops at this byte, and the end of the file stays
-        unknown.
+        Damaged bytes, up to the next intact chunk, attachment or footer, are yielded as one record
+        with opcode BROKEN. If ``to`` is given, reading stops at this byte; :attr:`closed` and
+        :attr:`damage` are then not set.
         """
         self.closed, self.damage, self._searched = False, "", 0
         at = len(MAGIC)
@@ -147,7 +150,7 @@ class Records:
             )
 
     def summary(self) -> Iterator[Record]:
-        """Yield the records of the summary of a closed file, which describe the channels again."""
+        """Yield the records in the summary of a closed file, which describes the channels again."""
         footer = self._footer(len(MAGIC))
         if not footer:
             return
@@ -157,7 +160,7 @@ class Records:
             at = record.at + record.size
 
     def summary_damage(self) -> str:
-        """Return the damage that the CRC shows in a closed file's summary; empty if there is none."""
+        """Check the CRC of a closed file's summary; return a message if it is wrong, else ""."""
         footer = self._footer(len(MAGIC))
         start, _, crc = FOOTER.unpack(self.read(footer + HEAD.size, FOOTER.size))
         end = footer + HEAD.size + FOOTER.size - U32.size
@@ -176,7 +179,7 @@ class Records:
         return found
 
     def _peek(self, at: int, size: int) -> bytes:
-        """Return up to ``size`` bytes, ending where the file ended when it was opened."""
+        """Return up to ``size`` bytes, but none that were appended after the file was opened."""
         return self._pread(max(0, min(size, self.size - at)), at)
 
     def _pread(self, size: int, at: int) -> bytes:
@@ -194,7 +197,7 @@ class Records:
             self._beat()
 
     def record(self, at: int) -> Record | None:
-        """Return the record at a byte, or None if no valid record begins there."""
+        """Return the record that begins at a byte; None if no valid record begins there."""
         head = self._peek(at, HEAD.size + LOOK_BYTES)
         if len(head) < HEAD.size:
             return None
@@ -207,7 +210,7 @@ class Records:
         return Record(opcode, content, size)
 
     def _whole(self, at: int, end: int) -> int:
-        """Return the start of the next chunk or attachment whose CRC is right; 0 if there is none."""
+        """Return the start of the next chunk or attachment with a correct CRC; 0 if there is none."""
         for begin in range(at, end, _SEARCH_BYTES):
             for found in _MARK.finditer(self._peek(begin, _SEARCH_BYTES + _MARK_BYTES - 1)):
                 record = self.record(begin + found.start())
@@ -221,12 +224,12 @@ class Records:
         return 0
 
     def footer(self) -> Record | None:
-        """Return the footer of a closed file, or None."""
+        """Return the footer of a closed file; None if the file was not closed."""
         start = self._footer(len(MAGIC))
         return self.record(start) if start else None
 
     def _footer(self, at: int) -> int:
-        """Return the start of the footer at the end of the file, if at or after ``at``; else 0."""
+        """Return the start of the footer at the end of the file; 0 if none is at or after ``at``."""
         start = self.size - len(MAGIC) - FOOTER.size - HEAD.size
         record = self.record(start) if start >= at else None
         if record is None or record.opcode != Opcode.FOOTER or record.at + record.size + len(MAGIC) != self.size:
@@ -234,7 +237,7 @@ class Records:
         return start
 
     def read(self, at: int, size: int, limit: int = MAX_RECORD_BYTES) -> bytes:
-        """Return ``size`` bytes.
+        """Return ``size`` bytes from offset ``at``.
 
         Raises:
             RecordingError: The size exceeds the limit, or the file became shorter.
@@ -252,15 +255,19 @@ class Records:
         return start_ns, end_ns
 
     def chunk(self, record: Record) -> Iterator[tuple[int, memoryview]]:
-        """Yield opcode and content of each record in a chunk.
+        """Yield the opcode and the content of each record in a chunk.
 
         Raises:
-            RecordingError: The chunk is damaged; raised at once, or at a damaged record.
+            RecordingError: The chunk or one of its records is damaged.
         """
         return self._split(record, memoryview(self.unpacked(record)))
 
     def unpacked(self, record: Record) -> bytes:
-        """Return the uncompressed bytes of a chunk, checked against its CRC; else RecordingError."""
+        """Return the uncompressed bytes of a chunk.
+
+        Raises:
+            RecordingError: The chunk is damaged or its CRC is wrong.
+        """
         try:
             data = _unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES))
         except (ValueError, struct.error, zstandard.ZstdError) as error:
@@ -291,7 +298,7 @@ class Records:
             at += size
 
     def hold(self) -> None:
-        """Lock the file while it is open, so that no recorder deletes it as old.
+        """Lock the file while it is open, so that no recorder deletes it.
 
         This has no effect on a file system without locks.
         """
@@ -306,9 +313,10 @@ class Records:
 
 
 class Damage(NamedTuple):
-    """Bytes ``first`` to ``last`` of a file, which cannot be read, or only in part.
+    """A damaged place in a file: bytes ``first`` to ``last`` cannot be read, or only in part.
 
-    ``after_ns``, ``before_ns``: log times of the readable entries before and after them; 0: none.
+    ``after_ns`` and ``before_ns`` are the log times of the last readable entry before the place and
+    the first one after it; 0 if there is none.
     """
 
     first: int
@@ -319,9 +327,10 @@ class Damage(NamedTuple):
 
 
 class DamageLog:
-    """Collects damage while a file is read from front to back. Between two intact chunks it is reported as one.
+    """Collects damage while a file is read from front to back.
 
-    Call :meth:`end` before a chunk that can be read, :meth:`after` behind it, and :meth:`end` at the end.
+    All damage between two intact chunks is reported as one place. Call :meth:`end` before each
+    readable chunk and at the end of the file, and :meth:`after` after each readable chunk.
     """
 
     def __init__(self, tell: Callable[[Damage], object]) -> None:
@@ -338,23 +347,23 @@ class DamageLog:
             self._found = self._found._replace(last=last)
 
     def after(self, last_ns: int) -> None:
-        """Note that a chunk was read, up to this log time."""
+        """Store the last log time of a chunk that was read."""
         self._after_ns = last_ns
 
     def end(self, before_ns: int = 0) -> None:
-        """Report pending damage. ``before_ns``: log time of the entry behind it; 0: there is none."""
+        """Report pending damage; ``before_ns`` is the log time of the next entry, 0 for none."""
         if self._found is not None:
             self._tell(self._found._replace(before_ns=before_ns))
             self._found = None
 
 
 def stream(data: bytes | memoryview) -> ReadDataStream:
-    """Return a stream from which the mcap library reads records; it has its own copy of the data."""
+    """Return a stream with a copy of the data, from which the mcap library can read records."""
     return ReadDataStream(BytesIO(data))
 
 
 class _OfThread(threading.local):
-    """Decompressor of a thread: making one takes longer than unpacking a chunk."""
+    """A decompressor for each thread; to create one takes longer than to decompress a chunk."""
 
     def __init__(self) -> None:
         self.decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
@@ -364,10 +373,10 @@ _of_thread = _OfThread()
 
 
 def _framed(opcode: int, size: int, look: bytes) -> bool:
-    """Return whether the lengths inside a record agree with the length of the whole record.
+    """Return whether the lengths inside a record are consistent with the length of the record.
 
-    This keeps a damaged length from leading the reader past intact records. ``look`` is the
-    beginning of the content.
+    Otherwise a damaged length would make the reader skip intact records. ``look`` is the beginning
+    of the content.
     """
     try:
         if opcode == Opcode.CHUNK:
@@ -395,7 +404,7 @@ def _unpack(content: bytes) -> bytes:
     """Return the uncompressed records of a chunk.
 
     Raises:
-        ValueError: A size, the compression or the checksum is wrong.
+        ValueError: A size or the checksum is wrong, or the compression is unknown.
         struct.error: The chunk is too short.
         ZstdError: The compressed data is damaged.
     """

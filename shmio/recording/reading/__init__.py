@@ -1,1 +1,1 @@
-"""Read recordings: closed ones, those of a killed recorder, and those being written."""
+"""Reads recordings that are closed, were left by a killed recorder, or are being written."""

@@ -1,4 +1,4 @@
-"""Read the frames of a block as arrays, one chunk at a time, without a Python object for each."""
+"""Reads the frames of a block as arrays, chunk by chunk, without a Python object for each frame."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ HEAD: Final = np.dtype(
         ("delay_us", "<u4"),
     ]
 )
-"""A frame's header (docs/reference/dump-format.md)."""
+"""The header of a frame (docs/reference/dump-format.md)."""
 
-_RECORD: Final = struct.Struct("<BQH")  # opcode, size; of a message: its channel
-_MESSAGE: Final = struct.Struct("<BQHIQQ")  # opcode, size; channel, sequence, log time, publish time
+_RECORD: Final = struct.Struct("<BQH")  # opcode, size; then, in a message, the channel
+_MESSAGE: Final = struct.Struct("<BQHIQQ")  # opcode, size, channel, sequence, log time, publish time
 _TOLD: Final = np.dtype(
     [
         ("opcode", "u1"),
@@ -48,11 +48,14 @@ _TOLD: Final = np.dtype(
         ("publish_ns", "<i8"),
     ]
 )
-"""The record and message header for numpy."""
+"""The record header and the message header as a numpy type."""
 _HEAD_SIZE: Final = 9
 _LOG_AT: Final = 15
 _WORTH: Final = 4
-"""Shorter runs do not pay: after ``_MAX_TRIES`` of them, a chunk is read message by message."""
+"""Length of a run below which runs are not worth it.
+
+After ``_MAX_TRIES`` shorter runs, the rest of a chunk is read message by message.
+"""
 _MAX_TRIES: Final = 8
 
 _Bytes = npt.NDArray[np.uint8]
@@ -60,13 +63,13 @@ _Bytes = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """n frames of one block in order.
+    """A batch of n frames of one block, in order.
 
     Attributes:
-        time_ns: Log times, int64, shape (n,).
-        records: Headers (:data:`HEAD`) and images, uint8, shape (n, header + image size). Images
-            are those that consumers saw, or the source's if these were requested.
-        reasons: The frames' reasons; None if all are empty.
+        time_ns: Log times in ns, int64, shape (n,).
+        records: Headers (:data:`HEAD`) and images, uint8, shape (n, header + image size). The
+            images are those that readers saw, or those of the source if these were requested.
+        reasons: The reasons of the frames; None if all are empty.
     """
 
     time_ns: npt.NDArray[np.int64]
@@ -75,12 +78,12 @@ class Batch:
 
     @property
     def head(self) -> npt.NDArray[Any]:
-        """The frames' headers: :data:`HEAD`, shape (n,)."""
+        """The headers of the frames, of type :data:`HEAD`, shape (n,)."""
         return self.records[:, : HEAD.itemsize].view(HEAD)[:, 0]
 
     @property
     def images(self) -> _Bytes:
-        """The frames' images: bytes, shape (n, image size)."""
+        """The images of the frames, uint8, shape (n, image size)."""
         return self.records[:, HEAD.itemsize :]
 
     def __len__(self) -> int:
@@ -100,7 +103,7 @@ def batch(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int, *,
         size: Size of an image in bytes.
         from_ns: First log time.
         to_ns: Last log time.
-        raw: Whether to return the source's images instead of those that consumers saw.
+        raw: True for the images that the source delivered; False for those that readers saw.
 
     Raises:
         RecordingError: The frames cannot be decoded.
@@ -160,10 +163,10 @@ def _frame(piece: bytes, size: int) -> Frame:
 
 
 def _runs(array: _Bytes, data: bytes, wanted: int) -> Iterator[_Bytes]:
-    """Yield a channel's messages in runs (n, bytes of a message) of one size and distance.
+    """Yield a channel's messages in runs of one size and distance, each (n, bytes of a message).
 
-    Messages of several blocks mostly take turns, so that the same pattern of records repeats. Such
-    a run is compared all at once instead of record by record.
+    If several blocks publish in turn, the same pattern of records repeats. Such a run is found by
+    comparing arrays, not record by record.
 
     Raises:
         RecordingError: The records do not fit the chunk.
@@ -194,7 +197,7 @@ def _runs(array: _Bytes, data: bytes, wanted: int) -> Iterator[_Bytes]:
 
 
 def _repeats(array: _Bytes, begin: int, period: int, pattern: list[int]) -> int:
-    """Return how often a pattern of records, first at ``begin``, repeats without interruption."""
+    """Return how many times a pattern of records repeats from ``begin`` on, one after another."""
     count = (len(array) - begin) // period
     rows = array[begin : begin + count * period].reshape(count, period)
     same = np.ones(count, np.bool_)
@@ -205,7 +208,7 @@ def _repeats(array: _Bytes, begin: int, period: int, pattern: list[int]) -> int:
 
 
 def _cut(array: _Bytes, begin: int, period: int, count: int, size: int) -> _Bytes:
-    """Return messages of one size, which begin ``period`` bytes apart, as bytes (count, size)."""
+    """Return messages of one size that begin ``period`` bytes apart, as uint8, (count, size)."""
     if size < _MESSAGE.size:
         raise RecordingError("a message is shorter than its header")
     if count == 1:
@@ -214,7 +217,7 @@ def _cut(array: _Bytes, begin: int, period: int, count: int, size: int) -> _Byte
 
 
 def _restored(run: _Bytes) -> _Bytes:
-    """Convert messages from FRAME_V2 all at once, as ``restore`` (``encoding.py``) converts one."""
+    """Convert all messages from FRAME_V2 to FRAME, like ``restore`` in ``encoding.py``."""
     told = run[:, : _MESSAGE.size].view(_TOLD)[:, 0]
     frames = run[:, _MESSAGE.size :].copy()
     if frames.shape[1] >= HEAD.itemsize:
@@ -228,7 +231,7 @@ def _restored(run: _Bytes) -> _Bytes:
 
 
 def _regular(frames: _Bytes, size: int) -> bool:
-    """Return whether each frame has a header and one image, and nothing else."""
+    """Return whether each frame consists of a header and one image."""
     if frames.shape[1] != HEAD.itemsize + size:
         return False
     head = frames[:, : HEAD.itemsize].view(HEAD)[:, 0]
@@ -237,7 +240,7 @@ def _regular(frames: _Bytes, size: int) -> bool:
 
 
 def _decoded(frames: _Bytes, size: int, *, raw: bool) -> tuple[_Bytes, list[str]]:
-    """Decode any frames one by one; return records as in :class:`Batch`, and the reasons."""
+    """Decode frames of any form one by one; return records as in :class:`Batch`, and the reasons."""
     records, reasons = [], []
     for piece in map(bytes, frames):
         frame = _frame(piece, size)

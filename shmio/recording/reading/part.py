@@ -1,4 +1,4 @@
-"""One file of a dump: its blocks, and its entries from a given time on."""
+"""Reads one file of a recording: its blocks, and its entries in a range of time."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from shmio.recording.reading.survey import Track, survey, survey_by_index
 from shmio.segment import Frame
 
 MAX_NS: Final = (1 << 63) - 1
-"""The end of time, for ranges without an end."""
+"""The largest log time, for ranges without an end."""
 BATCH_FRAMES: Final = 256
-"""Frames of a batch that is made from single frames."""
+"""Number of frames in a batch that is made from single frames."""
 
 Damaged = Callable[[Path, Damage], object]
 T = TypeVar("T")
@@ -35,9 +35,10 @@ ItemT_co = TypeVar("ItemT_co", bound=Item, covariant=True)
 
 @dataclass(slots=True, eq=False)
 class DumpBlock:
-    """A source with one layout. A reload that changes the layout starts another block.
+    """A block of a recording: a source with one layout; a reload of the layout begins a new block.
 
-    ``section`` is unique among the blocks of a run, also across files. ``layout_hash`` is a SHA-256 in hex.
+    ``section`` is unique among the blocks of a run, also in several files. ``layout_hash`` is a
+    SHA-256 in hex.
     """
 
     source: str
@@ -47,21 +48,21 @@ class DumpBlock:
     period_ns: int
     stale_ns: int
     of: str = ""
-    """Hash of the whole layout, if only some of its registers were recorded."""
+    """Hash of the whole layout, if only some of its registers were recorded; else empty."""
     frames: int = 0
-    """Number of recorded frames; those in two files count twice."""
+    """Number of recorded frames; a frame that is in two files counts twice."""
     events: int = 0
     after: dict[str, int] = field(default_factory=dict)
-    """Numbers before the first recorded frame and event, by ``frames`` and ``events``."""
+    """Number before the first recorded frame (key ``frames``) and event (key ``events``)."""
     begin_ns: int = 0
     end_ns: int = 0
-    """Log times of the first and last frame or event."""
+    """``begin_ns`` and ``end_ns``: log times of the first and the last frame or event."""
     first_ns: int = 0
     last_ns: int = 0
-    """Log times of the first and last frame."""
+    """``first_ns`` and ``last_ns``: log times of the first and the last frame."""
 
     def add(self, kind: str, track: Track) -> None:
-        """Add the frames or events of a file."""
+        """Add the counts and times of the frames or events in a file."""
         if kind == FRAME:
             self.frames += track.count
             self.first_ns = min(self.first_ns or track.first_ns, track.first_ns)
@@ -72,37 +73,49 @@ class DumpBlock:
         self.end_ns = max(self.end_ns, track.last_ns)
 
     def register(self, path: str) -> Register:
-        """Return a register or array element, by its path with or without the source; PathError."""
+        """Return a register or array element by its path, with or without the source.
+
+        Raises:
+            PathError: There is no such register.
+        """
         return find(self.layout, parse_topic(path, (self.source,), self.source).path)
 
     def named(self, topic: Topic) -> list[Register]:
-        """Return the registers that a topic of any form names; PathError."""
+        """Return the registers that a topic names.
+
+        Raises:
+            PathError: There is no such register.
+        """
         return named(self.layout, topic)
 
     def value(self, frame: Frame, path: str) -> Value:
-        """Return the value that consumers saw of a register in a frame of this block; PathError."""
+        """Return the value of a register that readers saw in a frame of this block.
+
+        Raises:
+            PathError: There is no such register.
+        """
         return codec(self.register(path), self.layout.byte_order).decode(frame.image)
 
 
 @dataclass(slots=True)
 class Contents:
-    """Channels of one file, by number."""
+    """The channels of one file, by the block or kind to which they belong."""
 
     blocks: dict[int, DumpBlock] = field(default_factory=dict)
-    """Blocks of the channels with frames and events."""
+    """The block of each channel with frames or events, by the channel's number."""
     kinds: dict[int, str] = field(default_factory=dict)
     instance: set[int] = field(default_factory=set)
-    """Channels that belong to no single block: gaps, steps, processes."""
+    """The numbers of the channels with gaps, steps and process changes."""
     numbered: dict[tuple[str, int], DumpBlock] = field(default_factory=dict)
-    """Blocks by source and their number in this file."""
+    """The blocks by source and their number in this file."""
     number: dict[DumpBlock, int] = field(default_factory=dict)
 
     def frames(self, source: str) -> list[int]:
-        """Channels with frames of a source, in the order in which the blocks began."""
+        """Return the channels with frames of a source, in the order in which the blocks began."""
         return [number for number, kind in self.kinds.items() if kind == FRAME and self.blocks[number].source == source]
 
     def events(self, sources: Collection[str]) -> list[int]:
-        """Channels with events of these sources."""
+        """Return the channels with events of these sources."""
         return [
             number for number, kind in self.kinds.items() if kind == EVENT and self.blocks[number].source in sources
         ]
@@ -111,7 +124,7 @@ class Contents:
 def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Contents:
     """Return the contents of a file, and add its new blocks to ``blocks``.
 
-    A block with a damaged layout is left out and listed in the survey's damage.
+    A block with a damaged layout is skipped, and noted in the survey's damage.
     """
     found = Contents()
     for channel in sorted(part.reader.channels.values(), key=lambda channel: (channel.block, channel.number)):
@@ -139,7 +152,7 @@ def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Conte
 
 
 class Part:
-    """One file of a dump, with a survey of its contents.
+    """One file of a recording, with a survey of its contents.
 
     Raises:
         OSError: The file cannot be opened.
@@ -147,7 +160,7 @@ class Part:
     """
 
     def __init__(self, file: Path, damaged: Damaged | None) -> None:
-        """Open a file; call ``damaged`` for damage, or raise RecordingError there if it is None."""
+        """Open a file. Damage is passed to ``damaged``, or raises RecordingError if it is None."""
         self.file = file
         self.reader = Reader(file)
         self._damaged = damaged
@@ -161,7 +174,7 @@ class Part:
         self.begin_ns, self.end_ns = self.found.begin_ns, self.found.end_ns
 
     def messages(self, channels: Collection[int], from_ns: int, to_ns: int) -> Iterator[Message]:
-        """Yield the messages of channels in a range of log times, in file order."""
+        """Yield the messages of some channels in a range of log times, in file order."""
         records = (record for record, _, _ in self._chunks(from_ns, to_ns, channels))
         damaged = self._tell if self._damaged else None
         yield from self.reader.messages(
@@ -169,9 +182,9 @@ class Part:
         )
 
     def messages_before(self, channels: Collection[int], time_ns: int) -> Iterator[list[Message]]:
-        """Yield the messages up to a time, chunk by chunk, the last chunk first.
+        """Yield the messages of each chunk up to a time, beginning with the last chunk.
 
-        Within a chunk, messages are in file order.
+        The messages of a chunk are in file order.
         """
         for record, _, _ in self.found.chunks.before(time_ns, self._sure(channels)):
             damaged = self._tell if self._damaged else None
@@ -179,7 +192,7 @@ class Part:
             yield list(self.reader.messages(wanted, 0, time_ns, damaged, [record]))
 
     def batches(self, number: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Iterator[Batch]:
-        """Yield the frames of a channel as arrays, chunk by chunk; ``size`` is that of an image."""
+        """Yield the frames of a channel as arrays, chunk by chunk; ``size`` is the image's size."""
         channel = self.reader.channels[number]
         for found in self._each(
             number, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)
@@ -211,7 +224,7 @@ class Part:
 
     def _decoded(self, record: Record, decode: Callable[[bytes], T]) -> T:
         if record.opcode != Opcode.CHUNK:
-            self.reader.note(record)  # raises an error about the damage
+            self.reader.note(record)  # raises RecordingError if the record is damaged
         data = self.reader.records.unpacked(record)
         try:
             return decode(data)
@@ -222,9 +235,9 @@ class Part:
         return self.found.chunks.between(from_ns, to_ns, self._sure(channels))
 
     def _sure(self, channels: Collection[int]) -> Collection[int] | None:
-        """Return the channels if the summary has been checked, else None.
+        """Return the channels if the CRC of the summary was correct, else None.
 
-        The index of a single chunk has no CRC; it must not hide an intact chunk.
+        The index of a single chunk has no CRC. If it is damaged, it must not hide an intact chunk.
         """
         return channels if self._indexed else None
 
@@ -254,7 +267,7 @@ class Entry(NamedTuple, Generic[ItemT_co]):
 def messages_of(
     part: Part, within: Contents, channels: Collection[int], from_ns: int, to_ns: int
 ) -> Iterator[tuple[Contents, Entry[Item]]]:
-    """Yield the messages of a file's channels in a range of log times, with the file's contents."""
+    """Yield the messages of some channels in a range of log times, each with the file's contents."""
     for channel, log_ns, item in part.messages(channels, from_ns, to_ns):
         block = (
             within.numbered.get((item.source, item.block))
@@ -265,7 +278,7 @@ def messages_of(
 
 
 def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[DumpBlock, Batch]]:
-    """Yield frames as arrays in batches; ``raw`` for the source's images, not the consumers'."""
+    """Yield frames as batches of arrays; ``raw`` selects the images without injections."""
     for block, of_block in groupby(frames, key=lambda entry: entry.block):
         while block is not None and (some := list(islice(of_block, BATCH_FRAMES))):
             items = [entry.item for entry in some]
@@ -276,7 +289,7 @@ def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[D
 
 
 def latest_of(part: Part, within: Contents, source: str, time_ns: int) -> Entry[Frame] | None:
-    """Return the last frame of a source in a file at or before a time."""
+    """Return the last frame of a source in a file at or before a time; None if there is none."""
     for messages in part.messages_before(within.frames(source), time_ns):
         for message in reversed(messages):
             if isinstance(message.item, Frame):

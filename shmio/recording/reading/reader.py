@@ -1,4 +1,4 @@
-"""Reads recordings: whole ones, those of a killed recorder, and those being written."""
+"""Reads the messages, layouts and metadata of one recording file."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ from shmio.recording.format.records import (
 from shmio.segment import Event, Frame
 
 MAX_LAYOUT_BYTES: Final = 64 << 20
-"""Maximum size of all layouts of a file together."""
+"""Largest total size of all layouts in a file."""
 MAX_ATTACHMENTS: Final = 10_000
 
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_ATTACHMENT_HEAD: Final = 4096  # enough for times, name, media type and size of any attachment
+_ATTACHMENT_HEAD: Final = 4096  # bytes for the times, name, media type and size of an attachment
 _LAYOUTS: Final = "layouts/"
 
 
@@ -74,7 +74,7 @@ _DECODERS: Final[dict[str, Callable[[bytes], Item]]] = {
 
 
 class Message(NamedTuple):
-    """A message: a frame, event, gap, end of a step or change of a process."""
+    """A message of a recording: a frame, an event, a gap, the end of a step or a process change."""
 
     channel: Channel
     log_ns: int
@@ -82,7 +82,7 @@ class Message(NamedTuple):
 
 
 class AttachmentEntry(NamedTuple):
-    """Place of an attachment's data, and the record that contains it."""
+    """The place of an attachment's data in the file, and the record that contains it."""
 
     at: int
     size: int
@@ -90,29 +90,40 @@ class AttachmentEntry(NamedTuple):
 
 
 class Reader:
-    """Reads one recording. A context manager. Channels become known as :meth:`messages` reads on.
+    """Reads one file of a recording. A context manager.
 
-    Raises OSError or RecordingError if the file cannot be opened, or is not a recording.
+    The file may be closed, left by a killed recorder, or being written. :meth:`messages` adds the
+    channels that it finds.
+
+    Raises:
+        OSError: The file cannot be opened.
+        RecordingError: The file is not a recording.
     """
 
     def __init__(self, file: Path, *, own: bool = False, beat: Callable[[], object] = lambda: None) -> None:
-        """``own``: accept only a regular file of this user. ``beat`` is called regularly while reading."""
+        """Open the file.
+
+        Args:
+            file: The path.
+            own: True to accept only a regular file of this user.
+            beat: Called regularly during reading, as a heartbeat.
+        """
         self.file = file
         self.records = Records(file, own=own, beat=beat)
         self.about: dict[str, str] = {}
         """The recorder's metadata about the instance."""
         self.places: dict[int, BlockPosition] = {}
-        """Positions, by section, where the previous recorder stopped, as far as known."""
+        """Positions by section at which the previous recording ended, as far as they are known."""
         self.complete = False
-        """Whether all channels are known, because the whole file was read."""
+        """True if all channels are known, because the whole file was read."""
         self.channels: dict[int, Channel] = {}
         self.summary_damage = ""
-        """Description of the first needed record of the summary that could not be read; empty: none."""
+        """Message about the first summary record that was needed but damaged; empty if there is none."""
         self.attachments: dict[str, AttachmentEntry] = {}
         self._layouts: dict[str, Layout] = {}
         self._layout_bytes = 0
         self._summarized = False
-        self._ours = False  # by what the file's header says
+        self._ours = False  # according to the file's header
 
     def messages(
         self,
@@ -124,16 +135,16 @@ class Reader:
     ) -> Iterator[Message]:
         """Yield the messages of some channels in a range of log times, in file order.
 
-        It ends at the end of the file; :attr:`Records.closed` and :attr:`Records.damage` then say how the file
-        ends. Once all channels are known, chunks outside the range are not read.
+        After the last message, :attr:`Records.closed` and :attr:`Records.damage` say how the file
+        ends. Once all channels are known, chunks outside the range are skipped.
 
         Args:
             wanted: Selects the channels.
             from_ns: Start of the range.
             to_ns: End of the range.
-            damaged: Called for damage within the range, before reading continues with the next intact chunk.
-                None: damage raises RecordingError.
-            records: The records to read; None: the whole file.
+            damaged: Called for each damage in the range; reading continues with the next intact
+                chunk. If None, damage raises RecordingError.
+            records: The records to read; None for the whole file.
         """
 
         def tell(damage: Damage) -> None:
@@ -165,7 +176,7 @@ class Reader:
         from_ns: int,
         to_ns: int,
     ) -> Iterator[Message]:
-        """Yield a chunk's messages. Malformed ones are skipped, and RecordingError is raised at the end."""
+        """Yield the messages of a chunk; after the last one, raise RecordingError if any is malformed."""
         problem: RecordingError | None = None
         for channel, log_ns, data in contents:
             if from_ns <= log_ns <= to_ns and wanted(channel):
@@ -179,12 +190,13 @@ class Reader:
             raise problem
 
     def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
-        """Yield channel, log time and data of a chunk's messages, and note its channels.
+        """Yield the channel, log time and data of each message in a chunk, and store its channels.
 
-        Messages of other programs are skipped. Frames of either version are converted to FRAME.
+        Messages of other programs are skipped. Frames of both versions are converted to FRAME.
 
         Raises:
-            RecordingError: At once if the chunk is damaged; at the end if messages were left out.
+            RecordingError: The chunk is damaged; or, after the last message, a message was skipped
+                because its channel is unknown.
         """
         return self._raw(self.records.chunk(record))
 
@@ -212,8 +224,9 @@ class Reader:
     def channel(self, number: int) -> Channel | None:
         """Return a channel by its number; None if it is unknown.
 
-        If the chunk that describes it is damaged, the summary of a closed file is used. Damage there is noted in
-        :attr:`summary_damage`, and does not affect other channels.
+        If the chunk that describes the channel is damaged, its description in the summary of a
+        closed file is used. Damage of the summary is noted in :attr:`summary_damage`, and does not
+        affect other channels.
         """
         if number not in self.channels and not self._summarized:
             self._summarized = True
@@ -226,7 +239,11 @@ class Reader:
         return self.channels.get(number)
 
     def decode(self, channel: Channel, data: memoryview) -> Item:
-        """Decode a message. RecordingError: it is malformed."""
+        """Decode a message.
+
+        Raises:
+            RecordingError: The message is malformed.
+        """
         try:
             if channel.encoding == FRAME:
                 frame = decode_frame(bytes(data))
@@ -238,7 +255,11 @@ class Reader:
             raise RecordingError(f"{self.file}: {channel.topic}: {error}") from None
 
     def layout(self, channel: Channel) -> Layout:
-        """Return the layout of a channel's block. RecordingError: its attachment is missing or damaged."""
+        """Return the layout of a channel's block.
+
+        Raises:
+            RecordingError: The layout is missing in the file, or is damaged.
+        """
         digest = channel.layout
         if digest not in self._layouts:
             entry = self.attachments.get(f"{_LAYOUTS}{digest}.json")
@@ -255,13 +276,21 @@ class Reader:
         return self._layouts[digest]
 
     def attachment(self, name: str, limit: int = MAX_LAYOUT_BYTES) -> bytes:
-        """Read an attachment, and check its CRC. RecordingError: it is damaged, or larger than the limit."""
+        """Return the data of an attachment, and check its CRC.
+
+        Raises:
+            RecordingError: The attachment is damaged, or larger than the limit.
+        """
         entry = self.attachments[name]
         self.records.check_crc(entry.record)
         return self.records.read(entry.at, entry.size, limit)
 
     def note(self, record: Record) -> None:
-        """Process a record outside chunks: metadata, header or attachment. RecordingError: it is damaged."""
+        """Process a record outside chunks: metadata, a header or an attachment.
+
+        Raises:
+            RecordingError: The record is damaged.
+        """
         if record.opcode == BROKEN:
             raise RecordingError(f"{self.file}: bytes {record.at} to {record.at + record.size - 1} are damaged")
         try:
@@ -284,7 +313,7 @@ class Reader:
         return start in (b"", bytes([Opcode.HEADER])) and self.records.record(len(MAGIC)) is None
 
     def _profile(self, record: Record) -> str:
-        """Return the profile in the header, which matters only for the message about an empty file."""
+        """Return the profile in the file's header, which is used only for messages."""
         with suppress(ValueError, struct.error, McapError):
             return str(Header.read(stream(self.records.read(record.at, min(record.size, LOOK_BYTES)))).profile)
         return ""
@@ -312,7 +341,7 @@ class Reader:
             raise RecordingError(f"{self.file}: channel {channel.number} has two different descriptions")
 
     def require_ours(self) -> None:
-        """Raise RecordingError if nothing that was read was written by a recorder of shmio."""
+        """Raise RecordingError if no recorder of shmio has written what was read."""
         if not self.about and not any(channel.encoding for channel in self.channels.values()):
             if not self.records.closed and (self._ours or self._is_cut_short()):
                 raise RecordingError(f"{self.file} {ONLY_BEGUN}")

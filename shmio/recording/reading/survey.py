@@ -1,4 +1,4 @@
-"""Survey a recording without reading all of it: by the index of a closed file, or by the indexes of its chunks."""
+"""Surveys a recording without reading all of it: by its index, or by the indexes after its chunks."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from shmio.recording.reading.reader import Reader
 
 MAX_CHUNKS: Final = 1 << 22
 MAX_SETS: Final = 1 << 16
-"""Limit on different sets of channels in the chunks."""
+"""Largest number of different sets of channels in the chunks."""
 MAX_GAPS: Final = 1000
-"""Limit on gaps that are listed; all are counted."""
+"""Largest number of gaps that are listed; all are counted."""
 MAX_DAMAGE: Final = 20
-"""Limit on damaged places that are listed."""
+"""Largest number of damaged places that are listed."""
 MAX_BLOCKS: Final = 10_000
 MAX_SUMMARY_BYTES: Final = 64 << 20
-"""A chunk takes about 90 bytes of the summary, so that this is enough for a week."""
+"""Largest size of the summary; it has about 90 bytes per chunk, so this is enough for a week."""
 
 _MAX_U64: Final = (1 << 64) - 1
 _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
-_CHUNK_INDEX: Final = struct.Struct("<QQQQI")  # first and last log time, start, length; bytes of the map that follows
-_PLACE: Final = struct.Struct("<HQ")  # a channel and where its message index is, or how many messages it has
+_CHUNK_INDEX: Final = struct.Struct("<QQQQI")  # first and last log time, start, length, size of the map that follows
+_PLACE: Final = struct.Struct("<HQ")  # a channel, and the place of its message index or the number of its messages
 _STATISTICS: Final = struct.Struct("<QHIIIIQQI")
 
 _Times = npt.NDArray[np.uint64]
 
 
 class Chunks:
-    """Table of chunks and damaged places in file order, with about 40 bytes for each."""
+    """A table of the chunks and damaged places of a file, in order, with about 40 bytes for each."""
 
     def __init__(self) -> None:
         self._at = array("Q")
@@ -71,7 +71,11 @@ class Chunks:
         self._last_ns.append(last_ns)
 
     def add_broken(self, record: Record) -> None:
-        """Add damaged bytes after the last chunk; RecordingError as in :meth:`add`."""
+        """Add damaged bytes after the last chunk.
+
+        Raises:
+            RecordingError: There are more chunks than any recorder writes.
+        """
         at_ns = self._last_ns[-1] if self._last_ns else 0
         self.add(record, at_ns, at_ns, ())
 
@@ -80,14 +84,14 @@ class Chunks:
     ) -> Iterator[tuple[Record, int, int]]:
         """Yield the chunks that may have messages in a range of log times.
 
-        With each chunk come the log times of its first and last message. ``channels`` selects the
-        chunks with messages of some of these channels.
+        Each item is a chunk, and the log times of its first and last message. ``channels`` selects
+        the chunks with messages of any of these channels.
         """
         begin, end = self._bounds(from_ns, to_ns)
         yield from self._rows(range(begin, end), from_ns, to_ns, channels)
 
     def before(self, time_ns: int, channels: Collection[int] | None = None) -> Iterator[tuple[Record, int, int]]:
-        """Yield the chunks that begin at or before a time, the last one first, as :meth:`between`."""
+        """Yield the chunks that begin at or before a time, in reverse; items as in :meth:`between`."""
         _, end = self._bounds(0, time_ns)
         yield from self._rows(range(end - 1, -1, -1), 0, time_ns, channels)
 
@@ -101,9 +105,9 @@ class Chunks:
                 yield Record(self._opcode[index], self._at[index], self._size[index]), first_ns, last_ns
 
     def _bounds(self, from_ns: int, to_ns: int) -> tuple[int, int]:
-        """Return a range of indices that includes all chunks of a range of log times.
+        """Return a range of indices that includes all chunks in a range of log times.
 
-        The times of neighbouring chunks may overlap a little.
+        It may include others, because the times of adjacent chunks may overlap a little.
         """
         latest_ns, earliest_ns = self._sorted
         begin = int(np.searchsorted(latest_ns, np.uint64(min(max(from_ns, 0), _MAX_U64)), "left"))
@@ -112,7 +116,7 @@ class Chunks:
 
     @cached_property
     def _sorted(self) -> tuple[_Times, _Times]:
-        """The latest time up to each chunk, and the earliest from each on; both ascend.
+        """For each chunk, the latest time up to it, and the earliest time from it on; both ascend.
 
         They are computed once, when the table is complete.
         """
@@ -122,7 +126,7 @@ class Chunks:
 
 
 class Count(NamedTuple):
-    """Number of messages of a channel in a chunk, and log times of the first and last."""
+    """The number of a channel's messages in a chunk, and the log times of the first and the last."""
 
     channel: int
     messages: int
@@ -132,7 +136,7 @@ class Count(NamedTuple):
 
 @dataclass(slots=True)
 class Track:
-    """Number of messages of one channel; times and chunks of the first and the last one."""
+    """The number of a channel's messages in a file; times and chunks of the first and the last."""
 
     channel: Channel
     count: int
@@ -142,26 +146,30 @@ class Track:
     last_in: Record
 
     def numbers(self, reader: Reader) -> tuple[int, int]:
-        """Return the numbers of the first and last frame or event.
+        """Return the numbers of the first and the last frame or event.
 
         Raises:
-            RecordingError: They cannot be read.
+            RecordingError: The chunk of one of them cannot be read.
         """
         return self._in(reader, self.first_in)[0], self.last(reader)
 
     def last(self, reader: Reader) -> int:
-        """Return the number of the last frame or event; RecordingError if it cannot be read."""
+        """Return the number of the last frame or event.
+
+        Raises:
+            RecordingError: Its chunk cannot be read.
+        """
         return self._in(reader, self.last_in)[-1]
 
     def _in(self, reader: Reader, chunk: Record) -> list[int]:
-        """Return the channel's numbers in a chunk, at least one."""
+        """Return the numbers of the channel's frames or events in a chunk, at least one."""
         found: list[int] = []
         try:
             for channel, _, data in reader.raw(chunk):
                 if channel.number == self.channel.number and len(data) >= U64.size:
-                    found.append(U64.unpack_from(data)[0])  # frames and events begin with it
+                    found.append(U64.unpack_from(data)[0])  # frames and events begin with their number
         except RecordingError:
-            if not found:  # otherwise only messages of other channels are lost
+            if not found:  # otherwise, only messages of other channels were damaged
                 raise
         if not found:
             raise RecordingError(f"{reader.file}: {self.channel.topic}: an index refers to messages that do not exist")
@@ -170,21 +178,21 @@ class Track:
 
 @dataclass(slots=True)
 class Survey:
-    """Contents of a recording as a whole."""
+    """A survey of the contents of a file."""
 
     tracks: dict[int, Track] = field(default_factory=dict)
-    """Messages by the channel's number."""
+    """The counts and times of messages, by the channel's number."""
     gaps: list[Gap] = field(default_factory=list)
     """The first gaps, at most ``MAX_GAPS``."""
     missed: dict[tuple[str, int, str], int] = field(default_factory=dict)
-    """Number of missing items by source, block and kind."""
+    """Number of missing frames or events, by source, block and kind."""
     missed_to: dict[tuple[str, int, str], int] = field(default_factory=dict)
-    """Highest missing number, by source, block and kind."""
+    """Highest number of a missing frame or event, by source, block and kind."""
     gap_count: int = 0
     damage: list[str] = field(default_factory=list)
-    """Descriptions of what could not be read."""
+    """Messages about what could not be read."""
     chunks: Chunks = field(default_factory=Chunks)
-    """All chunks found, by their indexes or by reading them."""
+    """All chunks of the file."""
 
     @property
     def begin_ns(self) -> int:
@@ -213,7 +221,7 @@ class Survey:
 
 
 def survey(reader: Reader) -> Survey:
-    """Survey a recording by walking through the file; damage is noted and skipped.
+    """Survey a recording by a walk through the file. Damage is noted and skipped.
 
     Raises:
         RecordingError: The file is not a recording of shmio.
@@ -227,7 +235,7 @@ def survey(reader: Reader) -> Survey:
             counts = None if counts is None or count is None else [*counts, count]
             continue
         if chunk is not None:
-            if record.opcode == BROKEN:  # perhaps the rest of the chunk's indexes
+            if record.opcode == BROKEN:  # it may be the rest of the chunk's indexes
                 counts = None
             _settle(reader, found, chunk, counts)
             chunk = None
@@ -240,7 +248,7 @@ def survey(reader: Reader) -> Survey:
                 reader.note(record)
             except RecordingError as error:
                 _damaged(found, str(error))
-    if chunk is not None:  # the file ends here: indexes of its last chunk may be missing
+    if chunk is not None:  # at the end of the file, indexes of the last chunk may be missing
         _settle(reader, found, chunk, None)
     if reader.summary_damage:
         _damaged(found, reader.summary_damage)
@@ -261,7 +269,7 @@ def read_index(reader: Reader, record: Record) -> Count | None:
 
 
 def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[Count] | None) -> None:
-    """Count a chunk's messages by its indexes, or by reading it if that is necessary."""
+    """Count the messages of a chunk by its indexes, or read the chunk if that is necessary."""
     if not counts or any(_must_read(reader, count.channel) for count in counts):
         counts = _read(reader, found, chunk)
     first_ns, last_ns = reader.records.chunk_times(chunk)
@@ -282,7 +290,7 @@ def _damaged(found: Survey, why: str) -> None:
 
 
 def _must_read(reader: Reader, number: int) -> bool:
-    channel = reader.channels.get(number)  # as described in a chunk, which has a CRC; not in the summary
+    channel = reader.channels.get(number)  # described in a chunk, which has a CRC, and not only in the summary
     return channel is None or channel.encoding == GAP
 
 
@@ -305,7 +313,7 @@ def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
 def survey_by_index(reader: Reader) -> Survey | None:
     """Survey a recording by its index; None if it has no intact and consistent index.
 
-    The result is the same as that of :func:`survey`.
+    The result is equal to that of :func:`survey`, but takes less time.
     """
     try:
         data = _summary(reader)
@@ -315,7 +323,7 @@ def survey_by_index(reader: Reader) -> Survey | None:
 
 
 def _summary(reader: Reader) -> bytes:
-    """Return the summary's bytes if their CRC is right, else an empty object."""
+    """Return the bytes of the summary; empty if there is none or its CRC is wrong."""
     footer = reader.records.footer()
     if footer is None:
         return b""
@@ -334,7 +342,7 @@ class _IndexSurvey:
         self._found = Survey()
         self._first: dict[int, tuple[Record, int]] = {}
         self._last: dict[int, tuple[Record, int]] = {}
-        """First and last chunk with messages of a channel, and places of their message indexes."""
+        """``_first`` and ``_last``: a channel's first and last chunk, and their message indexes."""
         self._counts: dict[int, int] = {}
         self._chunk_count = -1
 
@@ -370,7 +378,11 @@ class _IndexSurvey:
         self._found.chunks.add(chunk, first_ns, last_ns, [number for number, _ in places])
 
     def _track(self, number: int, chunk: Record, index: int) -> None:
-        """Note the messages of a channel; RecordingError or ValueError if the index is wrong."""
+        """Add a channel, whose first chunk and message index are given.
+
+        Raises:
+            RecordingError, ValueError: The message index is invalid.
+        """
         reader = self._reader
         channel = reader.channel(number)
         last_chunk, last_index = self._last[number]
@@ -402,7 +414,7 @@ def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
 
 
 def _places(content: memoryview, at: int) -> Iterator[tuple[int, int]]:
-    """Yield the items of a map of channels to numbers; its length is before ``at``."""
+    """Yield the items of a map from channels to numbers; its length in bytes is before ``at``."""
     (size,) = struct.unpack_from("<I", content, at - 4)
     if size > len(content) - at or size % _PLACE.size:
         raise ValueError
