@@ -1,4 +1,4 @@
-"""Write new recordings from others: a part, several as one, or the intact parts of a damaged one."""
+"""Writes new recordings from others: a part, several joined, or the intact parts of a damaged one."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ _TYPES: Final = {".json": JSON, ".toml": TOML}
 
 
 class _Track:
-    """A block in the new file: its channels, and its last frame and event."""
+    """A block in the new file, with its channels and its last frame and event."""
 
     def __init__(self) -> None:
         self.number = 0
         self.channels: Channels | None = None
         self.waiting: list[Entry[Item]] = []
-        """Gaps before the first frame or event."""
+        """Gaps before the first frame or event, which are not written yet."""
         self.last: dict[str, int] = {}
         self.last_ns = 0
 
 
 class Rewriter:
-    """Writes entries to a new file as a recorder does: each number of a block is in it or in a gap."""
+    """Writes entries to a new file like a recorder: each missing frame or event is in a gap."""
 
     def __init__(self, stream: IO[bytes], dump: Dump, made: str, *, whole: bool) -> None:
-        """Arguments as of :func:`rewrite`."""
+        """Begin the file; the arguments are those of :func:`rewrite`."""
         self._whole = whole
         about = {**dump.about, "made_by": made, "made_version": __version__}
         self._writer = Writer(stream, about)
@@ -56,10 +56,10 @@ class Rewriter:
         self._layouts: set[bytes] = set()
         self.counts: dict[str, int] = {"frames": 0, "events": 0}
         self.damaged = 0
-        """Number of frames and events that could not be read. The new file has gaps for them."""
+        """Number of frames and events that could not be read; the new file has gaps for them."""
 
     def attach(self) -> None:
-        """Copy the undamaged attachments, except layouts, which come with their blocks."""
+        """Copy the intact attachments, except layouts, which are written with their blocks."""
         seen: set[str] = set()
         for reader in self._dump.readers:
             for name in reader.attachments:
@@ -101,7 +101,7 @@ class Rewriter:
         track.last_ns = entry.time_ns
 
     def _begin(self, block: DumpBlock, track: _Track) -> None:
-        """Open a block at its first frame or event, which names the event or frame before it."""
+        """Begin a block in the new file at its first frame or event."""
         waiting, track.waiting = track.waiting, []
         first = waiting[-1].item
         after = {what: block.after.get(what, 0) for what in ("frames", "events")}
@@ -140,25 +140,25 @@ class Rewriter:
         self._writer.gap(gap, time_ns)
 
     def finish(self) -> None:
-        """Write index and footer."""
+        """Write the index and the footer."""
         for block, track in self._tracks.items():
-            if track.waiting:  # nothing but gaps
+            if track.waiting:  # the block has only gaps
                 self._begin(block, track)
         self._writer.finish()
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[IO[bytes]]:
-    """Create a file that only this user may read; on an error remove it again.
+    """Create a file that only this user may read; after an error, remove it again.
 
     Raises:
         RecordingError: The file exists already.
-        OSError: It cannot be written; the error has the file's name.
+        OSError: The file cannot be written. The error has the file's name.
     """
     try:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError:
-        raise RecordingError(f"{path} is there already: nothing is ever overwritten") from None
+        raise RecordingError(f"{path} exists already: choose another name, no file is overwritten") from None
     try:
         with os.fdopen(fd, "wb", buffering=FLUSH_BYTES) as stream:
             yield stream
@@ -181,22 +181,22 @@ def rewrite(
     whole: bool = True,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Rewriter:
-    """Write entries of a dump to a new file.
+    """Write entries of a recording to a new file. After an error, no new file is left.
 
     Args:
-        dump: The recording, with its attachments and metadata.
+        dump: The recording, whose attachments and metadata are copied.
         path: The new file.
-        made: Name of the command that makes it, for its metadata.
-        entries: The entries, in order: ``dump.items()``, or those of :func:`part`.
-        whole: Whether missing entries at the beginning of a block count as a gap; else they were
-            not selected.
-        progress: Called with the ns of the recording that are done.
+        made: Name of the command that makes the file, for its metadata.
+        entries: The entries in order: ``dump.items()``, or those of :func:`part`.
+        whole: True if missing entries at the beginning of a block are a gap; False if they were
+            only not selected.
+        progress: Called with the length in ns of the part that is done.
 
     Returns:
-        What was written.
+        The writer of the file, with its statistics.
 
     Raises:
-        RecordingError: The file exists already. After this or the next error no new file is left.
+        RecordingError: The file exists already.
         OSError: The file cannot be written.
     """
     with new_file(path) as stream:
@@ -216,22 +216,22 @@ def part(
     sources: Collection[str] | None = None,
     registers: Sequence[str] = (),
 ) -> Iterator[Entry[Item]]:
-    """Return a part of a recording: a time, some sources, some registers.
+    """Return the entries of a part of a recording, for :func:`rewrite` with ``whole=False``.
 
     Args:
         dump: The recording.
-        from_ns: Start of the range.
-        to_ns: End of the range.
-        sources: Names of sources; None: all.
-        registers: Paths of registers, of which an element stands for its array; none: all. The
-            other bytes of a frame are zero.
+        from_ns: Start of the range of time.
+        to_ns: End of the range of time.
+        sources: Names of the sources; None for all.
+        registers: Paths of the registers; empty for all. An element selects its whole array. All
+            other bytes of a frame become zero.
 
     Returns:
-        The entries, for :func:`rewrite` with ``whole=False``.
+        The entries in order.
 
     Raises:
         PathError: There is no such source or register.
-        RecordingError: Nothing is recorded in that time.
+        RecordingError: Nothing was recorded in that time.
     """
     return _part(dump, from_ns, to_ns, sources, _Parts(dump, registers) if registers else None)
 
@@ -251,19 +251,25 @@ def _part(
     if not anything and not dump.begin_ns:
         raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
     if not anything:
-        raise RecordingError(f"nothing of {dump.files[0]} is in that time; it goes {span(dump.begin_ns, dump.end_ns)}")
+        raise RecordingError(
+            f"nothing of {dump.files[0]} is in that time; it was recorded {span(dump.begin_ns, dump.end_ns)}"
+        )
 
 
 class _Parts:
-    """Blocks of a dump with some of their registers; all other bytes are zero."""
+    """Reduces the entries of a recording to some registers; all other bytes become zero."""
 
     def __init__(self, dump: Dump, paths: Sequence[str]) -> None:
-        """An element stands for its array. PathError: there is no such register."""
+        """Find the registers; an element selects its whole array.
+
+        Raises:
+            PathError: There is no such register.
+        """
         self._parts = {block: _reduced(block, registers) for block, registers in dump.select(paths).items()}
 
     @property
     def sources(self) -> list[str]:
-        """The sources of these registers."""
+        """The names of the sources of these registers."""
         return list(dict.fromkeys(block.source for block in self._parts))
 
     def of(self, entry: Entry[Item]) -> Entry[Item] | None:

@@ -1,4 +1,4 @@
-"""Select the sources and registers to record."""
+"""Selects the sources and registers to record."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from shmio.segment import Block, Frame
 
 
 class RecordedRegisters:
-    """The recorded registers of a block. ``layout`` has only these, at their original offsets."""
+    """The registers of a block to record; ``layout`` has only these, at their original offsets."""
 
     def __init__(self, layout: Layout, mask: npt.NDArray[np.uint8] | None = None) -> None:
-        """``mask``: the bits of these registers; None: the whole block."""
+        """Create the selection; ``mask`` has the bits of the registers, None selects all bits."""
         self.layout = layout
         self._mask = mask
 
     def keep(self, frame: Frame) -> Frame:
-        """Return the frame with all other bits set to zero."""
+        """Return the frame, with the bits of all other registers set to zero."""
         if self._mask is None:
             return frame
         effective = None if frame.effective is None else _kept(frame.effective, self._mask)
@@ -38,8 +38,8 @@ def _kept(image: bytes, mask: npt.NDArray[np.uint8]) -> bytes:
 class Selection:
     """The sources and registers to record.
 
-    ``sources``: names; None: all. ``registers``: patterns as for ``shmio get``; none: all. A pattern for an
-    element selects its whole array.
+    ``sources`` are the names of the sources, or None for all. ``registers`` are patterns as for
+    ``shmio get``; empty for all. A pattern that names an element selects its whole array.
     """
 
     def __init__(self, sources: Collection[str] | None = None, registers: Sequence[str] = ()) -> None:
@@ -47,7 +47,10 @@ class Selection:
         self._registers = registers
 
     def part(self, block: Block, sources: Collection[str]) -> RecordedRegisters | None:
-        """Return the registers to record of a block; None: nothing. ``sources``: names of all sources."""
+        """Return the registers of a block to record; None if there are none.
+
+        ``sources`` are the names of all sources.
+        """
         if self._sources is not None and block.source not in self._sources:
             return None
         if not self._registers:
@@ -60,7 +63,10 @@ class Selection:
         return RecordedRegisters(replace(block.layout, registers=registers), mask) if registers else None
 
     def nothing(self, layouts: Mapping[str, Layout]) -> list[str]:
-        """Describe the selected sources and patterns that do not exist. ``layouts``: by source."""
+        """Return a message for each selected source or pattern that does not exist.
+
+        ``layouts`` are the layouts of all sources, by name.
+        """
         missing = [
             f"no source {source!r}; there are: {', '.join(layouts)}"
             for source in self._sources or ()
@@ -75,7 +81,7 @@ class Selection:
 
 
 def _near(pattern: str, layouts: Mapping[str, Layout]) -> str:
-    """Return similar paths, as the end of a message."""
+    """Return the end of a message with similar paths; empty if there are none."""
     try:
         topic = parse_topic(pattern, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     except PathError:
@@ -85,7 +91,10 @@ def _near(pattern: str, layouts: Mapping[str, Layout]) -> str:
 
 
 def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) -> set[str]:
-    """Return the registers of a source that a pattern names; none if it is for another source."""
+    """Return the paths of a source's registers that a pattern names.
+
+    The result is empty if the pattern is for another source.
+    """
     try:
         topic = parse_topic(pattern, sources, next(iter(sources)) if len(sources) == 1 else None)
         if topic.source != source or topic.direction == "in":

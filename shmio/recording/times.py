@@ -1,4 +1,4 @@
-"""Times and damaged places of a recording, as text."""
+"""Formats times and damaged places of a recording as text."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ def local(time_ns: int) -> str:
 
 
 def span(first_ns: int, last_ns: int) -> str:
-    """Format a range of time, for people."""
+    """Format a range of time as local date and time, for people."""
     return f"from {local(first_ns)} to {local(last_ns)}"
 
 
 def lost(damage: Damage) -> str:
-    """Describe a damaged place: its time, its bytes, and the reason."""
+    """Return a message about a damaged place, with its time, its bytes and the reason."""
     begin = f"after {local(damage.after_ns)}" if damage.after_ns else "from the beginning"
     end = f"before {local(damage.before_ns)}" if damage.before_ns else "to the end"
     return f"lost {begin}, {end} (bytes {damage.first} to {damage.last}): {damage.why}"
 
 
 def _datetime(time_ns: int) -> datetime:
-    """Convert a time; a time in a damaged file may be later than any calendar goes."""
+    """Convert a time in ns to a datetime, clamped, because a damaged file may have any time."""
     return datetime.fromtimestamp(min(time_ns, 253_000_000_000 * 10**9) // 1000 / 1e6, UTC)

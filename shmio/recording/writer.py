@@ -1,4 +1,7 @@
-"""Write a recording as MCAP: channels for frames and events of each block, gaps, steps and processes."""
+"""Writes a recording as MCAP.
+
+The file has channels for the frames and events of each block, for gaps, steps and process changes.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,7 @@ TEXT: Final = "text/plain"
 
 
 class Output(Protocol):
-    """Where a recording is written to: the recorder's output, or any binary file."""
+    """The protocol of a recording's output, such as the recorder's output or a binary file."""
 
     def write(self, data: bytes, /) -> object:
         """Append data."""
@@ -55,22 +58,22 @@ class Output(Protocol):
         """Return the number of bytes written so far."""
 
     def flush(self) -> None:
-        """Pass everything on."""
+        """Pass all appended data on to the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """The channel numbers of a block."""
+    """The numbers of a block's channels."""
 
     frames: int
     events: int
 
 
 class Writer:
-    """Writes one recording, from one thread."""
+    """Writes one recording. Use it from one thread only."""
 
     def __init__(self, output: Output, about: Mapping[str, str]) -> None:
-        """Start the recording. ``about``: metadata of the instance."""
+        """Begin the recording; ``about`` is the metadata about the instance."""
         self._output = output
         self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._mcap.start(PROFILE, f"shmio {__version__}")
@@ -80,12 +83,12 @@ class Writer:
         self.flush()
 
     def places(self, places: Mapping[int, BlockPosition]) -> None:
-        """Write the positions, by section, where the previous recorder stopped."""
+        """Write the positions by section at which the previous recording ended."""
         if places:
             self._mcap.add_metadata(PLACES, {str(section): encode_position(place) for section, place in places.items()})
 
     def attach(self, name: str, media_type: str, data: bytes, now_ns: int, changed_ns: int = 0) -> None:
-        """Attach a file."""
+        """Attach a file; ``changed_ns`` is the time of its last change."""
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
     def open_block(
@@ -104,11 +107,11 @@ class Writer:
             number: Number of the block in this recording.
             after_frame: Number of the frame before the first recorded one.
             after_event: Number of the event before the first recorded one.
-            layout: Layout of the recorded registers; None: all.
+            layout: Layout of the recorded registers; None for that of the block.
             of: Hash of the whole layout, if it is not that of ``block``.
         """
         layout = layout or block.layout
-        self.flush()  # a channel's record is in the chunk of its block's first message, for readers without an index
+        self.flush()  # readers without an index need a channel's record in the chunk of its first message
         about = {
             "source": block.source,
             "block": str(number),
@@ -145,21 +148,21 @@ class Writer:
         self._mcap.add_message(channels.events, log_ns, encode_event(event), told_ns, event.number & 0xFFFFFFFF)
 
     def gap(self, gap: Gap, log_ns: int) -> None:
-        """Add a gap, before the entry that follows it."""
+        """Add a gap; call it before the entry after the gap is added."""
         self._mcap.add_message(self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA), log_ns, encode_json(gap), log_ns)
 
     def step(self, mark: StepMark, log_ns: int) -> None:
-        """Add the end of a step, after all its frames."""
+        """Add the end of a step; call it after all frames of the step were added."""
         channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
         self._mcap.add_message(channel, log_ns, encode_json(mark), log_ns, mark.step & 0xFFFFFFFF)
 
     def process(self, change: ProcessChange, log_ns: int) -> None:
-        """Add a change of a process."""
+        """Add a process change."""
         channel = self._channel(PROCESSES_TOPIC, "shmio.process.v1", PROCESS_SCHEMA)
         self._mcap.add_message(channel, log_ns, encode_json(change), log_ns)
 
     def _channel(self, topic: str, schema: str, text: bytes) -> int:
-        """Return a channel of the instance, which is described in the chunk of its first message."""
+        """Return the number of a channel of the instance; its record is in its first message's chunk."""
         if topic not in self._own:
             self.flush()
             number = self._mcap.register_schema(schema, "jsonschema", text)
@@ -167,10 +170,10 @@ class Writer:
         return self._own[topic]
 
     def flush(self) -> None:
-        """End the present chunk, and pass it to the output."""
+        """End the present chunk, and write it to the output."""
         self._mcap.flush()
 
     def finish(self) -> None:
-        """Write index and footer: the recording is closed."""
+        """Close the recording: write its index and footer."""
         self._mcap.finish()
         self._output.flush()

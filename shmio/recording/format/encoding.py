@@ -48,9 +48,7 @@ In the file, all three have the encoding PLAIN, and different topics.
 """
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
-_COUNTED: Final = struct.Struct(
-    "<QQQQQ"
-)  # the first fields of a frame: number, cycle, publish, clock, source
+_COUNTED: Final = struct.Struct("<QQQQQ")  # the first fields of a frame: number, cycle, publish, clock, source
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
 _QUALITIES: Final = (*Quality, Quality.BAD)  # an unknown quality counts as bad
 _PROVENANCES: Final = tuple(Provenance)

@@ -72,9 +72,9 @@ def test_cut_by_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["info", "part.mem"]) == 0
     assert "converted by shmio-dump cut" in capsys.readouterr().out
     assert main(["cut", str(file), "-o", "part.mem"]) == 1
-    assert capsys.readouterr().err == "part.mem is there already: nothing is ever overwritten\n"
+    assert capsys.readouterr().err == "part.mem exists already: choose another name, no file is overwritten\n"
     assert main(["cut", str(file), "-o", "none.mem", "--from", "100"]) == 1
-    assert re.fullmatch(r"nothing of \S+ is in that time; it goes from .* to .*\n", capsys.readouterr().err)
+    assert re.fullmatch(r"nothing of \S+ is in that time; it was recorded from .* to .*\n", capsys.readouterr().err)
     assert not Path("none.mem").exists()
 
 
@@ -85,8 +85,8 @@ def test_cut_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert json.loads(capsys.readouterr().out) == {"file": "part.mem", "frames": 47, "events": 1, "damage": []}
     assert main(words) == 1
     out, err = capsys.readouterr()
-    assert json.loads(out) == {"error": "part.mem is there already: nothing is ever overwritten"}
-    assert err == "part.mem is there already: nothing is ever overwritten\n"
+    assert json.loads(out) == {"error": "part.mem exists already: choose another name, no file is overwritten"}
+    assert err == "part.mem exists already: choose another name, no file is overwritten\n"
 
 
 def test_cut_by_source_and_register(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -50,6 +50,6 @@ def test_a_copy_that_fails_leaves_no_file(tmp_path: Path) -> None:
         with pytest.raises(PathError):
             part(dump, registers=["cell/none"])
         new.touch()
-        with pytest.raises(RecordingError, match="nothing is ever overwritten"):
+        with pytest.raises(RecordingError, match="exists already"):
             rewrite(dump, new, "a test", dump.items())
         assert new.exists()
