@@ -355,7 +355,7 @@ class CommandProcessor:
             pass
 
     def release(self, cycle: int) -> None:
-        """Accept the writes whose delay by an injection is over; call it before :meth:`carry_out`."""
+        """Accept the delayed writes that are due in a cycle. Call it before :meth:`carry_out`."""
         for layer, write in self._injections.declared.release(cycle):
             command = Command(NO_WRITER, layer.id, self._writer.incarnation, FAR_NS, (write,))
             self._accept(command, layer)
@@ -430,7 +430,7 @@ class CommandProcessor:
         self._end(items, [(EventKind.EXPIRED, "no cycle began before its deadline")] * len(items))
 
     def _patience_ns(self) -> int:
-        """Return the time in ns until the next deadline or regular check; negative if none is due."""
+        """Return the time in ns until the next deadline or check; negative if there is none."""
         with self._turn:
             deadlines = [item.command.deadline_ns for item in self._items]
         waits = [max(0, min(deadlines) - self._now_ns()) + 1_000_000] if deadlines else []
@@ -498,7 +498,7 @@ class CommandProcessor:
         return True
 
     def _accept(self, command: Command, layer: Layer | None) -> None:
-        """Apply the injections below ``layer`` to a command, and queue what is left for the cycle."""
+        """Apply the injections below ``layer`` to a command, and queue the rest for the cycle."""
         left, taken = _divert(self._output, command, layer)
         left = [pair for pair in left if not self._made_unfit(pair[0])]
         self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # _divert has published every DIVERTED event

@@ -323,7 +323,7 @@ class DeclaredLayer(Layer):
         return Running(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
 
     def resume(self, running: Running[Declaration], seen: Bits) -> None:
-        """Restore the state of the previous process; ``seen`` is the image that readers saw last."""
+        """Restore the state of the previous process. ``seen`` is the image last seen by readers."""
         state = State(running.state)
         self.activation = Activation(self.program.window, state, running.runs, running.cycle, running.time_ns)
         if self.active and self.direction is Direction.OUT:

@@ -489,7 +489,7 @@ class InjectionProcessor:
         return ""
 
     def _resume(self) -> None:
-        """Resume the injections of the previous process. Readers continue to see the same values."""
+        """Resume the injections of the previous process, so that readers see the same values."""
         block = self._writer.block
         last = block.latest()
         raw, image = (last.raw, last.image) if last else (bytes(block.layout.size),) * 2

@@ -1,4 +1,4 @@
-"""Compiles and evaluates declared injections: targets, conditions, operations, activation. No I/O."""
+"""Compiles and evaluates declared injections. No I/O."""
 
 from shmio.injection.program import Program, compile_program
 

@@ -150,7 +150,7 @@ class _Parser:
         return Expression(tuple(self._steps), tuple(self._references))
 
     def _advance(self) -> None:
-        """Read the next token: its kind (empty at the end) and its text (keywords in lower case)."""
+        """Read the next token: its kind, empty at the end, and its text, keywords in lower case."""
         self._start = self._at
         rest = self._text[self._at :]
         if not rest.strip():

@@ -74,7 +74,7 @@ class ValueGroup:
         return np.ascontiguousarray(image[self.index]).view(self.dtype)[:, 0].astype(exact)
 
     def put_numbers(self, image: Bytes, values: Values) -> None:
-        """Write numbers into an image; round them for integers, and clamp them to the type's range."""
+        """Write numbers into an image, rounded for integers and clamped to the type's range."""
         least, most = self.limits
         if self.dtype.kind != "f":
             values = np.rint(values)
@@ -252,7 +252,7 @@ class RandomChoice(Operation):
     """``random`` with a list: replaces each value by a random one of the list."""
 
     def __init__(self, tables: Sequence[tuple[ValueGroup, Bytes]], draw: SeededRandom) -> None:
-        """Create the operation; ``tables`` has the values to choose from, (k, size), for each group."""
+        """Create the operation; ``tables`` has the values to choose from, (k, size), per group."""
         self._tables = tables
         self._draw = draw
 

@@ -149,7 +149,7 @@ class Output:
             raise RecordingError(f"{self.path} was removed while it was being written")
 
     def end(self) -> None:
-        """Accept no more bytes. The thread writes the waiting bytes, however long the disk takes."""
+        """Accept no more bytes. The thread writes those that wait, however long the disk takes."""
         self.flush()
         with self._news:
             self._ending = True
@@ -198,7 +198,7 @@ class Output:
         self._sync()
 
     def _is_next(self) -> bool:
-        """Wait until the previous file is complete; return False if it was not written completely."""
+        """Wait until the previous file has ended; return False if it is not complete."""
         after, self._after = self._after, None
         while after is not None and not (after.whole or after.ended or self._closing):
             after._thread.join(WAIT_S)

@@ -142,7 +142,7 @@ class Housekeeper:
             log.warning("%s is left unchanged: %s", file.path, error)
 
     def _delete(self, present: list[_File]) -> None:
-        """Delete closed files that are too old, then the oldest ones until the rest is small enough."""
+        """Delete closed files that are too old; then the oldest until the rest is small enough."""
         settings = self._settings
         left = sum(file.size for file in (*present, *self._own))
         oldest = sorted((file for file, closed in self._own.items() if closed), key=lambda file: file.changed_ns)

@@ -162,7 +162,7 @@ class _ProcessState(NamedTuple):
 
 
 class ProcessWatch:
-    """Finds changes in the process table, including an end that is followed at once by a restart."""
+    """Finds changes in the process table, also if a process has restarted between two checks."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -240,7 +240,7 @@ class InstanceFollower:
     def __init__(
         self, segment: Segment, start: StartPositions = FROM_THE_FIRST, selection: Selection | None = None
     ) -> None:
-        """Create the follower; ``selection`` has the sources and registers to record, None for all."""
+        """Create the follower. ``selection`` names the sources and registers; None is all."""
         self.segment = segment
         self.start = start
         self.followers: list[BlockFollower] = []

@@ -73,7 +73,7 @@ class ConfigFiles:
         self._told: set[str] = set()
 
     def __call__(self, source: str | None, block: int) -> list[AttachedFile]:
-        """Return the present files of a source's layout, or the configuration file if it is None."""
+        """Return the present files of a source's layout; if None, the configuration file."""
         if source is None:
             return self._read("config", [self._file], TOML)
         try:
@@ -110,7 +110,7 @@ class ConfigFiles:
 
 @dataclass(slots=True)
 class _LostRange:
-    """The first and the last number of frames or events that were lost because the buffer was full."""
+    """A range of frames or events that were lost because the buffer was full."""
 
     first: int
     last: int
@@ -315,7 +315,7 @@ class Recorder:
 
     @property
     def losing(self) -> bool:
-        """True if entries were lost because the buffer was full, and no gap is recorded for them yet."""
+        """True if entries were lost that are not yet recorded as gaps."""
         return any(followed.lost for followed in self._followed.values())
 
     @property
@@ -337,7 +337,7 @@ class Recorder:
         self.output.end()
 
     def close(self, patience_s: float = CLOSE_S) -> bool:
-        """Record all remaining entries, and close the file. Return False if the disk was too slow."""
+        """Record the remaining entries and close the file; return False if the disk was too slow."""
         while self.turn():
             pass
         self.put(self.tap.rest())
@@ -428,7 +428,7 @@ def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:
 
 
 class RotatingRecorder:
-    """Records to a sequence of files: starts a new file when the present one is large or old enough.
+    """Records to a sequence of files; a new one begins when the present one is large or old enough.
 
     No entry is lost between two files. It also starts a new file after a failed fsync, because part
     of the old file may be lost. The new file begins at the last position that an fsync has
@@ -507,7 +507,7 @@ class RotatingRecorder:
         self.recorder.put(entries)
 
     def end(self) -> Mapping[int, BlockPosition]:
-        """End the recording without waiting for the disk, and return the last positions by section."""
+        """End the recording without waiting for the disk; return the last positions by section."""
         self.recorder.end()
         return self.recorder.places
 

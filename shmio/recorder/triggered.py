@@ -180,7 +180,7 @@ class TriggeredRecorder:
             self._begin(tap.now())
 
     def turn(self) -> bool:
-        """Read new entries, and record them if the trigger has fired. Return whether there are more.
+        """Read new entries; record them if the trigger has fired. Return whether there are more.
 
         Raises:
             RecordingError: The file was removed.

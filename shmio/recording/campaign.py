@@ -40,7 +40,7 @@ class _RecordedInjection:
 
 @dataclass(slots=True)
 class Derived:
-    """Declarations that repeat the injections of a recording, in the order of their begin per source.
+    """Declarations that repeat the injections of a recording, for each source in order.
 
     ``left_out`` has a message for each injection that cannot be repeated.
     """

@@ -132,7 +132,7 @@ class Columns(Mapping[str, Array]):
 
 
 def heading(source: str, path: str, taken: Collection[str] = OF_FRAMES) -> str:
-    """Return a register's column name: its path; if that is in ``taken``, with its source before."""
+    """Return a register's column name: its path, or source and path if the path is in ``taken``."""
     return f"{source}/{path}" if path in taken else path
 
 

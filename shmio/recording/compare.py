@@ -47,9 +47,9 @@ class RegisterDifference:
 
 @dataclass(slots=True)
 class Difference:
-    """The first difference, with the log times and numbers of the frames or events in both recordings.
+    """The first pair of frames or events that differ.
 
-    They are None for a recording that lacks the frame or event.
+    It has the log time and the number in each recording; None if one lacks the frame or event.
     """
 
     times_ns: tuple[int | None, int | None]
@@ -355,7 +355,7 @@ class _Common:
         ]
 
     def begins_after(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
-        """Return whether an entry that only one recording has comes before the first common entry."""
+        """Return whether an entry of only one recording comes before the first common entry."""
         return bool(self._ends) and any(
             entry is not None and _position(entry) < first
             for entry, (first, _) in zip((one, other), self._ends, strict=True)
@@ -562,10 +562,10 @@ class _InOrder:
 
 
 def _shift(ones: Sequence[Entry[Frame]], others: Sequence[Entry[Frame]]) -> int:
-    """Return the number of entries in ``ones`` before the first of ``others``, or the reverse (< 0).
+    """Return the number of entries in ``ones`` before the first one of ``others``.
 
-    With this offset, the largest number of pairs have the same content. Of several such offsets,
-    the one with most pairs is returned, then the largest.
+    It is negative if ``others`` begin earlier. With this offset, most pairs have the same content.
+    Of several such offsets, the one with most pairs is returned, then the largest.
     """
 
     def alike(shift: int) -> tuple[int, int, int]:
@@ -580,7 +580,7 @@ def _image(frame: Frame) -> Hashable:
 
 
 def _aligned(ones: Iterable[Entry[Event]], others: Iterable[Entry[Event]]) -> Iterator[_Pair[Event]]:
-    """Pair events with the same content in any order, the others by kind and offset, then by kind."""
+    """Pair events with the same content in any order; then by kind and offset, then by kind."""
     left: list[Entry[Event]] = list(ones)
     right: list[Entry[Event]] = list(others)
     for alike in (_content, _place, _event_kind):

@@ -334,7 +334,7 @@ class Dump:
                 that readers saw.
 
         Returns:
-            Arrays of shape (n, …) by path, for n frames, with the times and qualities of the frames.
+            Arrays of shape (n, …) by path, for n frames, with their times and qualities.
 
         Raises:
             PathError: There is no such register, or the registers are of several sources.
@@ -464,7 +464,7 @@ class _Names:
         return chosen
 
     def _named(self, path: str, topic: Topic) -> Chosen:
-        """Return the registers in all blocks of the source, because a reload may change the layout."""
+        """Return the registers by block of the source; a reload may have changed the layout."""
         found: Chosen = {}
         problem = PathError(f"{path}: no register of this recording has such a path")
         for block in self._blocks:

@@ -207,10 +207,10 @@ def _new_folder(path: Path) -> Iterator[None]:
 
 
 class BlockTables:
-    """Writes a file for each block, named after its source; later blocks of a source get a number."""
+    """Writes a file for each block, named after its source, with a number for later blocks."""
 
     def __init__(self, stack: ExitStack, output: Path, form: str, chosen: Chosen, *, named: bool) -> None:
-        """Create the writer; ``output`` is the only file if ``named``, else a folder for several."""
+        """Create the writer; ``output`` is the only file if ``named``, else a folder."""
         self._stack = stack
         self._output = output
         self._form = form
@@ -450,7 +450,10 @@ def _schema(tree: dict[str, Any], columns: Columns) -> dict[str, Any]:
 
 
 def _plain(values: npt.NDArray[Any]) -> list[Any]:
-    """Convert values for JSON: durations to numbers, dates to texts, invalid and infinite to null."""
+    """Convert values for JSON.
+
+    Durations become numbers, and dates texts. Invalid and infinite values become null.
+    """
     kind = values.dtype.kind
     found: Any = values
     if kind == "f" and not np.isfinite(values).all():

@@ -1,4 +1,4 @@
-"""Writes new recordings from others: a part, several joined, or the intact parts of a damaged one."""
+"""Writes new recordings from others: a part, several joined, or what is intact in a damaged one."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ class Writer:
         self._mcap.add_message(channel, log_ns, encode_json(change), log_ns)
 
     def _channel(self, topic: str, schema: str, text: bytes) -> int:
-        """Return the number of a channel of the instance; its record is in its first message's chunk."""
+        """Return the number of a channel of the instance; create the channel if necessary."""
         if topic not in self._own:
             self.flush()
             number = self._mcap.register_schema(schema, "jsonschema", text)

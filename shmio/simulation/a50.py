@@ -1,14 +1,15 @@
-"""A model of the A50 cell (D6.5, section 5.1): three robots, two engine test units, a conveyor and a rack.
+"""A model of the A50 cell: three robots, two engine test units, a conveyor and a rack.
 
-All motion depends only on the time; the constants in this module say what moves when. In a cycle, a trolley brings two
-engines and is clamped. Robot_825 and Robot_850 carry the engines to the test units, where two actuators hold each of
-them. The axes of the units run the test, while Robot_800 fetches a frame from the rack. The robots carry the engines
-back and put the frame on the trolley, and the trolley leaves. Any client that writes the commands below can pause the
-cell and move its actuators by hand.
+Deliverable D6.5, section 5.1, describes the cell. All motion depends only on the time; the constants in this
+module say what moves when. In a cycle, a trolley brings two engines and is clamped. Robot_825 and
+Robot_850 carry the engines to the test units, where two actuators hold each of them. The axes of
+the units run the test, while Robot_800 fetches a frame from the rack. The robots carry the engines
+back and put the frame on the trolley, and the trolley leaves. Any client that writes the commands
+below can pause the cell and move its actuators by hand.
 
-The real cell's I/O assignment is not public. This one was made for shmio. It uses the first bytes of ``Inputs`` and
-``Outputs``; the model does not change the other bytes or the commands. Words are big-endian, bits of a byte count
-from the lowest.
+The real cell's I/O assignment is not public. This one was made for shmio. It uses the first bytes
+of ``Inputs`` and ``Outputs``; the model does not change the other bytes or the commands. Words are
+big-endian. Bits of a byte are listed from the lowest.
 
 ======  ===========================================================================================================
 Inputs  plant to controller
@@ -55,7 +56,7 @@ _BREATH_SPREAD_S = 0.31  # difference between neighbouring axes, so that they do
 
 
 def smooth(u: float) -> float:
-    """Return a smooth transition from 0 (for u <= 0) to 1 (for u >= 1), with slope 0 at both ends."""
+    """Return a smooth transition from 0 (u <= 0) to 1 (u >= 1) with slope 0 at both ends."""
     u = min(max(u, 0.0), 1.0)
     return u * u * (3 - 2 * u)
 
@@ -137,7 +138,7 @@ class Actuator(NamedTuple):
     name: str
     travel_s: float
     spans: tuple[tuple[float, float], ...]
-    """Times in a cycle, in s, at which the valve opens and closes; an open valve extends the drive."""
+    """Times in a cycle, in s, at which the valve opens and closes. It extends the drive."""
 
     def valve(self, phase_s: float) -> bool:
         """Return whether the valve is open."""

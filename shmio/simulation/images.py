@@ -235,7 +235,7 @@ class _StructureCodec:
         return dict(zip(self._names, found, strict=True))
 
     def write(self, values: Mapping[str, object], image: bytearray) -> bool:
-        """Write all values and return True; if any of them does not fit, write none, return False."""
+        """Write all values and return True; if any does not fit, write none and return False."""
         try:
             found: Sequence[object] = self._values(values)
             if len(values) != len(self._names) or not _NUMBERS.issuperset(map(type, found)):

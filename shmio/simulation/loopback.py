@@ -13,7 +13,7 @@ POSITION: Final = "LREAL"
 
 
 class Loopback(Model):
-    """A model with four joint positions and a safety zone, which shows the values written to them."""
+    """A model that shows the values written to four joint positions and a safety zone."""
 
     r3200_link1 = InOut(POSITION, path="joints/R3200/Link1/R/position")
     kuka_j1 = InOut(POSITION, path="joints/Kuka.j1/R")

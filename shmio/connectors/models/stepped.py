@@ -113,7 +113,7 @@ class StepClock(Protocol):
 
 
 class PageClock:
-    """The loop's clock in a running instance; it waits on the process's doorbell in shared memory."""
+    """The loop's clock in a running instance. It waits on the process's doorbell in the segment."""
 
     def __init__(self, page: ClockPage, slot: int) -> None:
         self._bell = page.slot_bell(slot)
@@ -205,7 +205,7 @@ class SteppedLoop:
         return self._quality_log.note
 
     def run(self) -> None:
-        """Compute cycles and steps until the clock stops the loop, then publish a last bad frame."""
+        """Compute cycles and steps until the clock stops the loop; then publish a bad frame."""
         try:
             self._begin()
             while not (self._live() if self._page.read().virtual else self._free_run()):
@@ -240,7 +240,7 @@ class SteppedLoop:
     # ---- wall time -----------------------------------------------------------------------------------------------
 
     def _free_run(self) -> bool:
-        """Wait for the next cycle of the schedule and compute it. Return True if the loop must stop."""
+        """Wait for the next cycle of the schedule and compute it; return True if stopped."""
         state = self._page.last_written()
         if state.virtual:
             return False
@@ -349,7 +349,7 @@ class SteppedLoop:
             self.commands.carry_out(self._write)
 
     def _write(self, writes: Sequence[Write]) -> list[str]:
-        """Write to the source. If it is prompt, publish a frame before the outcomes of the writes."""
+        """Write to the source. If it is prompt, publish a frame before the writes' outcomes."""
         refusals = self._source.write(writes)
         if self._source.prompt:
             self._publish(self._source.begin(), self._writer.now_ns())

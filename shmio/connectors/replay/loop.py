@@ -43,7 +43,7 @@ GOES_ON: Final = f"{OWN_WORDS}the recording continues"
 PIECE: Final = 64
 """Largest number of frames and events to play before requests and commands are handled."""
 LATE_NS: Final = 10_000_000_000
-"""Longest delay of frames, in instance time, that is caught up; if it is longer, they are skipped."""
+"""Frames that are later than this, in instance time, are skipped; earlier ones are caught up."""
 ASK_TURN_NS: Final = 1_000_000
 """Period at which to check whether the step that a request waits for has ended.
 
@@ -133,7 +133,7 @@ class Player:
         self.go(None if entry is None else position_ns)
 
     def again(self, position_ns: int, stale_ns: int, stamp: StampOf) -> None:
-        """Continue at the begin of a loop. Publish a bad frame if no frame is due in ``stale_ns``."""
+        """Continue at the begin of a loop. Publish a bad frame if none is due in ``stale_ns``."""
         if self._recorded.newest(position_ns + stale_ns) is None:
             self.end(NOTHING, stamp(position_ns, position_ns))
         self.go(position_ns)
@@ -283,7 +283,7 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
 
 
 class Search:
-    """A search for an event or a change; it reads the recording in pieces, while the replay runs."""
+    """A search for an event or a change. It reads the recording in pieces while the replay runs."""
 
     def __init__(self, recorded: RecordedSource, find: FindRequest, end_ns: int, *, keep: bool) -> None:
         """Create a search.
@@ -470,7 +470,7 @@ class ReplayLoop:
         return max(0, play.due_ns(goal_ns) - self._page.present_ns())
 
     def _advance(self, clock_ns: int) -> bool:
-        """Play at most ``PIECE`` entries that are due at ``clock_ns``. Return whether more are due."""
+        """Play at most ``PIECE`` entries due at ``clock_ns``. Return whether more are due."""
         self._leave_out(clock_ns)
         play = self._play
         # An entry at the stop position is played; an entry at the end is not.

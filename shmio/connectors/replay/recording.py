@@ -238,7 +238,7 @@ class Recording:
         """Return a reader of one source of the recording.
 
         Raises:
-            RecordingError: There are no frames of the source, or its layout changes within ``span``.
+            RecordingError: There are no frames of the source, or its layout changes in ``span``.
 
         """
         if source not in self.sources:

@@ -209,7 +209,7 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
     """Divide a batch into waves, in order; send a wave when the one before it is complete.
 
     The controller may execute jobs in flight in any order. So writes to the same bits must be in
-    different waves. Each wave stores the reasons of refusals in ``outcomes``, by index of the write.
+    different waves. Each wave stores the reasons of refusals in ``outcomes``, by the write's index.
     """
     wave: list[_Item] = []
     spans: list[tuple[int, int]] = []  # sorted ranges of bits that the wave writes
@@ -225,7 +225,10 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
 
 
 def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
-    """Return the outcome of each write after the session was lost; ``begun`` are the waves so far."""
+    """Return the outcome of each write after the session was lost.
+
+    ``begun`` are the waves that were sent completely or in part.
+    """
     parts: list[set[Lost | None]] = [set() for _ in outcomes]
     for wave in begun:
         for write, known in wave.unanswered():

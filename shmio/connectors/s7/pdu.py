@@ -204,7 +204,10 @@ def parse_connect_confirm(frame: memoryview) -> int:
 
 
 def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
-    """Return the request "setup communication", for so many parallel jobs and a PDU size in bytes."""
+    """Return the request "setup communication".
+
+    It asks for a number of parallel jobs and a PDU size in bytes.
+    """
     return request(reference, struct.pack(">BBHHH", _SETUP, 0, jobs, jobs, pdu_size))
 
 

@@ -43,7 +43,7 @@ class Transport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setblocking(False)
         self.taken = 0
-        """Number of bytes of the last ``send`` that the kernel accepted, also if ``send`` failed."""
+        """Number of bytes that the kernel accepted in the last ``send``, even if it failed."""
         self.reserve(1, 512)  # longer than any connection confirm
 
     def reserve(self, frames: int, longest: int) -> None:

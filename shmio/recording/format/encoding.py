@@ -36,7 +36,7 @@ PROCESSES_TOPIC: Final = "processes"
 
 FRAME: Final = "shmio.frame.v1"
 FRAME_V2: Final = "shmio.frame.v2"
-"""The encoding FRAME with five fields as differences from the message's header: see :func:`differ`."""
+"""FRAME with five fields as differences from the message's header: see :func:`differ`."""
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"
 GAP: Final = "gap"
@@ -219,7 +219,7 @@ def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
 
 
 def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """Convert a frame from FRAME_V2 to FRAME. Bytes that are too short for a frame are unchanged."""
+    """Convert a frame from FRAME_V2 to FRAME. Bytes too short for a frame are unchanged."""
     if len(data) < _FRAME.size:
         return data
     number, cycle, publish, clock, source = _COUNTED.unpack_from(data)

@@ -210,7 +210,7 @@ class Records:
         return Record(opcode, content, size)
 
     def _whole(self, at: int, end: int) -> int:
-        """Return the start of the next chunk or attachment with a correct CRC; 0 if there is none."""
+        """Return the start of the next chunk or attachment with a correct CRC; 0 if none."""
         for begin in range(at, end, _SEARCH_BYTES):
             for found in _MARK.finditer(self._peek(begin, _SEARCH_BYTES + _MARK_BYTES - 1)):
                 record = self.record(begin + found.start())
@@ -229,7 +229,7 @@ class Records:
         return self.record(start) if start else None
 
     def _footer(self, at: int) -> int:
-        """Return the start of the footer at the end of the file; 0 if none is at or after ``at``."""
+        """Return the start of the footer at the end of the file; 0 if none is after ``at``."""
         start = self.size - len(MAGIC) - FOOTER.size - HEAD.size
         record = self.record(start) if start >= at else None
         if record is None or record.opcode != Opcode.FOOTER or record.at + record.size + len(MAGIC) != self.size:

@@ -240,7 +240,7 @@ def _regular(frames: _Bytes, size: int) -> bool:
 
 
 def _decoded(frames: _Bytes, size: int, *, raw: bool) -> tuple[_Bytes, list[str]]:
-    """Decode frames of any form one by one; return records as in :class:`Batch`, and the reasons."""
+    """Decode frames one by one; return records as in :class:`Batch`, and the reasons."""
     records, reasons = [], []
     for piece in map(bytes, frames):
         frame = _frame(piece, size)

@@ -257,7 +257,7 @@ class Part:
 
 
 class Entry(NamedTuple, Generic[ItemT_co]):
-    """A recorded item with its log time (UTC); ``block`` is None for items of the whole instance."""
+    """A recorded item with its log time; ``block`` is None if it is of the whole instance."""
 
     time_ns: int
     block: DumpBlock | None
@@ -267,7 +267,7 @@ class Entry(NamedTuple, Generic[ItemT_co]):
 def messages_of(
     part: Part, within: Contents, channels: Collection[int], from_ns: int, to_ns: int
 ) -> Iterator[tuple[Contents, Entry[Item]]]:
-    """Yield the messages of some channels in a range of log times, each with the file's contents."""
+    """Yield messages of some channels in a range of log times, each with the file's contents."""
     for channel, log_ns, item in part.messages(channels, from_ns, to_ns):
         block = (
             within.numbered.get((item.source, item.block))

@@ -118,7 +118,7 @@ class Reader:
         """True if all channels are known, because the whole file was read."""
         self.channels: dict[int, Channel] = {}
         self.summary_damage = ""
-        """Message about the first summary record that was needed but damaged; empty if there is none."""
+        """Message about the first needed summary record that is damaged; empty if there is none."""
         self.attachments: dict[str, AttachmentEntry] = {}
         self._layouts: dict[str, Layout] = {}
         self._layout_bytes = 0
@@ -176,7 +176,11 @@ class Reader:
         from_ns: int,
         to_ns: int,
     ) -> Iterator[Message]:
-        """Yield the messages of a chunk; after the last one, raise RecordingError if any is malformed."""
+        """Yield the messages of a chunk.
+
+        Raises:
+            RecordingError: The chunk is damaged; or, after the last message, one was malformed.
+        """
         problem: RecordingError | None = None
         for channel, log_ns, data in contents:
             if from_ns <= log_ns <= to_ns and wanted(channel):

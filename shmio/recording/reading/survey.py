@@ -1,4 +1,4 @@
-"""Surveys a recording without reading all of it: by its index, or by the indexes after its chunks."""
+"""Surveys a recording without reading all of it, by its index or the indexes of its chunks."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _Times = npt.NDArray[np.uint64]
 
 
 class Chunks:
-    """A table of the chunks and damaged places of a file, in order, with about 40 bytes for each."""
+    """A table of a file's chunks and damaged places, in order; each takes about 40 bytes."""
 
     def __init__(self) -> None:
         self._at = array("Q")
@@ -91,7 +91,10 @@ class Chunks:
         yield from self._rows(range(begin, end), from_ns, to_ns, channels)
 
     def before(self, time_ns: int, channels: Collection[int] | None = None) -> Iterator[tuple[Record, int, int]]:
-        """Yield the chunks that begin at or before a time, in reverse; items as in :meth:`between`."""
+        """Yield the chunks that begin at or before a time, the last one first.
+
+        Items are those of :meth:`between`.
+        """
         _, end = self._bounds(0, time_ns)
         yield from self._rows(range(end - 1, -1, -1), 0, time_ns, channels)
 
@@ -126,7 +129,7 @@ class Chunks:
 
 
 class Count(NamedTuple):
-    """The number of a channel's messages in a chunk, and the log times of the first and the last."""
+    """The number of a channel's messages in a chunk, and the first and the last log time."""
 
     channel: int
     messages: int
