@@ -270,7 +270,7 @@ def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
 
 
 def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
-    """Group items of one command by consecutive places; yield the first item and the count."""
+    """Yield the first item and the length of each run of consecutive places of a command."""
     first, count = items[0], 1
     for item in items[1:]:
         if item.place == first.place + count:
@@ -309,7 +309,7 @@ class CommandProcessor:
             writable: Patterns of writable registers; None if the device cannot be written.
             now_ns: The loop's clock.
             allow_nonfinite: Patterns of registers that may be written NaN and infinities.
-            armed: Whether injections may reach the device.
+            armed: True if injections may reach the device.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources, for conditions. Default: only this source's.
             accepted: Called when accepted items begin to wait for a cycle.

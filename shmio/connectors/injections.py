@@ -72,8 +72,8 @@ class ConditionValues:
         """Create the values for one image.
 
         Args:
-            own: The source whose next image this is.
-            image: That image.
+            own: The name of the source to which the image belongs.
+            image: The source's next image.
             blocks: The blocks of all sources.
             before: The present step; None outside steps. Other sources that take part in the step
                 are read as they were before it, even if they have completed it already.

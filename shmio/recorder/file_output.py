@@ -1,4 +1,4 @@
-"""Writes a recording's file in a separate thread, so that a slow or full disk delays no reader."""
+"""Writes a recording's file in a separate thread, so that a slow disk does not delay reading."""
 
 from __future__ import annotations
 

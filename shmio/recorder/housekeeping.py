@@ -206,8 +206,9 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
         False if another process is still writing the file.
 
     Raises:
-        RecordingError: The file is not a recording, or is damaged: only ``recover`` can save it.
-        OSError: The disk is full. Only the incomplete end was cut off.
+        RecordingError: The file is not a recording, or is so damaged that only ``shmio-dump
+            recover`` can read it.
+        OSError: The disk is full. The file is unchanged, except that its incomplete end is cut off.
     """
     with Reader(file, own=True, beat=beat) as reader:
         fd = os.open(file, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -341,7 +342,7 @@ class _RecordingEnd:
         self._chunks.append(_Chunk(record, index))
 
     def _index(self, record: Record) -> None:
-        """Add a message index to the last chunk. Read the descriptions of new channels from it."""
+        """Add a message index to the last chunk; if its channel is new, read its description."""
         chunk = self._chunks[-1]
         number, size = INDEX.unpack(self._records.read(record.at, INDEX.size))
         if number not in self._channels:

@@ -73,7 +73,7 @@ class ConfigFiles:
         self._told: set[str] = set()
 
     def __call__(self, source: str | None, block: int) -> list[AttachedFile]:
-        """Return the present files of a source's layout; if None, the configuration file."""
+        """Return the files of a source's layout; if ``source`` is None, the configuration file."""
         if source is None:
             return self._read("config", [self._file], TOML)
         try:
@@ -299,9 +299,9 @@ class Recorder:
             self._look()
 
     def _confirm(self) -> None:
-        """Update :attr:`confirmed` if the bytes of the stored positions were synced.
+        """Move the stored positions to :attr:`confirmed` once everything before them was synced.
 
-        Then store the present positions for the next update.
+        Then store the present positions, to confirm them next.
         """
         if self._to_confirm and self.output.synced >= self._to_confirm[0]:
             self.confirmed, self._to_confirm = self._to_confirm[1], None
@@ -337,7 +337,7 @@ class Recorder:
         self.output.end()
 
     def close(self, patience_s: float = CLOSE_S) -> bool:
-        """Record the remaining entries and close the file; return False if the disk was too slow."""
+        """Record remaining entries and close the file; return False if the disk was too slow."""
         while self.turn():
             pass
         self.put(self.tap.rest())

@@ -30,7 +30,7 @@ log = logging.getLogger("shmio.recorder")
 class Trigger:
     """Evaluates the trigger's condition at each frame of a source that it reads.
 
-    The condition reads the values that readers see. The values of a bad frame are unknown.
+    It uses the values that readers see. The values of a bad frame are unknown.
     """
 
     def __init__(self, when: str, blocks: Mapping[str, Block]) -> None:
@@ -210,7 +210,7 @@ class TriggeredRecorder:
         return more
 
     def _begin(self, log_ns: int) -> None:
-        """Start a file with the stored entries, or record to the present file for longer."""
+        """Start a file with the stored entries, or extend the time of the present file."""
         self._until_ns = log_ns + round(self._times.after_s * 1e9)
         if self._series is not None:
             return

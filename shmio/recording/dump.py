@@ -464,7 +464,7 @@ class _Names:
         return chosen
 
     def _named(self, path: str, topic: Topic) -> Chosen:
-        """Return the registers by block of the source; a reload may have changed the layout."""
+        """Return the registers of a topic by block, because blocks may have different layouts."""
         found: Chosen = {}
         problem = PathError(f"{path}: no register of this recording has such a path")
         for block in self._blocks:
@@ -541,7 +541,7 @@ class _Changes:
         self._before: dict[DumpBlock, npt.NDArray[Any]] = {}
 
     def begin(self, block: DumpBlock, image: bytes) -> None:
-        """Set the image before the first frame."""
+        """Set the image with which the first frame of a block is compared."""
         if block in self._bytes:
             self._before[block] = self._of(block, np.frombuffer(image, np.uint8)[None, :])[0]
 

@@ -63,7 +63,7 @@ def pieces(
     *,
     raw: bool = False,
 ) -> Iterator[tuple[DumpBlock, Columns]]:
-    """Yield the values of the chosen registers of one source, in pieces that belong to one block.
+    """Yield the values of chosen registers of one source in pieces; each is of one block.
 
     Raises:
         PathError: There is no such source.

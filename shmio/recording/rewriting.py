@@ -189,7 +189,7 @@ def rewrite(
         made: Name of the command that makes the file, for its metadata.
         entries: The entries in order: ``dump.items()``, or those of :func:`part`.
         whole: True if missing entries at the beginning of a block are a gap; False if they were
-            only not selected.
+            not selected.
         progress: Called with the length in ns of the part that is done.
 
     Returns:

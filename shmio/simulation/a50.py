@@ -1,11 +1,11 @@
 """A model of the A50 cell: three robots, two engine test units, a conveyor and a rack.
 
-Deliverable D6.5, section 5.1, describes the cell. All motion depends only on the time; the constants in this
-module say what moves when. In a cycle, a trolley brings two engines and is clamped. Robot_825 and
-Robot_850 carry the engines to the test units, where two actuators hold each of them. The axes of
-the units run the test, while Robot_800 fetches a frame from the rack. The robots carry the engines
-back and put the frame on the trolley, and the trolley leaves. Any client that writes the commands
-below can pause the cell and move its actuators by hand.
+Deliverable D6.5, section 5.1, describes the cell. All motion depends only on the time; the
+constants in this module say what moves when. In a cycle, a trolley brings two engines and is
+clamped. Robot_825 and Robot_850 carry the engines to the test units, where two actuators hold each
+of them. The axes of the units run the test, while Robot_800 fetches a frame from the rack. The
+robots carry the engines back and put the frame on the trolley, and the trolley leaves. Any client
+that writes the commands below can pause the cell and move its actuators by hand.
 
 The real cell's I/O assignment is not public. This one was made for shmio. It uses the first bytes
 of ``Inputs`` and ``Outputs``; the model does not change the other bytes or the commands. Words are
@@ -34,7 +34,7 @@ Outputs  controller to plant
 10 - 12  Robot_800, Robot_825, Robot_850: drives on, task runs, work space released
 13       command: hold; all motion stops while bit 0 is set
 14, 15   command: valves of ``ACTUATORS`` to open in every step; the drive reaches its end at once
-16, 17   command: valves to close in every step, likewise; it overrides the command to open
+16, 17   command: valves of ``ACTUATORS`` to close in every step; it overrides the command to open
 =======  ==========================================================================================================
 """
 

@@ -103,7 +103,7 @@ class Ends:
 
     @property
     def shown(self) -> Any:
-        """The value of ``/out`` that readers see. Set it to change it."""
+        """The value of ``/out`` that readers see; the model sets it."""
         return self._shown.read()
 
     @shown.setter

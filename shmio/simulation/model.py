@@ -143,7 +143,7 @@ class Output(Declaration):
 
 
 class InOut(Declaration):
-    """A register that clients command and the model computes.
+    """A register that clients write and the model computes.
 
     The value of the attribute is an :class:`Ends`.
     """

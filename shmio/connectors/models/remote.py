@@ -19,7 +19,7 @@ from shmio.segment.model_channel import ConnectedModel, ModelAnswer, ModelChanne
 from shmio.simulation.images import Images
 
 TURN_NS: Final = 50_000_000
-"""Period at which a waiting source checks the model, because a process that dies wakes nobody."""
+"""Period at which a waiting source checks the model; a process that dies causes no wake-up."""
 STOPPED: Final = "the source was stopped"
 
 
@@ -28,7 +28,7 @@ class Remote(Computed):
 
     Without such a program, a step fails at once. If the program does not answer, the step fails
     after ``timeout_ms``. A register that the program does not compute keeps its commanded or
-    connected value; a new value shows from the next step on.
+    connected value; a new value is shown from the next step on.
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):

@@ -292,7 +292,7 @@ class Search:
             recorded: The recording of the source.
             find: The event or register to find.
             end_ns: The position before which the search ends.
-            keep: Whether recorded injections are shown.
+            keep: True if recorded injections are shown.
 
         Raises:
             PathError: There is no such register or event kind.
@@ -595,7 +595,7 @@ class ReplayLoop:
         return True
 
     def _move(self, ask: MoveRequest, clock_ns: int) -> PlayheadAnswer:
-        """Carry out a request as of its time, and publish the frame that it leads to."""
+        """Carry out a request from its time on, and publish the frame at a new position."""
         play, behind = self._play, self._is_behind(min(ask.clock_ns, clock_ns + AHEAD_NS))
         before = self._round_before
         if before and before.anchor_ns <= ask.clock_ns < play.anchor_ns:

@@ -55,7 +55,7 @@ class BlockRead:
         """Start a read that must be complete by ``deadline_ns``."""
         self.deadline_ns = deadline_ns
         self.refusal: RefusedError | None = None
-        """Why the controller refused to read the block; None unless it did."""
+        """The controller's refusal to read the block; None if it did not refuse."""
         self.sent = self._answered = 0
 
     @property

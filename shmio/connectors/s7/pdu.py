@@ -2,7 +2,7 @@
 
 A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole), ISO
 8073 class 0 (COTP: CR and CC open, DT carries data), and the S7 job (ROSCTR 1). A controller
-answers with Ack-Data (3), or with a bare Ack (2) that holds an error. S7 has no public standard;
+answers with Ack-Data (3), or with only an Ack (2) that has an error. S7 has no public standard;
 names follow Wireshark's dissector.
 
 The client of python-snap7 is not used. Its parsers are many times slower than one ``struct`` call

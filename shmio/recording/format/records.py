@@ -31,7 +31,7 @@ MAX_RECORD_BYTES: Final = 1 << 20
 """Largest size of a record, other than a chunk, that is read as a whole."""
 
 BROKEN: Final = 0
-"""Opcode that stands for bytes without a valid record; MCAP does not use it."""
+"""Opcode of bytes that are not a valid record; MCAP does not use it."""
 ONLY_BEGUN: Final = "has no content: its recorder was killed before it wrote anything, or has just started"
 LOOK_BYTES: Final = 4096
 """Number of bytes to read from the beginning of a record in order to check the lengths in it.

@@ -35,7 +35,7 @@ ItemT_co = TypeVar("ItemT_co", bound=Item, covariant=True)
 
 @dataclass(slots=True, eq=False)
 class DumpBlock:
-    """A block of a recording: a source with one layout; a reload of the layout begins a new block.
+    """A source with one layout in a recording. A reload that changes the layout begins a new block.
 
     ``section`` is unique among the blocks of a run, also in several files. ``layout_hash`` is a
     SHA-256 in hex.
@@ -99,7 +99,7 @@ class DumpBlock:
 
 @dataclass(slots=True)
 class Contents:
-    """The channels of one file, by the block or kind to which they belong."""
+    """The channels of one file, grouped by block."""
 
     blocks: dict[int, DumpBlock] = field(default_factory=dict)
     """The block of each channel with frames or events, by the channel's number."""
