@@ -534,10 +534,10 @@ class CommandProcessor:
     def _refusal(self, command: Command) -> str:
         """Return why a command came for the wrong process or too late; empty if it did not."""
         if command.incarnation != self._writer.incarnation:
-            return "it was for an earlier process of the source, which has ended: try again"
+            return "the source was restarted after the command was sent: send it again"
         late_ns = self._now_ns() - command.deadline_ns
         if late_ns > 0:
-            return f"it came {late_ns / 1e6:.0f} ms after its deadline"
+            return f"the command came {late_ns / 1e6:.0f} ms after its deadline"
         return ""
 
     def _unwritable(self, command: Command) -> str:

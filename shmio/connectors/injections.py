@@ -470,7 +470,7 @@ class InjectionProcessor:
 
     def _shadow(self, layer: Layer, command: Command) -> str:
         if isinstance(layer, DeclaredLayer):
-            return f"the injection {layer.name} is declared: clients cannot give it values"
+            return f"the injection {layer.name} is declared: clients cannot set its values"
         with self._output.turn:
             if reason := shadow(layer, command.writes):
                 return reason

@@ -128,7 +128,7 @@ def parse(text: str) -> Expression:
 
     """
     if len(text) > MAX_LENGTH:
-        raise ConfigError(f"a condition is at most {MAX_LENGTH} characters long, this has {len(text)}")
+        raise ConfigError(f"a condition has at most {MAX_LENGTH} characters, this one has {len(text)}")
     return _Parser(text).whole()
 
 
@@ -146,7 +146,7 @@ class _Parser:
     def whole(self) -> Expression:
         self._either()
         if self._kind:
-            raise self._expected("and, or, or its end")
+            raise self._expected("and, or, or the end")
         return Expression(tuple(self._steps), tuple(self._references))
 
     def _advance(self) -> None:

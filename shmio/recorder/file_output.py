@@ -43,8 +43,8 @@ def create(directory: Path, instance: str, now: datetime | None = None) -> tuple
             with suppress(FileExistsError):
                 return path, os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        raise RecordingError(f"cannot make a recording in {directory}: {error.strerror}") from None
-    raise RecordingError(f"cannot make a recording in {directory}: all names for this second are taken")
+        raise RecordingError(f"cannot create a recording in {directory}: {error.strerror}") from None
+    raise RecordingError(f"cannot create a recording in {directory}: all names for this second are taken")
 
 
 class Output:

@@ -104,9 +104,7 @@ class PreTriggerBuffer:
         if self._size > self._limit and not self._told:
             self._told = True
             kept_s = (entry.log_ns - self._entries[0].log_ns) / 1e9
-            log.warning(
-                "only %.1f s before a trigger are kept: recorder.trigger.before_mb has no room for more", kept_s
-            )
+            log.warning("only %.1f s before a trigger are kept: raise recorder.trigger.before_mb to keep more", kept_s)
         while self._size > self._limit:
             self._drop()
 

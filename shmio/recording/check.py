@@ -199,6 +199,6 @@ class _Numbers:
 
     def _broken(self, key: tuple[str, int, str], last: int, number: int) -> None:
         source, block, what = key
-        missing = f"{what} {last + 1} to {number - 1} are missing, and in no gap"
+        missing = f"{what} {last + 1} to {number - 1} are missing without a gap"
         again = f"{what}: {number} comes after {last}"
         self._problem(f"{source}, block {block}: {missing if number > last else again}")

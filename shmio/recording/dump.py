@@ -61,7 +61,7 @@ def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], 
     """
     paths = [Path(files)] if isinstance(files, str | os.PathLike) else [Path(file) for file in files]
     if not 0 < len(paths) <= MAX_FILES:
-        raise RecordingError(f"{len(paths)} files: a dump is of 1 to {MAX_FILES}")
+        raise RecordingError(f"{len(paths)} files: a recording has 1 to {MAX_FILES}")
     parts: list[Part] = []
     try:
         parts += (Part(path, damaged) for path in paths)

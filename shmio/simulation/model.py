@@ -206,12 +206,12 @@ class Model(ABC):
         """
         super().__init_subclass__(**keywords)
         if "__init__" in cls.__dict__:
-            raise ModelError(f"model {cls.__qualname__}: a model has no __init__ of its own; prepare it in start()")
+            raise ModelError(f"model {cls.__qualname__}: a model cannot have its own __init__; use start()")
         found = {name: value for base in reversed(cls.__mro__) for name, value in vars(base).items()}
         cls.declarations = {name: value for name, value in found.items() if isinstance(value, Declaration)}
         for name in cls.declarations:
             if name in _OWN or name.startswith("_"):
-                raise ModelError(f"model {cls.__qualname__}: {name}: choose another name, and give it this one as path")
+                raise ModelError(f"model {cls.__qualname__}: {name}: this name is reserved: rename it, and set path")
         for kinds in ((Input, Output, InOut), (Parameter,)):
             place_declarations(cls.__qualname__, declared(cls, *kinds))
 

@@ -310,11 +310,11 @@ class ServedModel:
         """
         for path in self._runner.inputs:
             if path not in joined.inputs:
-                raise ModelError(self._lacks(path, joined, "gives to its model", "leave it out of outputs"))
+                raise ModelError(self._lacks(path, joined, "sends to its model", "leave it out of outputs"))
         for register, _, _ in self._outputs:
             if register.path not in joined.outputs:
                 key = "inouts" if register.path in self._inputs else "outputs"
-                raise ModelError(self._lacks(register.path, joined, "has from its model", f"name it in {key}"))
+                raise ModelError(self._lacks(register.path, joined, "receives from its model", f"name it in {key}"))
         if not self._begun and joined.computed:
             image = bytearray(self._runner.image)
             for register, encoder, _ in self._outputs:

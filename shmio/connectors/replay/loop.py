@@ -267,7 +267,7 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
     at_ns = play.position_ns if position_ns is None else position_ns
     if ask.until_ns is not None and ask.until_ns < at_ns:
         at_s = (at_ns - play.begin_ns) / 1e9
-        raise ValueRangeError(f"that time has passed: the replay is at {at_s:.3f} s; seek to before that first")
+        raise ValueRangeError(f"that time has passed: the replay is at {at_s:.3f} s; seek to an earlier time")
     until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
     if ask.until_ns is None and position_ns is None and (ask.paused is None or play.until_ns > at_ns):
         until_ns = play.until_ns  # `pause` and `play` keep a stop position that lies ahead

@@ -160,11 +160,11 @@ class Recording:
         if len(names) > MAX_PROCESSES:
             raise RecordingError(
                 f"{self._file} has {len(names)} sources, an instance at most {MAX_PROCESSES}: shmio-dump cut --source "
-                "takes some of them into a file of their own"
+                "copies some of them to another file"
             )
         spans = {name: span for name in names if (span := self._measured(name))}
         if not spans:
-            raise RecordingError(f"{self._file} holds no frames: there is nothing to play")
+            raise RecordingError(f"{self._file} has no frames: there is nothing to play")
         self.sources = list(spans)
         """The names of the sources that have frames."""
         self.whole = Span(

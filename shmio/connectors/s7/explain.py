@@ -93,5 +93,5 @@ def _explain_item(code: int) -> str:
             f"be optimized, then {_NO_OPTIMIZED}"
         )
     if code in {NO_SUCH_TYPE, OTHER_SIZE}:
-        return f"the controller does not take data of this type or length {where}"
+        return f"the controller does not accept data of this type or length {where}"
     return f"the controller refused it: {S7_RETURN_CODES.get(code, 'no text known')} {where}"

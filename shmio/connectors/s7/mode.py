@@ -128,7 +128,7 @@ def parse_mode_answer(frame: memoryview) -> int | None:
         raise ConnectorError("not an answer to 'read SZL'")
     begin = pdu.USERDATA_END + _PARAMETERS_SIZE
     if parameters_size != _PARAMETERS_SIZE or begin + data_size != len(frame) or data_size < 4:
-        raise ConnectorError("not an answer to 'read SZL': lengths that contradict each other")
+        raise ConnectorError("not an answer to 'read SZL': inconsistent lengths")
     parameters = frame[pdu.USERDATA_END : begin]
     if parameters[:7] != _PARAMETERS:
         raise ConnectorError("not an answer to 'read SZL'")

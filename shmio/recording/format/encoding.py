@@ -194,7 +194,7 @@ def decode_frame(data: bytes) -> Frame:
     raw_at = _FRAME.size + reason_size
     images = 2 if flags & _EFFECTIVE else 1
     if len(data) != raw_at + images * size or provenance > Provenance.INJECTED:
-        raise ValueError("a frame contradicts its header")
+        raise ValueError("a frame does not match its header")
     return Frame(
         number, cycle, publish_ns, clock_ns, source_ns, incarnation,
         _QUALITIES[min(quality, 3)], _PROVENANCES[provenance], event, delay_us,
@@ -253,7 +253,7 @@ def decode_event(data: bytes) -> Event:
     writer, item, items, offset, size, kind, quality, mask, data_size, text_size = rest
     text_at = _EVENT.size + data_size
     if len(data) != text_at + text_size or data_size > EVENT_DATA_SIZE:
-        raise ValueError("an event contradicts its header")
+        raise ValueError("an event does not match its header")
     known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD
     return Event(
         number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
@@ -277,9 +277,9 @@ def decode_gap(data: bytes) -> Gap:
     """Decode a gap; raise ValueError if it is malformed."""
     gap = _decode_json(data, Gap, "a gap")
     if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
-        raise ValueError("a gap contradicts itself")
+        raise ValueError("the numbers of a gap are inconsistent")
     if min(gap.after_ns, gap.before_ns) < 0:
-        raise ValueError("a gap contradicts all clocks")
+        raise ValueError("a gap has a negative time")
     return gap
 
 
@@ -305,7 +305,7 @@ def decode_position(text: str) -> BlockPosition:
     """Decode a position; raise ValueError if it is malformed."""
     frame, event, log_ns = (int(number) for number in text.split(" ") if len(number) <= 20)
     if min(frame, event, log_ns) < 0:
-        raise ValueError("a place is negative")
+        raise ValueError("a position is negative")
     return BlockPosition(frame, event, log_ns)
 
 

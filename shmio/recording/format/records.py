@@ -415,19 +415,19 @@ def _unpack(content: bytes) -> bytes:
     (packed_size,) = U64.unpack_from(content, at)
     packed = memoryview(content)[at + 8 :]
     if packed_size != len(packed):
-        raise ValueError("its sizes contradict each other")
+        raise ValueError("its sizes are inconsistent")
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"{size} bytes, more than {MAX_CHUNK_BYTES}")
     if compression == "zstd":
         if zstandard.get_frame_parameters(packed).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-            raise ValueError("its sizes contradict each other")
+            raise ValueError("its sizes are inconsistent")
         data = _of_thread.decompressor.decompress(packed, max_output_size=size)
     elif not compression:
         data = bytes(packed)
     else:
         raise ValueError(f"its compression {compression[:20]!r} is unknown")
     if len(data) != size:
-        raise ValueError("its sizes contradict each other")
+        raise ValueError("its sizes are inconsistent")
     if crc and zlib.crc32(data) != crc:
         raise ValueError("its checksum is wrong")
     return data

@@ -329,7 +329,7 @@ class Reader:
         data.read_prefixed_string()
         size = data.read8()
         if data.count + size + 4 != record.size:
-            raise ValueError("its sizes contradict each other")
+            raise ValueError("its sizes are inconsistent")
         self.attachments[name] = AttachmentEntry(record.at + data.count, size, record)
 
     def _channel(self, content: memoryview) -> None:

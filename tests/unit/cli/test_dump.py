@@ -304,7 +304,7 @@ def test_verify_locates_damage(damaged: tuple[str, str], said: Output) -> None:
     [place, events, frames] = [line for line in out if line.startswith("  damage: ")]
     assert re.fullmatch(f"  damage: {WHERE}", place)
     first = 3 * RING + 11
-    assert frames == f"  damage: press, block 1: frames {first} to {first + 9} are missing, and in no gap"
+    assert frames == f"  damage: press, block 1: frames {first} to {first + 9} are missing without a gap"
     assert events.startswith("  damage: press, block 1: events ")
     assert out[-1].endswith("no damage"), "the undamaged file is reported, too"
     assert err == []
@@ -456,7 +456,7 @@ def test_the_end_of_the_instance_ends_a_recording(segment: Segment) -> None:
     ("arguments", "message"),
     [
         (["--source", "pres"], "no source 'pres'; there are: cell, press"),
-        (["-o", "text"], "cannot make a recording in text: File exists"),
+        (["-o", "text"], "cannot create a recording in text: File exists"),
     ],
 )
 def test_unknown_source_or_unusable_folder_is_refused(

@@ -265,8 +265,8 @@ def test_command_for_a_restarted_source_can_be_repeated(
         assert main(["set", "other/count", "1"]) == 1
         replacing.join()
         assert capsys.readouterr().err == (
-            "other/count: not written, the source accepted nothing: it was for an earlier process of the source, "
-            "which has ended: try again; see shmio-supervisor status\n"
+            "other/count: not written, the source accepted nothing: the source was restarted after the "
+            "command was sent: send it again; see shmio-supervisor status\n"
         )
         assert main(["set", "other/count", "1"]) == 0, "the remedy works"
 

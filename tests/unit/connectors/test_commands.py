@@ -187,14 +187,14 @@ def test_command_for_an_earlier_process_is_rejected(writer: BlockWriter, instanc
             bench.stop()
         last = successor.block.events.read(successor.block.events.head())
         assert last is not None
-        assert "for an earlier process of the source" in last.text
+        assert "restarted after the command was sent" in last.text
 
 
 def test_late_command_is_rejected(bench: Bench) -> None:
     bench.now_ns = 5_000_000
     bench.send(Write(0, 0, b"\0\0"), deadline_ns=2_000_000)
     event = bench.event()
-    assert (event.kind, event.text) == (EventKind.REJECTED, "it came 3 ms after its deadline")
+    assert (event.kind, event.text) == (EventKind.REJECTED, "the command came 3 ms after its deadline")
 
 
 def test_command_that_no_cycle_carries_out_in_time_expires(bench: Bench) -> None:

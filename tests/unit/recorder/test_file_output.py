@@ -35,7 +35,7 @@ def test_a_file_is_named_after_instance_and_time_and_never_overwritten(tmp_path:
 
 def test_a_folder_where_no_file_can_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(RecordingError, match=r"cannot make a recording in .*/file: (File exists|Not a directory)"):
+    with pytest.raises(RecordingError, match=r"cannot create a recording in .*/file: (File exists|Not a directory)"):
         create(tmp_path / "file", "a50")
 
 

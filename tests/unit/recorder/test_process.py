@@ -372,7 +372,7 @@ def test_a_failed_fsync_is_reported_until_a_new_file_is_started(segment: Segment
         until((tmp_path / "synced").exists, "a good fsync")
         until(lambda: process.counts("bytes") == old.stat().st_size, "a report of the write")
         assert "may be lost" in process.slot.report.note
-        assert "cannot make a recording" in process.log.read_text()
+        assert "cannot create a recording" in process.log.read_text()
         process.folder.unlink()
         until(lambda: ready(process) and process.file.name != old.name, "a new file")
         process.stop()

@@ -171,7 +171,7 @@ def test_the_memory_for_the_time_before_is_bounded(
     bench = Bench(segment, tmp_path, when="cell/count = 90", before_s=50, after_s=0, before_mb=802 * 10 / 1e6)
     bench.publish(91)
     assert bench.close() == [list(range(80, 91))], "ten frames, and the one that triggers"
-    assert caplog.text.count("recorder.trigger.before_mb has no room for more") == 1
+    assert caplog.text.count("raise recorder.trigger.before_mb") == 1
 
 
 def test_frames_lost_before_the_files_time_are_not_a_gap(segment: Segment, tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def test_without_a_folder_it_reports_that_and_keeps_waiting(segment: Segment, tm
     folder.touch()
     bench = Bench(segment, folder, when="cell/count = 5 or cell/count = 7", before_s=9, after_s=0)
     bench.publish(6)
-    assert "cannot make a recording in" in bench.work.problem
+    assert "cannot create a recording in" in bench.work.problem
     folder.unlink()
     bench.publish(3)
     assert bench.work.problem == ""

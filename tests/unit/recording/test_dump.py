@@ -242,7 +242,7 @@ def test_files_of_different_runs_are_refused(tmp_path: Path) -> None:
         work.frame(1, image(1))
     with pytest.raises(RecordingError, match=r"b.mem and .*a.mem come from different runs"):
         shmio.open_dump([plain(tmp_path / "a.mem"), tmp_path / "b.mem"])
-    with pytest.raises(RecordingError, match="a dump is of 1 to"):
+    with pytest.raises(RecordingError, match="a recording has 1 to"):
         shmio.open_dump([])
 
 

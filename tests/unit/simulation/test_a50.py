@@ -77,7 +77,7 @@ def test_registers_that_it_does_not_compute_keep_written_values(db201: Layout) -
     assert [value(runner, path) for path in ("Inputs/20", "Outputs/18")] == [0xA5] * 2
     assert 0xA5 not in [value(runner, path) for path in ("Inputs/0", "Outputs/0")]
     assert runner.write(encode(find(db201, AXIS), 0.0, "big")) == [
-        "the model computes Robot_825/Axs1_Pos: it is an output and cannot be written; shmio inject can show others"
+        "the model computes Robot_825/Axs1_Pos: outputs cannot be written; shmio inject can show another value"
     ]
 
 

@@ -104,12 +104,12 @@ def test_several_faults_are_reported_together() -> None:
 
 @pytest.mark.parametrize("name", ["step", "start", "random", "_hidden"])
 def test_names_of_model_attributes_cannot_be_registers(name: str) -> None:
-    with pytest.raises(ModelError, match=f"model Wrong: {name}: choose another name"):
+    with pytest.raises(ModelError, match=f"model Wrong: {name}: this name is reserved"):
         type("Wrong", (Still,), {name: Input("INT")})
 
 
 def test_a_model_must_not_define_init() -> None:
-    with pytest.raises(ModelError, match=r"model Wrong: a model has no __init__ of its own; prepare it in start\(\)"):
+    with pytest.raises(ModelError, match=r"model Wrong: a model cannot have its own __init__; use start\(\)"):
         type("Wrong", (Still,), {"__init__": lambda self: None})
 
 

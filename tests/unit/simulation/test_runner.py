@@ -85,7 +85,7 @@ def test_a_bit_is_written_alone() -> None:
     assert runner.write([Write(0, 1, b"\xff"), Write(0, 4, b"\xff")]) == ["", ""]
     assert (
         runner.write([Write(0, 2, b"\xff"), Write(0, 0, b"\xff")])
-        == ["the model computes b: it is an output and cannot be written; shmio inject can show others"] * 2
+        == ["the model computes b: outputs cannot be written; shmio inject can show another value"] * 2
     )
     assert step(runner) == b"\x05\x00"
     assert runner.write([Write(0, 1, b"\0"), Write(0, 4, b"\0")]) == ["", ""]
@@ -94,7 +94,7 @@ def test_a_bit_is_written_alone() -> None:
 
 def test_outputs_are_not_written() -> None:
     runner = ModelRunner(Belt)
-    told = "the model computes position: it is an output and cannot be written; shmio inject can show others"
+    told = "the model computes position: outputs cannot be written; shmio inject can show another value"
     assert set_to(runner, "position", 1.0) == told
     assert set_to(runner, "parts/box/corners", [1, 2]).startswith("the model computes parts/box/corners")
     whole = runner.write([Write(0, 0, bytes(runner.layout.size)), Write(runner.layout.size - 1, 0, b"ab")])

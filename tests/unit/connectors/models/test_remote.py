@@ -154,7 +154,7 @@ def test_remote_model_computes_only_its_outputs(instance: str) -> None:
         assert struct.unpack(">III", latest(segment, "sim").raw) == (9, 7, 0)
         (outcome,) = source_writer.write({"sum": 7})
         assert outcome.kind is OutcomeKind.REFUSED
-        told = "the model computes sum: it is an output and cannot be written; shmio inject can show others"
+        told = "the model computes sum: outputs cannot be written; shmio inject can show another value"
         assert outcome.text == told
         assert [(ask.step, ask.time_ns, ask.dt_ns) for ask in model.asks] == [
             (1, 20 * MS, 20 * MS),

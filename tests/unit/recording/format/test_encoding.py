@@ -71,7 +71,7 @@ def test_a_gap() -> None:
 )
 def test_a_contradictory_gap_is_refused(change: dict[str, object]) -> None:
     fields = {"source": "c", "block": 1, "what": "frames", "first": 5, "last": 9, "count": 5, "reason": "overtaken"}
-    with pytest.raises(ValueError, match="contradicts"):
+    with pytest.raises(ValueError, match=r"inconsistent|negative time"):
         decode_gap(encode_json(Gap(**fields | change)))  # type: ignore[arg-type]
 
 

@@ -131,11 +131,11 @@ def chunk(size: int, packed: bytes, compression: bytes = b"zstd", crc: int = 0) 
     ("content", "message"),
     [
         (chunk(1 << 40, zstandard.compress(b"x")), "more than"),
-        (chunk(5, zstandard.compress(bytes(MAX_CHUNK_BYTES * 2))), "sizes contradict each other"),
+        (chunk(5, zstandard.compress(bytes(MAX_CHUNK_BYTES * 2))), "sizes are inconsistent"),
         (chunk(5, zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1 << 20))), "chunk at byte 17"),
         (chunk(5, b"nonsense"), "chunk at byte 17 is damaged"),
         (chunk(5, b"12345", b""), "ends within a record"),
-        (chunk(5, b"1234", b""), "sizes contradict each other"),
+        (chunk(5, b"1234", b""), "sizes are inconsistent"),
         (chunk(4, b"1234", b"", crc=77), "checksum is wrong"),
         (chunk(4, b"1234", b"lz5"), "compression 'lz5' is unknown"),
         (chunk(9, struct.pack("<BQ", 5, 1 << 60), b""), "ends within a record"),

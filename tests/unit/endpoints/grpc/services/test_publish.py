@@ -332,7 +332,7 @@ def test_commands_for_an_earlier_process_of_the_source_are_never_done(
 
     asyncio.run(run())
     assert "the source was restarted meanwhile" in caplog.text
-    assert caplog.text.count("it was for an earlier process of the source") == 2
+    assert caplog.text.count("the source was restarted after the command was sent") == 2
 
 
 def test_a_source_that_does_not_answer_delays_publishers_only_briefly(
