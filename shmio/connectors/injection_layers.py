@@ -235,7 +235,7 @@ def shadow(injection: Layer, writes: Sequence[Write]) -> str:
 
 
 def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
-    """Return which bytes the layer does not cover, as a message; empty if it covers all."""
+    """Return a message about bytes that the layer does not cover; empty if it covers all."""
     for write in writes:
         cover = injection.cover[write.offset : write.offset + len(write.data)]
         if len(cover) < len(write.data) or (~cover & (write.mask or 0xFF)).any():

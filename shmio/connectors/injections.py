@@ -355,7 +355,7 @@ def _activation_event(layer: DeclaredLayer) -> Record:
 
 
 def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[Record]:
-    """Return the events of a new injection, which contain its declaration and its seed in parts."""
+    """Return the events of a new injection; together they have its declaration with its seed."""
     document = msgspec.json.encode(msgspec.structs.replace(layer.program.declaration, seed=layer.seed))
     return in_parts(layer_event(EventKind.INJECTED, layer, layer.name, command), document)
 

@@ -144,7 +144,7 @@ class Output:
         return ""
 
     def check(self) -> None:
-        """Raise RecordingError if the file was removed, so that no one could find new data."""
+        """Raise RecordingError if the file was removed, because new data would be lost."""
         if os.fstat(self._fd).st_nlink == 0:
             raise RecordingError(f"{self.path} was removed while it was being written")
 

@@ -310,7 +310,7 @@ class Recorder:
             self._to_confirm = self.output.tell(), dict(self.places)
 
     def settle(self) -> None:
-        """Update :attr:`places`."""
+        """Update :attr:`places` to the last recorded entries."""
         self.places |= {section: followed.place for section, followed in self._followed.items()}
 
     @property

@@ -185,7 +185,7 @@ class _Numbers:
         self._go_on(key, number, number)
 
     def gap(self, gap: Gap) -> None:
-        """Check the numbers of the next gap."""
+        """Check the numbers in the next gap."""
         self._go_on((gap.source, gap.block, gap.what), gap.first, gap.last)
 
     def _go_on(self, key: tuple[str, int, str], first: int, last: int) -> None:

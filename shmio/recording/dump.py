@@ -413,7 +413,7 @@ class _Names:
         self.sources = tuple(dict.fromkeys(block.source for block in blocks))
 
     def one(self, name: str | None) -> str:
-        """Check and return the name of a source; None is the only source.
+        """Check and return the name of a source; for None, return that of the only source.
 
         Raises:
             PathError: There is no such source, or several.
@@ -426,7 +426,7 @@ class _Names:
         return name
 
     def several(self, names: str | Collection[str] | None) -> set[str]:
-        """Check and return the names of sources; None is all sources.
+        """Check and return the names of sources; for None, return all names.
 
         Raises:
             PathError: There is no such source.

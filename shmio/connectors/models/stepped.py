@@ -40,7 +40,7 @@ class Inputs:
         """Create the inputs.
 
         Args:
-            segment: A segment that no other object uses, because this one follows reloads.
+            segment: A segment that only this object uses, because it follows reloads.
             connections: The topic of each input, by the input's path.
 
         """

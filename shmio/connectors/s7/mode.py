@@ -113,7 +113,7 @@ class ModeQuery:
 
 
 def parse_mode_answer(frame: memoryview) -> int | None:
-    """Return the operating mode from an answer to a read of SZL 0x0424; None if it has none.
+    """Return the operating mode from an answer to a read of SZL 0x0424; None if there is none.
 
     Raises:
         ConnectorError: The answer is malformed.

@@ -49,7 +49,7 @@ class Transport:
     def reserve(self, frames: int, longest: int) -> None:
         """Allocate a buffer for ``frames`` frames of at most ``longest`` bytes.
 
-        Take all received frames before.
+        Take all received frames before you call it.
         """
         self._longest = longest
         self._inbox = memoryview(bytearray(frames * longest))
@@ -97,7 +97,7 @@ class Transport:
         return True
 
     def frame(self) -> memoryview | None:
-        """Return the next whole frame; None if there is none. It is valid until ``receive``."""
+        """Return the next whole frame, valid until the next ``receive``; None if there is none."""
         if self._end - self._start < 4:
             return None
         length = pdu.frame_length(self._inbox, self._start, self._longest)
