@@ -148,7 +148,7 @@ class _Check:
         if count is None:
             raise RecordingError(f"{self._reader.file}: the index at byte {record.at} is damaged")
         channel = self._reader.channel(count.channel)
-        if channel is None or channel.encoding:  # not a message of another program
+        if channel is None or channel.encoding:  # ignore the channels of other programs
             self._indexes[count.channel] = count
 
     def _compare_indexes(self) -> None:

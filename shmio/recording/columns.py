@@ -240,7 +240,7 @@ def record_codec(registers: tuple[Register, ...], size: int, byte_order: ByteOrd
 
 
 def _categories(arrow: Any, codes: npt.NDArray[np.uint8], names: tuple[str, ...]) -> Any:
-    known = np.where(codes < len(names), codes, 0).astype(np.int8)  # unknown codes count as the first name
+    known = np.where(codes < len(names), codes, 0).astype(np.int8)  # an unknown code gets the first name
     return arrow.DictionaryArray.from_arrays(arrow.array(known), arrow.array(names))
 
 

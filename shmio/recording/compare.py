@@ -22,7 +22,10 @@ from shmio.segment.playhead import OWN_WORDS
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
 """The fields of an event that do not depend on the run."""
 MAX_EVENTS: Final = 4096
-"""Largest number of events with one key in memory; a cycle may have any number in paused time."""
+"""Largest number of events with one key in memory.
+
+While time is paused, one cycle may have any number of events.
+"""
 MAX_SHIFT: Final = 64
 """Largest number of frames with the first common key that one of two recordings may lack."""
 

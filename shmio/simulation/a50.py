@@ -138,7 +138,7 @@ class Actuator(NamedTuple):
     name: str
     travel_s: float
     spans: tuple[tuple[float, float], ...]
-    """Times in a cycle, in s, at which the valve opens and closes. It extends the drive."""
+    """Times in a cycle, in s, at which the valve opens to extend the drive, and closes again."""
 
     def valve(self, phase_s: float) -> bool:
         """Return whether the valve is open."""

@@ -184,7 +184,7 @@ class SteppedLoop:
         self._page = writer.block.clock
         writer.utc_ns = self._page.utc_ns
         self._from_start = self._schedule = schedule
-        self._basis = Clock().basis  # the clock's basis to which the schedule belongs
+        self._basis = Clock().basis  # the clock's basis for which the schedule is valid
         self._clock = clock
         self._inputs = inputs
         self._output = Output(writer, clock.now_ns)

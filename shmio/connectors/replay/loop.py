@@ -43,7 +43,7 @@ GOES_ON: Final = f"{OWN_WORDS}the recording continues"
 PIECE: Final = 64
 """Largest number of frames and events to play before requests and commands are handled."""
 LATE_NS: Final = 10_000_000_000
-"""Frames that are later than this, in instance time, are skipped; earlier ones are caught up."""
+"""Frames that are delayed by more than this, in instance time, are skipped; others are played."""
 ASK_TURN_NS: Final = 1_000_000
 """Period at which to check whether the step that a request waits for has ended.
 

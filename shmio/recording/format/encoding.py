@@ -144,7 +144,7 @@ class ProcessEvent(StrEnum):
     IS = "is"
     """The process was running when the recording began."""
     STARTED = "started"
-    """The process was started or restarted."""
+    """The process was started or restarted; the end of the previous one was recorded before."""
     ENDED = "ended"
     """The process ended, or was restarted, on request."""
     DIED = "died"
