@@ -101,6 +101,7 @@ class Campaign:
         self._new: Any = V2Stub(channel)  # type: ignore[no-untyped-call]
         self._time: Any = SimServerAPIStub(channel)  # type: ignore[no-untyped-call]
         self._readers: dict[str, asyncio.Task[list[bytes]]] = {}
+        self._arrived = asyncio.Queue[str]()  # values published to J1 that the endpoint has received
 
     async def run(self) -> Streams:
         """Run the campaign; return the messages of each stream."""
@@ -110,7 +111,11 @@ class Campaign:
             for number in range(1, STEPS + 1):
                 await self._act(number)
                 for part in range(number % 4 + 1):
-                    await outgoing.write(_published(f"SIM://{J1}/in", f"{number - (number % 4 - part) / 4}"))
+                    value = f"{number - (number % 4 - part) / 4}"
+                    await outgoing.write(_published(f"SIM://{J1}/in", value))
+                async with asyncio.timeout(PATIENCE_S):  # gRPC does not order the value and the call of the step
+                    while await self._arrived.get() != value:
+                        pass
                 await self._step(number)
         await outgoing.done_writing()
         await outgoing
@@ -130,7 +135,7 @@ class Campaign:
         )
         await self._subscribe_new("slow", "noise/glitches", "/noise/glitches", *glitches, "SIMLOG://step")
         await self._subscribe_old(f"{J1}/out", lambda message: message.value == f"{STEPS}.0")
-        await self._subscribe_old(f"{J1}/in", lambda message: message.value == f"{STEPS}.0")
+        await self._subscribe_old(f"{J1}/in", self._arrive)
         await self._subscribe_old("noise/measured", lambda message: message.timeStamp.seq == STEPS)
         await self._subscribe_old("/model/clock", lambda message: message.timeStamp.seq == STEPS)
         over = sum(map(_step_ms, range(1, STEPS + 1)))
@@ -161,6 +166,11 @@ class Campaign:
             f"v1 {path}", self._channel, "/simulation.server.SimlogAPI/Subscribe", v1.TopicDescriptor(path=path),
             lambda data: over(v1.ROSMessage.FromString(data)),
         )  # fmt: skip
+
+    def _arrive(self, message: v1.ROSMessage) -> bool:
+        """Note a published value; return whether it is the last one."""
+        self._arrived.put_nowait(message.value)
+        return message.value == f"{STEPS}.0"
 
     async def _follow(
         self, name: str, channel: grpc.aio.Channel, method: str, request: Any, over: Callable[[bytes], bool]
