@@ -119,6 +119,7 @@ def layouts(parts: Iterable[Any]) -> Iterator[BlockLayout]:
                 optimized=part.optimized,
                 registers=tuple(registers),
                 byte_order="big" if part.big_endian else "little",
+                status_offset=part.status_offset if part.HasField("status_offset") else None,
                 source=part.source,
                 section=part.section,
                 hash=part.hash,

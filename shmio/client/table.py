@@ -20,6 +20,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from shmio.errors import PathError, RemoteError
 from shmio.layout import model
 from shmio.layout.model import ElementType, element_type
+from shmio.model.statuses import RegisterStatus
 from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -129,6 +130,7 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
                 found.count,
                 found.comment,
                 found.initial if found.HasField("initial") else None,
+                unit=found.unit,
                 column=Column(found.column),
                 slot=found.slot,
             )
@@ -188,6 +190,10 @@ class Table:
         """True for each register whose bytes are not a valid value of its type."""
         self.injected = np.zeros(len(self.registers), bool)
         """True for each register that an injection covers."""
+        self.codes: Array | None = None
+        """The status code of each register; None if the source gives registers no status."""
+        self.times_ns: Array | None = None
+        """The source time of each register, UTC in ns; 0: that of the update."""
         self.state: object = None
         """Quality, reason, provenance and incarnation of the latest frame."""
         self._everything = {column: np.arange(len(array), dtype=np.uint32) for column, array in self.arrays.items()}
@@ -281,6 +287,25 @@ class Table:
                 if len(slots) != len(news):
                     raise ValueError(f"{len(news)} values for {len(slots)} elements")
                 yield Change(column, slots, news)
+
+    def take_statuses(self, found: Any) -> list[int]:
+        """Copy a message's statuses, and return the indices of their registers. RemoteError: they are invalid."""
+        places = np.frombuffer(found.registers, np.uint32)
+        if self.codes is None or self.times_ns is None:
+            self.codes = np.zeros(len(self.registers), np.uint32)
+            self.times_ns = np.zeros(len(self.registers), np.int64)
+        try:
+            self.codes[places] = np.frombuffer(found.codes, "<u4")
+            self.times_ns[places] = np.frombuffer(found.source_ns, "<i8")
+        except (IndexError, ValueError) as error:
+            raise RemoteError(f"source {self.source}: an invalid update: {error}") from None
+        return list(map(int, places))
+
+    def status(self, place: int) -> RegisterStatus | None:
+        """Return the status that the source gave a register; None if it gives registers none."""
+        if self.codes is None or self.times_ns is None:
+            return None
+        return RegisterStatus(int(self.codes[place]), int(self.times_ns[place]))
 
     def mark(self, marks: Any, into: Array) -> None:
         """Copy a message's marks into ``into``. RemoteError: they are invalid."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from shmio.client.table import Array, Change, SubscribeResponse, Table, unknown
 from shmio.errors import QualityError, RemoteError
 from shmio.layout import model
+from shmio.model.statuses import worse
 from shmio.model.values import Column, Provenance, Quality, Reading
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -40,9 +41,9 @@ class Update:
     """
 
     __slots__ = (
-        "_everything", "_originals", "age_ns", "changes", "clock_ns", "cycle", "ended", "frame", "image", "incarnation",
-        "marked",
-        "missed", "pieces", "provenance", "quality", "raw", "reason", "source_ns", "table", "whole",
+        "_everything", "_originals", "_statuses", "age_ns", "changes", "clock_ns", "cycle", "ended", "frame", "image",
+        "incarnation", "marked", "missed", "pieces", "provenance", "quality", "raw", "reason", "source_ns", "table",
+        "whole",
     )  # fmt: skip
 
     def __init__(self, table: Table, found: Any) -> None:
@@ -69,6 +70,7 @@ class Update:
             table.mark(found.invalid, table.invalid)
         if found.HasField("injected"):
             table.mark(found.injected, table.injected)
+        self._statuses = table.take_statuses(found.statuses) if found.HasField("statuses") else []
         state = self.quality, self.reason.partition(":")[0], self.provenance, self.incarnation  # without an age
         self._everything = self.whole or self.marked or table.state != state
         table.state = state
@@ -85,7 +87,12 @@ class Update:
     def changed(self) -> list[str]:
         """Paths of the registers in this update, with the source."""
         registers = self.table.registers
-        return [f"{self.source}/{registers[place].path}" for place in self.table.changed(self.changes)]
+        return [f"{self.source}/{registers[place].path}" for place in self._changed()]
+
+    def _changed(self) -> Sequence[int]:
+        """Return the ascending indices of the registers with new values or statuses."""
+        changed = self.table.changed(self.changes)
+        return sorted({*changed, *self._statuses}) if self._statuses else changed
 
     @property
     def readings(self) -> list[Reading]:
@@ -93,7 +100,7 @@ class Update:
         if self.ended:
             return []
         table = self.table
-        places = range(len(table.registers)) if self._everything else table.changed(self.changes)
+        places = range(len(table.registers)) if self._everything else self._changed()
         return [self.reading(place) for place in places]
 
     def reading(self, place: int, register: model.Register | None = None) -> Reading:
@@ -104,6 +111,8 @@ class Update:
         found = self.table.registers[place]
         value: Any = self.table.value(place) if self.source_ns else None
         quality, reason = self.quality_of(found.path)
+        status = self.table.status(place)
+        source_ns = (status.source_ns if status else 0) or self.source_ns
         return Reading(
             self.source,
             register or found,
@@ -111,7 +120,7 @@ class Update:
             quality,
             reason,
             str(self.provenance_of(found.path)),
-            self.source_ns / 1e9 if self.source_ns else None,
+            source_ns / 1e9 if self.source_ns else None,
             round(self.age_ns / 1e9, 6) if self.age_ns or quality is not Quality.BAD else None,
         )
 
@@ -144,7 +153,8 @@ class Update:
         place = self.table.place(path)
         if self.quality is not Quality.BAD and self.table.invalid[place]:
             return Quality.BAD, f"the bytes are not a valid {self.table.registers[place].type}"
-        return self.quality, self.reason
+        status = self.table.status(place) if self.source_ns else None
+        return (self.quality, self.reason) if status is None else worse(self.quality, self.reason, status)
 
     def provenance_of(self, path: str) -> Provenance:
         """Return the origin of a register's value; PathError."""

@@ -65,7 +65,7 @@ class ConditionValues:
 
     Each image is fetched once, and only if a condition needs it. No injection is applied to these
     images, so that an injection cannot influence its own condition. The values of a source with bad
-    quality are unknown.
+    quality are unknown, and so are those of a register with a bad status.
     """
 
     def __init__(self, own: str, image: Image, blocks: Mapping[str, Block], before: int | None) -> None:

@@ -38,6 +38,7 @@ from shmio.layout.values.codec import RegisterCodec, codec, scalar_codec
 from shmio.layout.values.literal import parse_literal
 from shmio.layout.values.text import from_text, wire_type
 from shmio.layout.values.write import bits_of, chosen
+from shmio.model.statuses import trusted_codec
 
 _NS: Final = 1_000_000_000
 MAX_REGISTERS: Final = 4096
@@ -141,7 +142,7 @@ def _read(path: str, layouts: Mapping[str, Layout]) -> tuple[str, RegisterCodec]
         raise ConfigError(f"{path}: an array; a condition reads one of its elements")
     if register.type != "BOOL" and not scalar_codec(register.element).plain:
         raise ConfigError(f"{path}: {register.type} is neither a number nor a BOOL")
-    return source, codec(register, layouts[source].byte_order)
+    return source, trusted_codec(register, layouts[source])
 
 
 def _window(declaration: Declaration) -> Window:

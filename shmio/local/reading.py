@@ -11,6 +11,7 @@ from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import Value, codec
+from shmio.model.statuses import RegisterStatus, worse
 from shmio.model.values import Provenance, Quality, Reading
 from shmio.segment.block import Block, Frame
 
@@ -87,6 +88,18 @@ class View:
         """
         return self._decode(parse_topic(path, (self.source,), self.source).path, self.frame.raw)
 
+    def status(self, path: str) -> RegisterStatus | None:
+        """Return the status that the source gave a register; None if it gives registers none.
+
+        Args:
+            path: Path of a register or element.
+
+        Raises:
+            PathError: There is no such register.
+        """
+        register = find(self.layout, parse_topic(path, (self.source,), self.source).path)
+        return status_of(self.block, register, self.frame)
+
     def _decode(self, path: str, image: bytes) -> Value:
         return codec(find(self.layout, path), self.layout.byte_order).decode(image)
 
@@ -119,14 +132,23 @@ def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool
         return Reading(block.source, register, None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
     now_ns = block.now_ns()
     quality, reason = frame.assess(block.stale_ns, now_ns) if aged else (frame.quality, frame.reason)
-    known = frame.source_ns != 0
-    value = codec(register, block.layout.byte_order).decode(frame.image) if known else None
+    source_ns = frame.source_ns
+    value = codec(register, block.layout.byte_order).decode(frame.image) if source_ns else None
+    if source_ns and (status := status_of(block, register, frame)) is not None:
+        quality, reason = worse(quality, reason, status)
+        source_ns = status.source_ns or source_ns
     if quality is not Quality.BAD and holds_none(value):
         quality, reason = Quality.BAD, f"the bytes are not a valid {register.type}"
-    source_time = frame.source_ns / 1e9 if known else None
+    source_time = source_ns / 1e9 if source_ns else None
     provenance = Provenance.INJECTED if injected(block, (register,), frame) else frame.provenance
     age_s = round(frame.age_ns(now_ns) / 1e9, 6)
     return Reading(block.source, register, value, quality, reason, str(provenance), source_time, age_s)
+
+
+def status_of(block: Block, register: Register, frame: Frame) -> RegisterStatus | None:
+    """Return the status that the source gave a register of a frame; None if it gives none."""
+    area = block.statuses
+    return None if area is None else area.get(frame.raw, area.index(register))
 
 
 def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:

@@ -232,7 +232,7 @@ class _Follower:
         self.due_s = math.inf
         """Earliest time of the next update, if ``max_rate_hz`` delays it."""
         self._registers = registers
-        self._scan = ChangeScan(registers)
+        self._scan = ChangeScan(registers, block.statuses)
         self._frames = FrameFollower(block)
         self._every_frame = every_frame
         self._interval_s = interval_s

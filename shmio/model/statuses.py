@@ -1,9 +1,10 @@
 """The status area of an image: a status code and a source time for each register.
 
 An image of a layout with :attr:`Layout.status_offset` ends in this area, so that rings, recordings
-and replays carry it like all other bytes. It holds two little-endian arrays in the order of the
+and replays carry it like all other bytes. It holds two arrays in the order of the
 layout's registers: the OPC UA status codes (u32, OPC 10000-4, section 7.39), padded to 8 bytes, and
-the source times (i64, ns since 1970 UTC; 0: unknown, the time of the frame counts).
+the source times (i64, ns since 1970 UTC; 0: unknown, the time of the frame counts). They have the
+byte order of the layout.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from shmio.layout.model import Layout, Register
+from shmio.layout.values.codec import Buffer, RegisterCodec, Value, codec
 from shmio.model.values import Quality
 
-_CODE: Final = struct.Struct("<I")
-_TIME: Final = struct.Struct("<q")
+_CODE_BYTES: Final = 4
+_TIME_BYTES: Final = 8
 _QUALITIES: Final = (Quality.GOOD, Quality.UNCERTAIN, Quality.BAD, Quality.BAD)
 
 GOOD: Final = 0x00000000
@@ -178,6 +180,11 @@ def describe(code: int) -> str:
     return f"{name} (0x{code:08X})" if name else f"status 0x{code:08X}"
 
 
+def worse(quality: Quality, reason: str, status: RegisterStatus) -> tuple[Quality, str]:
+    """Return the worse of a frame's quality and of a register's status, with its reason."""
+    return (quality, reason) if quality <= status.quality else (status.quality, status.reason)
+
+
 def quality_of(code: int) -> Quality:
     """Return the severity of a status code; the reserved severity counts as bad."""
     return _QUALITIES[code >> 30]
@@ -191,8 +198,11 @@ class StatusArea:
             raise ValueError(f"{layout.name}: the layout has no status area")
         self.codes_offset = layout.status_offset
         """Where the codes begin."""
-        self.times_offset = layout.size - _TIME.size * len(layout.registers)
+        self.times_offset = layout.size - _TIME_BYTES * len(layout.registers)
         """Where the source times begin."""
+        order = ">" if layout.byte_order == "big" else "<"
+        self._code, self._time = struct.Struct(f"{order}I"), struct.Struct(f"{order}q")
+        self._severity_at = 0 if layout.byte_order == "big" else 3  # the byte of a code that has its severity
         self._first_bits = [8 * register.offset + (register.bit or 0) for register in layout.registers]
 
     def index(self, register: Register) -> int:
@@ -205,22 +215,77 @@ class StatusArea:
 
     def code_range(self, index: int) -> tuple[int, int]:
         """Return (offset, size) of a register's code in an image."""
-        return self.codes_offset + _CODE.size * index, _CODE.size
+        return self.codes_offset + _CODE_BYTES * index, _CODE_BYTES
 
-    def get(self, image: bytes | bytearray, index: int) -> RegisterStatus:
+    def time_range(self, index: int) -> tuple[int, int]:
+        """Return (offset, size) of a register's source time in an image."""
+        return self.times_offset + _TIME_BYTES * index, _TIME_BYTES
+
+    def get(self, image: Buffer, index: int) -> RegisterStatus:
         """Return the status of the register at an index of the layout."""
-        (code,) = _CODE.unpack_from(image, self.codes_offset + _CODE.size * index)
-        (source_ns,) = _TIME.unpack_from(image, self.times_offset + _TIME.size * index)
+        (code,) = self._code.unpack_from(image, self.codes_offset + _CODE_BYTES * index)
+        (source_ns,) = self._time.unpack_from(image, self.times_offset + _TIME_BYTES * index)
         return RegisterStatus(code, source_ns)
 
-    def quality(self, image: bytes | bytearray, index: int) -> Quality:
+    def quality(self, image: Buffer, index: int) -> Quality:
         """Return the quality of the register at an index of the layout."""
-        return _QUALITIES[image[self.codes_offset + _CODE.size * index + 3] >> 6]
+        return _QUALITIES[image[self.codes_offset + _CODE_BYTES * index + self._severity_at] >> 6]
+
+    def worst(self, image: Buffer, indices: Iterable[int]) -> tuple[int, RegisterStatus]:
+        """Return the index with the worst quality among these, and its status; the first of equals."""
+        found = min(indices, key=lambda index: self.quality(image, index))
+        return found, self.get(image, found)
 
     def put(self, image: bytearray, index: int, status: RegisterStatus) -> None:
         """Write the status of the register at an index of the layout."""
-        _CODE.pack_into(image, self.codes_offset + _CODE.size * index, status.code)
-        _TIME.pack_into(image, self.times_offset + _TIME.size * index, status.source_ns)
+        self._code.pack_into(image, self.codes_offset + _CODE_BYTES * index, status.code)
+        self._time.pack_into(image, self.times_offset + _TIME_BYTES * index, status.source_ns)
+
+
+def status_registers(layout: Layout, registers: Iterable[Register], *, times: bool = True) -> list[Register]:
+    """Return the statuses of registers as registers themselves, for tables and comparisons.
+
+    Args:
+        layout: The layout of the registers.
+        registers: Registers, elements or parts. Those of one register of the layout share its status.
+        times: Whether to include the source times.
+
+    Returns:
+        For each register ``PATH#status``, a DWORD, and ``PATH#source_ns``, a LINT; nothing if the
+        layout has no status area. No other path contains a ``#``.
+
+    """
+    area = status_area(layout)
+    if area is None:
+        return []
+    found = []
+    for index in dict.fromkeys(area.indices(registers)):
+        path = layout.registers[index].path
+        offset, size = area.code_range(index)
+        found.append(Register(f"{path}#status", "DWORD", (), offset, None, size, 1))
+        if times:
+            offset, size = area.time_range(index)
+            found.append(Register(f"{path}#source_ns", "LINT", (), offset, None, size, 1))
+    return found
+
+
+class _StatusCodec:
+    """Decodes a register to None while its status is bad; otherwise like the register's codec."""
+
+    def __init__(self, register: Register, layout: Layout, area: StatusArea) -> None:
+        self._codec = codec(register, layout.byte_order)
+        self._area, self._index = area, area.index(register)
+        self.encode_into = self._codec.encode_into
+
+    def decode(self, data: Buffer) -> Value:
+        """Return the register's value in an image; None for invalid bytes, and if its status is bad."""
+        return None if self._area.quality(data, self._index) is Quality.BAD else self._codec.decode(data)
+
+
+def trusted_codec(register: Register, layout: Layout) -> RegisterCodec:
+    """Return a register's codec, which decodes to None while the source calls the register bad."""
+    area = status_area(layout)
+    return codec(register, layout.byte_order) if area is None else _StatusCodec(register, layout, area)
 
 
 def status_area(layout: Layout) -> StatusArea | None:
@@ -229,5 +294,5 @@ def status_area(layout: Layout) -> StatusArea | None:
         return None
     found: StatusArea | None = vars(layout).get("_status_area")
     if found is None:
-        found = vars(layout)["_status_area"] = StatusArea(layout)
+        found = vars(layout)["_status_area"] = StatusArea(layout)  # as cached_property does
     return found

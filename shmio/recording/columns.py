@@ -15,6 +15,7 @@ import numpy.typing as npt
 from shmio.errors import RecordingError
 from shmio.layout.model import ByteOrder, Layout, Register
 from shmio.layout.values.frame_codec import FrameCodec
+from shmio.model.statuses import status_registers
 from shmio.recording.libraries import ANALYSIS, library
 from shmio.recording.reading.batch import HEAD, Batch
 from shmio.recording.reading.part import DumpBlock
@@ -38,7 +39,9 @@ DECODED_BYTES: Final = 1 << 20
 class Columns(Mapping[str, Array]):
     """The values of registers of one source in n frames, as a mapping.
 
-    The keys are the paths without the source; the values are arrays of shape (n, …).
+    The keys are the paths without the source; the values are arrays of shape (n, …). If the source
+    gave its registers statuses, ``PATH#status`` has the OPC UA status codes of a register, and
+    ``PATH#source_ns`` its times (UTC, ns since 1970; 0: that of the frame).
 
     Attributes:
         source: Name of the source.
@@ -177,7 +180,8 @@ class Collector:
         Raises:
             RecordingError: The types of the registers differ from those in the previous block.
         """
-        codec = record_codec(tuple(registers), block.layout.size, block.layout.byte_order)
+        registers = (*registers, *status_registers(block.layout, registers))
+        codec = record_codec(registers, block.layout.size, block.layout.byte_order)
         if self._codec is codec:
             return
         if self._codec is not None and self._codec.dtype != codec.dtype:
@@ -185,7 +189,7 @@ class Collector:
                 f"{self._source}: a reload changed these registers within the range: choose a range before or after it"
             )
         self._flush()
-        self._codec, self._registers = codec, tuple(registers)
+        self._codec, self._registers = codec, registers
 
     def add(self, block: DumpBlock, registers: Sequence[Register], batch: Batch) -> None:
         """Add frames of a block.

@@ -13,6 +13,7 @@ from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import elements
+from shmio.model.statuses import status_registers
 from shmio.recording.dump import Dump
 from shmio.recording.reading.part import DumpBlock, Entry
 from shmio.segment import Event, EventKind, Frame, Provenance
@@ -197,7 +198,9 @@ def compare(
 
 
 def _chosen(dump: Dump, how: Comparison) -> Mapping[DumpBlock, Sequence[Register]]:
-    return dump.select(how.only) if how.only else {block: block.layout.registers for block in dump.blocks}
+    """Return the registers to compare, with their statuses if the source gave them any."""
+    registers = dump.select(how.only) if how.only else {block: block.layout.registers for block in dump.blocks}
+    return {block: (*some, *status_registers(block.layout, some, times=False)) for block, some in registers.items()}
 
 
 class _Source:

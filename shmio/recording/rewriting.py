@@ -9,12 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Final
 
-import numpy as np
-
 from shmio.errors import RecordingError
 from shmio.layout.model import Register
 from shmio.layout.topic import holder
-from shmio.layout.values.write import covering
 from shmio.recording.dump import Dump
 from shmio.recording.format.encoding import Gap, ProcessChange, Reason, StepMark
 from shmio.recording.reading.part import MAX_NS, DumpBlock, Entry
@@ -287,8 +284,8 @@ def _reduced(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock
     """Return a block with only these registers, and an object that reduces its frames to them."""
     paths = {holder(block.layout, register) for register in registers}
     whole = tuple(register for register in block.layout.registers if register.path in paths)
-    layout = replace(block.layout, registers=whole)
-    part = RecordedRegisters(layout, np.frombuffer(covering(whole, layout.size), np.uint8))
+    part = RecordedRegisters(block.layout, whole)
+    layout = part.layout
     digest = layout.hash.hex()
     of = "" if digest == block.layout_hash else block.of or block.layout_hash
     return replace(block, layout=layout, layout_hash=digest, of=of), part

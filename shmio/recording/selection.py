@@ -9,30 +9,60 @@ import numpy as np
 import numpy.typing as npt
 
 from shmio.errors import PathError
-from shmio.layout.model import Layout
+from shmio.layout.model import Layout, Register
 from shmio.layout.topic import holder, near, parse_topic
 from shmio.layout.values.write import chosen, covering
+from shmio.model.statuses import StatusArea
 from shmio.segment import Block, Frame
 
 
 class RecordedRegisters:
-    """The registers of a block to record; ``layout`` has only these, at their original offsets."""
+    """The registers of a block to record; ``layout`` has only these, at their original offsets.
 
-    def __init__(self, layout: Layout, mask: npt.NDArray[np.uint8] | None = None) -> None:
-        """Create the selection; ``mask`` has the bits of the registers, None selects all bits."""
+    A status area has the statuses of these registers only, and is shorter.
+    """
+
+    def __init__(self, layout: Layout, registers: Sequence[Register] | None = None) -> None:
+        """Select registers of a layout; None selects all."""
         self.layout = layout
-        self._mask = mask
+        self._mask: npt.NDArray[np.uint8] | None = None
+        self._taken: npt.NDArray[np.intp] | slice = slice(None)  # from where each byte comes
+        if registers is None:
+            return
+        mask = np.frombuffer(covering(registers, layout.size), np.uint8)
+        if layout.status_offset is None:
+            self.layout, self._mask = replace(layout, registers=tuple(registers)), mask
+            return
+        values = replace(layout, registers=tuple(registers), size=layout.status_offset, status_offset=None)
+        self.layout = values.with_statuses()
+        self._mask, self._taken = _with_statuses(layout, self.layout, mask[: layout.status_offset])
 
     def keep(self, frame: Frame) -> Frame:
         """Return the frame, with the bits of all other registers set to zero."""
         if self._mask is None:
             return frame
-        effective = None if frame.effective is None else _kept(frame.effective, self._mask)
-        return frame._replace(raw=_kept(frame.raw, self._mask), effective=effective)
+        effective = None if frame.effective is None else self._kept(frame.effective, self._mask)
+        return frame._replace(raw=self._kept(frame.raw, self._mask), effective=effective)
+
+    def _kept(self, image: bytes, mask: npt.NDArray[np.uint8]) -> bytes:
+        return (np.frombuffer(image, np.uint8)[self._taken] & mask).tobytes()
 
 
-def _kept(image: bytes, mask: npt.NDArray[np.uint8]) -> bytes:
-    return (np.frombuffer(image, np.uint8) & mask).tobytes()
+def _with_statuses(
+    whole: Layout, part: Layout, mask: npt.NDArray[np.uint8]
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.intp]]:
+    """Return the mask of the reduced image, and from where in the whole image each of its bytes comes.
+
+    ``mask`` is that of the values.
+    """
+    old, new = StatusArea(whole), StatusArea(part)
+    kept, taken = np.zeros(part.size, np.uint8), np.zeros(part.size, np.intp)
+    kept[: len(mask)], taken[: len(mask)] = mask, np.arange(len(mask))
+    for index, register in enumerate(part.registers):
+        for of in (StatusArea.code_range, StatusArea.time_range):
+            (start, size), (to, _) = of(old, old.index(register)), of(new, index)
+            kept[to : to + size], taken[to : to + size] = 0xFF, np.arange(start, start + size)
+    return kept, taken
 
 
 class Selection:
@@ -59,8 +89,7 @@ class Selection:
         registers = tuple(register for register in block.layout.registers if register.path in paths)
         if len(registers) == len(block.layout.registers):
             return RecordedRegisters(block.layout)
-        mask = np.frombuffer(covering(registers, block.layout.size), np.uint8)
-        return RecordedRegisters(replace(block.layout, registers=registers), mask) if registers else None
+        return RecordedRegisters(block.layout, registers) if registers else None
 
     def nothing(self, layouts: Mapping[str, Layout]) -> list[str]:
         """Return a message for each selected source or pattern that does not exist.

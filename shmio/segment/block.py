@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 from shmio.errors import SegmentError
+from shmio.model.statuses import StatusArea, status_area
 from shmio.model.values import Provenance, Quality
 from shmio.segment._atomics import REASON_SIZE, Ring
 from shmio.segment.events import Event, EventKind, Record, decode_event
@@ -294,6 +295,11 @@ class Block:
             FormatError: The layout is inconsistent.
         """
         return self._load_layout()
+
+    @property
+    def statuses(self) -> StatusArea | None:
+        """The status area of the block's images; None if its source gives registers no status."""
+        return status_area(self.layout)
 
     @property
     def retired(self) -> bool:

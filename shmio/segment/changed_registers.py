@@ -1,7 +1,8 @@
 """Find the registers that differ between two images of a block.
 
 Bytes are compared, not values: a NaN that stays the same has not changed, but 0.0 that became -0.0
-has. Of a BOOL only its bit is compared; padding is ignored.
+has. Of a BOOL only its bit is compared; padding is ignored. If the layout has a status area, a
+register has also changed if its status code has; its source time does not count.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from shmio.layout.model import Register
 from shmio.layout.values.write import bits_of
+from shmio.model.statuses import StatusArea
 from shmio.segment import _atomics
 
 _ENTRY = struct.Struct("=IIII")  # offset, size, mask, index: scan_entry in _atomics.c
@@ -19,8 +21,9 @@ _ENTRY = struct.Struct("=IIII")  # offset, size, mask, index: scan_entry in _ato
 class ChangeScan:
     """Compares two images over the given registers, in C. Immutable."""
 
-    def __init__(self, registers: Sequence[Register]) -> None:
-        self._table = b"".join(entries([register], index) for index, register in enumerate(registers))
+    def __init__(self, registers: Sequence[Register], statuses: StatusArea | None = None) -> None:
+        """Prepare the comparison of these registers; ``statuses`` is the status area of their layout."""
+        self._table = b"".join(entries([register], index, statuses) for index, register in enumerate(registers))
 
     @classmethod
     def joined(cls, parts: Iterable[bytes]) -> ChangeScan:
@@ -38,9 +41,13 @@ class ChangeScan:
         return _atomics.changed(old, new, self._table)
 
 
-def entries(registers: Iterable[Register], index: int) -> bytes:
+def entries(registers: Sequence[Register], index: int, statuses: StatusArea | None = None) -> bytes:
     """Encode the part of a scan that reports a change of any of these registers as ``index``."""
-    return b"".join(_ENTRY.pack(*run, index) for register in registers for run in runs(register))
+    found = [_ENTRY.pack(*run, index) for register in registers for run in runs(register)]
+    if statuses is not None:
+        indices = dict.fromkeys(statuses.indices(registers))
+        found += [_ENTRY.pack(*statuses.code_range(register), 0, index) for register in indices]
+    return b"".join(found)
 
 
 def runs(register: Register) -> Iterator[tuple[int, int, int]]:

@@ -41,10 +41,10 @@ typedef struct {
     uint32_t slot_count; /* a power of two */
     uint32_t slot_stride;
     uint32_t frame_size; /* bytes of one image */
-    uint32_t status_size;
+    uint32_t reserved3;
     uint32_t raw_offset; /* within a slot; RAW_OFFSET */
     uint32_t effective_offset; /* 0: slots have one image only */
-    uint32_t status_offset;
+    uint32_t reserved4;
     uint32_t reserved0;
     int64_t period_ns;
     int64_t stale_ns;

@@ -74,7 +74,7 @@ class GetLayoutsRequest(_message.Message):
     def __init__(self, sources: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class LayoutPart(_message.Message):
-    __slots__ = ("source", "section", "name", "number", "size", "big_endian", "hash", "period_ns", "stale_ns", "writable", "armed", "optimized", "registers", "last")
+    __slots__ = ("source", "section", "name", "number", "size", "big_endian", "hash", "period_ns", "stale_ns", "writable", "armed", "optimized", "registers", "last", "status_offset")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     SECTION_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
@@ -89,6 +89,7 @@ class LayoutPart(_message.Message):
     OPTIMIZED_FIELD_NUMBER: _ClassVar[int]
     REGISTERS_FIELD_NUMBER: _ClassVar[int]
     LAST_FIELD_NUMBER: _ClassVar[int]
+    STATUS_OFFSET_FIELD_NUMBER: _ClassVar[int]
     source: str
     section: int
     name: str
@@ -103,10 +104,11 @@ class LayoutPart(_message.Message):
     optimized: bool
     registers: _containers.RepeatedCompositeFieldContainer[Register]
     last: bool
-    def __init__(self, source: _Optional[str] = ..., section: _Optional[int] = ..., name: _Optional[str] = ..., number: _Optional[int] = ..., size: _Optional[int] = ..., big_endian: bool = ..., hash: _Optional[bytes] = ..., period_ns: _Optional[int] = ..., stale_ns: _Optional[int] = ..., writable: _Optional[_Iterable[str]] = ..., armed: bool = ..., optimized: bool = ..., registers: _Optional[_Iterable[_Union[Register, _Mapping]]] = ..., last: bool = ...) -> None: ...
+    status_offset: int
+    def __init__(self, source: _Optional[str] = ..., section: _Optional[int] = ..., name: _Optional[str] = ..., number: _Optional[int] = ..., size: _Optional[int] = ..., big_endian: bool = ..., hash: _Optional[bytes] = ..., period_ns: _Optional[int] = ..., stale_ns: _Optional[int] = ..., writable: _Optional[_Iterable[str]] = ..., armed: bool = ..., optimized: bool = ..., registers: _Optional[_Iterable[_Union[Register, _Mapping]]] = ..., last: bool = ..., status_offset: _Optional[int] = ...) -> None: ...
 
 class Register(_message.Message):
-    __slots__ = ("path", "type", "dims", "offset", "bit", "size", "count", "column", "slot", "comment", "initial")
+    __slots__ = ("path", "type", "dims", "offset", "bit", "size", "count", "column", "slot", "comment", "initial", "unit")
     PATH_FIELD_NUMBER: _ClassVar[int]
     TYPE_FIELD_NUMBER: _ClassVar[int]
     DIMS_FIELD_NUMBER: _ClassVar[int]
@@ -118,6 +120,7 @@ class Register(_message.Message):
     SLOT_FIELD_NUMBER: _ClassVar[int]
     COMMENT_FIELD_NUMBER: _ClassVar[int]
     INITIAL_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
     path: str
     type: str
     dims: _containers.RepeatedCompositeFieldContainer[Bounds]
@@ -129,7 +132,8 @@ class Register(_message.Message):
     slot: int
     comment: str
     initial: str
-    def __init__(self, path: _Optional[str] = ..., type: _Optional[str] = ..., dims: _Optional[_Iterable[_Union[Bounds, _Mapping]]] = ..., offset: _Optional[int] = ..., bit: _Optional[int] = ..., size: _Optional[int] = ..., count: _Optional[int] = ..., column: _Optional[_Union[Column, str]] = ..., slot: _Optional[int] = ..., comment: _Optional[str] = ..., initial: _Optional[str] = ...) -> None: ...
+    unit: str
+    def __init__(self, path: _Optional[str] = ..., type: _Optional[str] = ..., dims: _Optional[_Iterable[_Union[Bounds, _Mapping]]] = ..., offset: _Optional[int] = ..., bit: _Optional[int] = ..., size: _Optional[int] = ..., count: _Optional[int] = ..., column: _Optional[_Union[Column, str]] = ..., slot: _Optional[int] = ..., comment: _Optional[str] = ..., initial: _Optional[str] = ..., unit: _Optional[str] = ...) -> None: ...
 
 class Bounds(_message.Message):
     __slots__ = ("low", "high")
@@ -261,8 +265,18 @@ class Marks(_message.Message):
     registers: _containers.RepeatedScalarFieldContainer[int]
     def __init__(self, registers: _Optional[_Iterable[int]] = ...) -> None: ...
 
+class Statuses(_message.Message):
+    __slots__ = ("registers", "codes", "source_ns")
+    REGISTERS_FIELD_NUMBER: _ClassVar[int]
+    CODES_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_NS_FIELD_NUMBER: _ClassVar[int]
+    registers: _containers.RepeatedScalarFieldContainer[int]
+    codes: _containers.RepeatedScalarFieldContainer[int]
+    source_ns: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, registers: _Optional[_Iterable[int]] = ..., codes: _Optional[_Iterable[int]] = ..., source_ns: _Optional[_Iterable[int]] = ...) -> None: ...
+
 class Update(_message.Message):
-    __slots__ = ("table", "frame", "cycle", "incarnation", "clock_ns", "source_ns", "quality", "reason", "provenance", "missed", "whole", "values", "originals", "invalid", "injected", "image", "original", "age_ns", "pieces")
+    __slots__ = ("table", "frame", "cycle", "incarnation", "clock_ns", "source_ns", "quality", "reason", "provenance", "missed", "whole", "values", "originals", "invalid", "injected", "image", "original", "age_ns", "pieces", "statuses")
     TABLE_FIELD_NUMBER: _ClassVar[int]
     FRAME_FIELD_NUMBER: _ClassVar[int]
     CYCLE_FIELD_NUMBER: _ClassVar[int]
@@ -282,6 +296,7 @@ class Update(_message.Message):
     ORIGINAL_FIELD_NUMBER: _ClassVar[int]
     AGE_NS_FIELD_NUMBER: _ClassVar[int]
     PIECES_FIELD_NUMBER: _ClassVar[int]
+    STATUSES_FIELD_NUMBER: _ClassVar[int]
     table: int
     frame: int
     cycle: int
@@ -301,7 +316,8 @@ class Update(_message.Message):
     original: bytes
     age_ns: int
     pieces: _containers.RepeatedCompositeFieldContainer[Piece]
-    def __init__(self, table: _Optional[int] = ..., frame: _Optional[int] = ..., cycle: _Optional[int] = ..., incarnation: _Optional[int] = ..., clock_ns: _Optional[int] = ..., source_ns: _Optional[int] = ..., quality: _Optional[_Union[Quality, str]] = ..., reason: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, str]] = ..., missed: _Optional[int] = ..., whole: bool = ..., values: _Optional[_Union[Values, _Mapping]] = ..., originals: _Optional[_Union[Values, _Mapping]] = ..., invalid: _Optional[_Union[Marks, _Mapping]] = ..., injected: _Optional[_Union[Marks, _Mapping]] = ..., image: _Optional[bytes] = ..., original: _Optional[bytes] = ..., age_ns: _Optional[int] = ..., pieces: _Optional[_Iterable[_Union[Piece, _Mapping]]] = ...) -> None: ...
+    statuses: Statuses
+    def __init__(self, table: _Optional[int] = ..., frame: _Optional[int] = ..., cycle: _Optional[int] = ..., incarnation: _Optional[int] = ..., clock_ns: _Optional[int] = ..., source_ns: _Optional[int] = ..., quality: _Optional[_Union[Quality, str]] = ..., reason: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, str]] = ..., missed: _Optional[int] = ..., whole: bool = ..., values: _Optional[_Union[Values, _Mapping]] = ..., originals: _Optional[_Union[Values, _Mapping]] = ..., invalid: _Optional[_Union[Marks, _Mapping]] = ..., injected: _Optional[_Union[Marks, _Mapping]] = ..., image: _Optional[bytes] = ..., original: _Optional[bytes] = ..., age_ns: _Optional[int] = ..., pieces: _Optional[_Iterable[_Union[Piece, _Mapping]]] = ..., statuses: _Optional[_Union[Statuses, _Mapping]] = ...) -> None: ...
 
 class ReadRequest(_message.Message):
     __slots__ = ("patterns", "originals", "tables")

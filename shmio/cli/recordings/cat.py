@@ -24,6 +24,7 @@ from shmio.layout.topic import parse_topic
 from shmio.layout.values.codec import codec
 from shmio.layout.values.text import json_value, to_text
 from shmio.logs import printable
+from shmio.model.statuses import status_registers
 from shmio.recording.columns import heading
 from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, Channel, Gap, ProcessChange, StepMark
 from shmio.recording.reading.reader import Message, Reader
@@ -171,9 +172,9 @@ class View:
 
     def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
         self.source = channel.source
-        self.registers = registers
-        self.codecs = [codec(register, layout.byte_order) for register in registers]
-        self._scan = ChangeScan(registers)
+        self.registers = (*registers, *status_registers(layout, registers, times=False))
+        self.codecs = [codec(register, layout.byte_order) for register in self.registers]
+        self._scan = ChangeScan(self.registers)
         self._shown: Frame | None = None
 
     def news(self, frame: Frame) -> bool:

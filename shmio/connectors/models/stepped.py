@@ -17,10 +17,11 @@ from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters, QualityLog, Schedule
 from shmio.errors import PathError, SegmentError, ShmioError
 from shmio.layout.topic import Topic, find
-from shmio.layout.values.codec import RegisterCodec, Value, codec
+from shmio.layout.values.codec import RegisterCodec, Value
 from shmio.layout.values.write import Write
-from shmio.local.reading import holds_none
+from shmio.local.reading import holds_none, status_of
 from shmio.model.clock import Clock
+from shmio.model.statuses import trusted_codec
 from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Quality, Record, Segment
 from shmio.segment.clock import ClockPage
 
@@ -69,9 +70,8 @@ class Inputs:
             frame, reason = frames[block.source]
             value = None if frame is None else decoder.decode(frame.image)
             if holds_none(value):
-                missing.append(
-                    f"input {path} keeps its value: {block.source}: {reason or 'the bytes are not a valid value'}"
-                )
+                why = reason or _why_none(block, topic, frame)
+                missing.append(f"input {path} keeps its value: {block.source}: {why}")
             else:
                 values[path] = value
         return values, "; ".join(missing)
@@ -81,8 +81,14 @@ class Inputs:
             block = self._segment.blocks.get(topic.source)
             if block is None:
                 raise PathError(f"there is no source {topic.source!r} any more")
-            self._found[path] = block, codec(find(block.layout, topic.path), block.layout.byte_order)
+            self._found[path] = block, trusted_codec(find(block.layout, topic.path), block.layout)
         return self._found[path]
+
+
+def _why_none(block: Block, topic: Topic, frame: Frame | None) -> str:
+    """Return why the register of a good frame has no value."""
+    status = frame and status_of(block, find(block.layout, topic.path), frame)
+    return (status.reason if status else "") or "the bytes are not a valid value"
 
 
 def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:

@@ -6,12 +6,16 @@ from parts that all listeners share.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import dataclass
 from dataclasses import field as attribute
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, TypeVar
 
-from shmio.layout.model import Register
+from shmio.layout.model import Layout, Register
+from shmio.model.statuses import status_area
+from shmio.model.values import Quality
+
+M = TypeVar("M", bound=Sized)
 
 
 class BlockImage(Protocol):
@@ -74,6 +78,23 @@ class Subject:
     registers: tuple[Register, ...] = attribute(compare=False)
     encode: Encode = attribute(compare=False)
     changed: Callable[[SourceImage, SourceImage], bool] | None = attribute(default=None, compare=False)
+
+
+def unless_bad(
+    encode: Callable[[BlockImage], M | None], registers: Sequence[Register], layout: Layout
+) -> Callable[[BlockImage], M | None]:
+    """Return a function that encodes like ``encode``, but returns None if the source calls a register bad."""
+    area = status_area(layout)
+    if area is None:
+        return encode
+    indices = area.indices(registers)
+
+    def encode_unless_bad(image: BlockImage) -> M | None:
+        if any(area.quality(image.image, index) is Quality.BAD for index in indices):
+            return None
+        return encode(image)
+
+    return encode_unless_bad
 
 
 _SHORT: Final = [bytes((number,)) for number in range(0x80)]

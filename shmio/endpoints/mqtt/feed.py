@@ -75,7 +75,7 @@ class Feed:
         self._covered = self._injected
         self._injection_sequence = 0
         """Sequence number of the list of injections from which ``_covered`` was made."""
-        self._scan = ChangeScan([register for register, _ in chosen])
+        self._scan = ChangeScan([register for register, _ in chosen], block.statuses)
         self._outbox = outbox
         self._limited: dict[ValueChannel | FramesChannel, None] = {}
 

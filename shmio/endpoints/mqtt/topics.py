@@ -16,7 +16,8 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.topic import canonical_path, decode_segment, names_part
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.text import json_value, texts
-from shmio.local.reading import holds_none, injected, reading
+from shmio.local.reading import holds_none, injected, reading, status_of
+from shmio.model.statuses import worse
 from shmio.segment import Frame, FrameFollower, Provenance, Quality
 
 DEFAULT: Final = MqttTopic(match="**")
@@ -162,8 +163,10 @@ class RegisterChannel(_RuledChannel):
         return self._message(self._json(late=late) if self.json else self._text(), late=late)
 
     def _text(self) -> bytes:
-        frame = self._follower.frame
-        if frame is None or self._follower.quality is Quality.BAD:
+        follower = self._follower
+        frame = follower.frame
+        status = frame and status_of(follower.block, self._register, frame)
+        if frame is None or follower.quality is Quality.BAD or (status and status.quality is Quality.BAD):
             self._note(None)
             return b""
         value = self._decode(frame.image)
@@ -174,11 +177,13 @@ class RegisterChannel(_RuledChannel):
         follower = self._follower
         frame, quality, reason = follower.frame, follower.quality, follower.reason
         found = reading(follower.block, self._register, frame)
+        if frame is not None and (status := status_of(follower.block, self._register, frame)):
+            quality, reason = worse(quality, reason, status)
         if holds_none(found.value):
             quality, reason = Quality.BAD, reason or found.reason
         self._note(None if quality is Quality.BAD else found.value)
         value = json_value(found.value, self._register.element)
-        return _json_payload(value, quality, reason, found.provenance, frame, late=late)
+        return _json_payload(value, quality, reason, found.provenance, found.source_time, frame, late=late)
 
     def _note(self, value: Value) -> None:
         if self._deadband:
@@ -209,17 +214,28 @@ class StructureChannel(_RuledChannel):
         depth = path.count("/") + 1 if path else 0
         parts = [(register.path.split("/")[depth:], register) for register in registers]
         self._value = _members(parts, follower.block.layout)
+        area = follower.block.statuses
+        self._indices = [] if area is None else area.indices(registers)
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message. While the quality is bad, it has the last known values."""
+        """Make the message. While the quality is bad, it has the last known values.
+
+        If the source gives each register a status, the quality is that of the worst register.
+        """
         follower = self._follower
         block, frame = follower.block, follower.frame
         self._pause()
         value, provenance = None, Provenance.LIVE
+        quality, reason = follower.quality, follower.reason
         if frame is not None:
             provenance = Provenance.INJECTED if injected(block, self.registers, frame) else frame.provenance
             value = self._value(frame.image) if frame.source_ns else None
-        payload = _json_payload(value, follower.quality, follower.reason, str(provenance), frame, late=late)
+            if block.statuses is not None and frame.source_ns:
+                worst, status = block.statuses.worst(frame.raw, self._indices)
+                if status.quality < quality:
+                    quality, reason = status.quality, f"{block.layout.registers[worst].path}: {status.reason}"
+        source_time = frame.source_ns / 1e9 if frame and frame.source_ns else None
+        payload = _json_payload(value, quality, reason, str(provenance), source_time, frame, late=late)
         return self._message(payload, late=late)
 
 
@@ -275,14 +291,21 @@ class ClearedTopic:
 
 
 def _json_payload(
-    value: object, quality: Quality, reason: str, provenance: str, frame: Frame | None, *, late: bool
+    value: object,
+    quality: Quality,
+    reason: str,
+    provenance: str,
+    source_time: float | None,
+    frame: Frame | None,
+    *,
+    late: bool,
 ) -> bytes:
     """Encode a value as JSON, with its quality, source time, provenance and sequence number."""
     fields = {
         "value": value,
         "quality": str(quality),
         "reason": reason,
-        "source_time": frame.source_ns / 1e9 if frame and frame.source_ns else None,
+        "source_time": source_time,
         "provenance": provenance,
         "sequence": frame.number if frame else 0,
     }

@@ -32,6 +32,8 @@ class PendingImage:
             frame = self._block.read(number) or self._block.latest()
             self._frame = number
             self.image = bytearray(len(self.image)) if frame is None else bytearray(frame.image)
+            if (statuses := self._block.layout.status_offset) is not None:
+                self.image[statuses:] = bytes(len(self.image) - statuses)  # a written value is good
         self.mask = bytearray(len(self.mask))
 
     def put(self, event: Event) -> None:

@@ -109,7 +109,7 @@ class Injection(InjectionFollower):
         frame = feed.block.latest()
         self._base = InjectionBase(feed.block, frame.image if frame else b"")
         self._given_image = bytearray(self._base.given)
-        self._scan = ChangeScan(shape.registers)
+        self._scan = ChangeScan(shape.registers, feed.block.statuses)
         self._subjects: dict[Subject, None] = {}
         self._diverted, self._given = _Tap(), _Tap()
         self._laid = asyncio.get_running_loop().create_task(self._lay(name))

@@ -16,7 +16,7 @@ import grpc
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import Message
 
-from shmio.endpoints.grpc.encoding import BlockImage, Encode, Subject, delimited, varint
+from shmio.endpoints.grpc.encoding import BlockImage, Encode, Subject, delimited, unless_bad, varint
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.services.injection import Injection, ShadowKind, Shadows, shadow_path
 from shmio.endpoints.grpc.services.publish import Publisher, Request
@@ -57,13 +57,16 @@ def message_type(found: Shape) -> str:
 
 
 def encoder(found: Shape, layout: Layout) -> Encode:
-    """Return a function that encodes an image as a ROSMessage, or returns None for invalid bytes.
+    """Return a function that encodes an image as a ROSMessage.
+
+    It returns None for invalid bytes, and if the source calls a register bad.
 
     Raises:
         ValueRangeError: The topic is a structure without a message type.
 
     """
-    return _text(found.registers[0], layout) if found.whole else _structure(found, layout)
+    encode = _text(found.registers[0], layout) if found.whole else _structure(found, layout)
+    return unless_bad(encode, found.registers, layout)
 
 
 def read(data: wire.ROSMessage, found: Shape) -> Mapping[str, object]:

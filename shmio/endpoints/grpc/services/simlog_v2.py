@@ -20,7 +20,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.struct_pb2 import NULL_VALUE, ListValue
 from google.protobuf.struct_pb2 import Value as WireValue
 
-from shmio.endpoints.grpc.encoding import BlockImage, Subject, delimited, varint
+from shmio.endpoints.grpc.encoding import BlockImage, Subject, delimited, unless_bad, varint
 from shmio.endpoints.grpc.server.access import holder_of
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.server.limits import time_sliced
@@ -107,7 +107,9 @@ def subject(found: Shape, layout: Layout) -> Subject:
 
 
 def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessage | None]:
-    """Return a function that encodes an image as a message, or returns None for invalid bytes.
+    """Return a function that encodes an image as a message.
+
+    It returns None for invalid bytes, and if the source calls a register bad.
 
     Raises:
         ValueRangeError: The topic is too large or nested too deeply for a message.
@@ -126,7 +128,7 @@ def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessa
         value = serialise(picture.image)
         return None if value is None else EncodedMessage(time_stamp(picture.clock_ns), head + delimited(value))
 
-    return encode
+    return unless_bad(encode, found.registers, layout)
 
 
 def path_field(path: str) -> bytes:

@@ -157,6 +157,7 @@ def _layout_parts(block: Block) -> Iterator[wire.LayoutPart]:
             name=layout.name,
             number=layout.number,
             size=layout.size,
+            status_offset=layout.status_offset,
             big_endian=layout.byte_order == "big",
             hash=layout.hash,
             period_ns=block.period_ns,

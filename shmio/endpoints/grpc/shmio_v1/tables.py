@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -21,16 +21,18 @@ from shmio.endpoints.grpc.encoding import field, number
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values.codec import Buffer, Scalar, scalar_codec
 from shmio.layout.values.write import covering
+from shmio.model.statuses import StatusArea
 from shmio.model.values import Column
 from shmio.segment import Block, Event, Frame
 from shmio.segment.commands import NO_COMMAND, apply
 from shmio.segment.events import EVENT_DATA_SIZE
 from shmio.wire import shmio_v1_pb2 as wire
 
-VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, AGE_NS = (
+VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, AGE_NS, STATUSES = (
     wire.Update.DESCRIPTOR.fields_by_name[name].number
     for name in (
         "values", "originals", "invalid", "injected", "image", "original", "quality", "reason", "missed", "age_ns",
+        "statuses",
     )
 )  # fmt: skip
 
@@ -436,6 +438,7 @@ class Selection:
         self._decoded: OrderedDict[int, DecodedImage] = OrderedDict()
         self._updates: OrderedDict[tuple[int, int], UpdateMessage] = OrderedDict()
         self._injected_places: OrderedDict[int, Array] = OrderedDict()
+        self._status_indices: Array | None = None
 
     @cached_property
     def writes(self) -> WriteUpdates:
@@ -508,10 +511,43 @@ class Selection:
                 parts.append(field(VALUES, values))
             if old is None or new.invalid != old.invalid:
                 parts.append(field(INVALID, field(1, np.array(new.invalid, "<u4").tobytes())))
+            parts += self._statuses(frame, before, whole=old is None, changed=bool(parts))
         now = self.injected(frame)
         if before is None or (now is not (was := self.injected(before)) and not np.array_equal(now, was)):
             parts.append(field(INJECTED, field(1, now.tobytes())))
         return UpdateMessage(head(self.number, frame, whole=before is None), b"".join(parts))
+
+    def _statuses(self, frame: Frame, before: Frame | None, *, whole: bool, changed: bool) -> Iterator[bytes]:
+        """Yield the field with the statuses, if there are any and some have changed.
+
+        A change of source times alone counts only if the update has other changes: there would
+        be an update for each frame.
+        """
+        area = self.block.statuses
+        if area is None:
+            return
+        codes, times = self._status_columns(area, frame)
+        places = np.arange(len(codes))
+        if before is not None and not whole:
+            old_codes, old_times = self._status_columns(area, before)
+            differ = codes != old_codes
+            if not (changed or differ.any()):
+                return
+            places = np.flatnonzero(differ | (times != old_times))
+        if len(places):
+            columns = places.astype("<u4"), codes[places].astype("<u4"), times[places].astype("<i8")
+            yield field(STATUSES, b"".join(field(at, column.tobytes()) for at, column in enumerate(columns, 1)))
+
+    def _status_columns(self, area: StatusArea, frame: Frame) -> tuple[Array, Array]:
+        """Return the status codes and source times of the table's registers."""
+        layout = self.block.layout
+        order, count = ">" if layout.byte_order == "big" else "<", len(layout.registers)
+        if self._status_indices is None:
+            self._status_indices = np.array(area.indices(self.registers), np.intp)
+        return (
+            np.frombuffer(frame.raw, f"{order}u4", count, area.codes_offset)[self._status_indices],
+            np.frombuffer(frame.raw, f"{order}i8", count, area.times_offset)[self._status_indices],
+        )
 
     def originals(self, frame: Frame) -> bytes:
         """Return the serialised ``Values`` as the source delivered them."""
@@ -625,7 +661,7 @@ def describe(register: Register, found: wire.Register, column: Column | None = N
     found.path, found.type = register.path, register.type
     found.offset, found.size, found.count = register.offset, register.size, register.count
     found.column = int(column or column_of(register.element))  # type: ignore[assignment]
-    found.slot = slot
+    found.slot, found.unit = slot, register.unit
     if register.bit is not None:
         found.bit = register.bit
     for low, high in register.dims:

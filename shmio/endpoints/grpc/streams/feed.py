@@ -10,6 +10,7 @@ from shmio.endpoints.grpc.commands.command_client import CommandClient
 from shmio.endpoints.grpc.encoding import Subject
 from shmio.endpoints.grpc.streams.back_pressure import BackPressure, Stream
 from shmio.endpoints.grpc.wakeups import BatchReader, WakeUps
+from shmio.model.statuses import StatusArea
 from shmio.segment import Block, Event, Frame, FrameFollower, Quality, QualityChange, Segment
 from shmio.segment.changed_registers import ChangeScan, entries
 
@@ -74,12 +75,13 @@ class Listener(Protocol):
 class _Channel:
     """A subject that has listeners: encodes its value, and knows who gets it."""
 
-    def __init__(self, subject: Subject, slot: int) -> None:
+    def __init__(self, subject: Subject, slot: int, statuses: StatusArea | None) -> None:
         """Create a channel without listeners.
 
         Args:
             subject: The subject.
             slot: Index of the channel in the feed's table.
+            statuses: The status area of the block's images.
 
         """
         self.encode = subject.encode
@@ -89,7 +91,7 @@ class _Channel:
         self.order = first.offset, first.bit or 0, subject.path, subject.wire
         """Sort key: the changes of a step are delivered in the order of the block's registers."""
         self.changed = subject.changed
-        self.entries = b"" if self.changed else entries(subject.registers, slot)
+        self.entries = b"" if self.changed else entries(subject.registers, slot, statuses)
 
 
 class _ChannelTable(NamedTuple):
@@ -189,7 +191,7 @@ class Feed:
         channel = self._channels.get(subject)
         if channel is None:
             slot = self._free.pop() if self._free else len(self._channels)
-            channel = self._channels[subject] = _Channel(subject, slot)
+            channel = self._channels[subject] = _Channel(subject, slot, self.block.statuses)
             self._rebuild()
         channel.listeners[listener] = None
         self._back_pressure.join(listener.stream)
@@ -288,11 +290,15 @@ class Feed:
         """Drop the listeners' values from before ``frame``: from that frame on, the quality is bad."""
         self._shown = None
         for channel in self._channels.values():
-            for listener in channel.listeners:
-                if listener.since < frame:
-                    listener.lose()
-                    listener.since = 0  # the value may have been dropped
+            self._lose(channel, frame)
         self._tell(good=False)
+
+    def _lose(self, channel: _Channel, frame: int) -> None:
+        """Drop the values from before ``frame`` that wait in a channel's streams: they are no longer valid."""
+        for listener in channel.listeners:
+            if listener.since < frame:
+                listener.lose()
+                listener.since = 0  # the value may have been dropped
 
     def _rebuild(self) -> None:
         self._table = _ChannelTable.of(self._channels.values(), len(self._channels) + len(self._free))
@@ -361,6 +367,7 @@ class Feed:
         for channel in self._changes(shown, frame):
             message = channel.encode(frame)
             if message is None:
+                self._lose(channel, frame.number)
                 continue
             self.messages += 1
             for listener in channel.listeners:

@@ -12,6 +12,7 @@ from shmio.endpoints.mqtt.sparkplug.node import Metric, Sample, parts_of
 from shmio.layout.glob import Glob
 from shmio.layout.model import Register
 from shmio.layout.values.codec import codec
+from shmio.local.reading import reading
 from shmio.segment import Block, Frame, Quality, QualityChange
 from shmio.segment.changed_registers import ChangeScan
 
@@ -54,7 +55,7 @@ class Device:
         ]
         self.parts: tuple[Register, ...] = tuple(parts_of(block.layout, registers, single=elements))
         self._metrics: Sequence[Metric] = ()
-        self._scan = ChangeScan(self.parts)
+        self._scan = ChangeScan(self.parts, block.statuses)
         self._decoders = [codec(part, block.layout.byte_order).decode for part in self.parts]
         self._follower = follow(block)
 
@@ -91,11 +92,20 @@ class Device:
         frame = follower.frame
         if frame is None:
             return []
+        at = range(len(self.parts)) if at is None else at
+        if self.block.statuses is not None:
+            return [self._sample_with_status(one, frame) for one in at]
         at_ms = frame.source_ns // 1_000_000
         return [
             Sample(self._metrics[one], self._decoders[one](frame.image), at_ms, follower.quality, follower.reason)
-            for one in (range(len(self.parts)) if at is None else at)
+            for one in at
         ]
+
+    def _sample_with_status(self, one: int, frame: Frame) -> Sample:
+        """Return the sample of a metric whose register has a status of its own."""
+        found = reading(self.block, self.parts[one], frame, aged=False)
+        at_ms = round((found.source_time or 0) * 1000)
+        return Sample(self._metrics[one], self._decoders[one](frame.image), at_ms, found.quality, found.reason)
 
     def _take(self, frame: Frame) -> DeviceChange | None:
         old = self._follower.frame
