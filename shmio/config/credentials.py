@@ -39,11 +39,17 @@ class Secret(NamedTuple):
     digest: bytes
 
 
-def read_tokens(tokens: Sequence[Token]) -> tuple[Secret, ...]:
-    """Read all tokens; ConfigError names the key of an invalid token and never quotes it."""
+def read_tokens(tokens: Sequence[Token], section: str = "grpc.token") -> tuple[Secret, ...]:
+    """Read all tokens; ConfigError names the key of an invalid token and never quotes it.
+
+    Args:
+        tokens: The tokens.
+        section: Name of their section, for messages.
+
+    """
     found: dict[bytes, Secret] = {}
     for index, token in enumerate(tokens):
-        key = f"grpc.token[{index}]"
+        key = f"{section}[{index}]"
         digest = bytes.fromhex(token.sha256) if token.sha256 is not None else _read_token(key, str(token.token_file))
         if digest in found:
             raise ConfigError(f"{key}: the same token as that of {found[digest].name!r}; give each one of its own")

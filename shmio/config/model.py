@@ -316,6 +316,19 @@ class Mqtt(Section):
     sparkplug: Sparkplug | None = None
 
 
+class OpcUa(Section):
+    """``[opcua]``: the endpoint that serves the instance as an OPC UA address space."""
+
+    listen: Text
+    insecure: bool = False
+    certificate: Text | None = None
+    key: Text | None = None
+    trusted: list[Text] = []
+    anonymous: list[Text] | None = None
+    account: list[Token] = []
+    client: list[Client] = []
+
+
 class Config(Section):
     """The whole configuration, with the folder that its paths are relative to."""
 
@@ -325,6 +338,7 @@ class Config(Section):
     injection: list[Declaration] = []
     grpc: Grpc | None = None
     mqtt: Mqtt | None = None
+    opcua: OpcUa | None = None
     recorder: Recorder | None = None
     replay: Replay | None = None
     folder: str = "."

@@ -26,6 +26,7 @@ from shmio.config.model import (
     MqttAccount,
     MqttTls,
     MqttTopic,
+    OpcUa,
     Recorder,
     Replay,
     Section,
@@ -36,10 +37,11 @@ from shmio.config.model import (
     Trigger,
 )
 from shmio.config.mqtt import check_mqtt, resolve_mqtt
+from shmio.config.opcua import check_opcua, resolve_opcua
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
-SECTION_PROCESSES = frozenset({"broker", "grpc", "mqtt", "recorder", "supervisor", "web"})
+SECTION_PROCESSES = frozenset({"broker", "grpc", "mqtt", "opcua", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
 MAX_PROPERTIES_BYTES = 64 << 10
 MAX_DEPTH = 64
@@ -63,6 +65,9 @@ _TABLES: dict[str, type[Section]] = {
     "mqtt.tls": MqttTls,
     "mqtt.topic": MqttTopic,
     "mqtt.sparkplug": Sparkplug,
+    "opcua": OpcUa,
+    "opcua.account": Token,
+    "opcua.client": Client,
     "recorder": Recorder,
     "recorder.trigger": Trigger,
     "replay": Replay,
@@ -76,6 +81,8 @@ _SEVERAL = {
     "grpc.address",
     "mqtt.account",
     "mqtt.topic",
+    "opcua.account",
+    "opcua.client",
 }
 _SLIPPED = re.compile(r"[A-Za-z]:[\x00-\x1f\\]")  # a Windows path in double quotes, \t being a tab
 _DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file
@@ -218,11 +225,15 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     check_listening(config, faults.catching)
     with faults.catching():
         check_mqtt(config)
+    with faults.catching():
+        check_opcua(config)
     if config.grpc:
         with faults.catching():
             resolve(config.grpc, config)
     if config.mqtt:
         resolve_mqtt(config.mqtt, config)
+    if config.opcua:
+        resolve_opcua(config.opcua, config)
     return Examined(config, faults, broken)
 
 

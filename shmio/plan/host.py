@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Final
 
 from shmio import realtime
-from shmio.config import Config, Mqtt, UnixAddress, parse_address
+from shmio.config import Config, Mqtt, OpcUa, UnixAddress, parse_address
 from shmio.config.credentials import read_accounts, read_password, read_tokens
 from shmio.config.folder import unwritable
 from shmio.config.listening import encrypted
+from shmio.config.model import ROLES
+from shmio.config.opcua import check_library
 from shmio.config.tls import client_context, read_tls, server_context
 from shmio.endpoints.mqtt.broker.program import choose_broker, find_mosquitto
 from shmio.errors import ConfigError
@@ -53,6 +55,9 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
     if config.mqtt:
         with catching():
             _check_mqtt(config.mqtt)
+    if config.opcua:
+        with catching():
+            warnings += _check_opcua(config.opcua)
     return warnings
 
 
@@ -68,6 +73,26 @@ def _check_mqtt(mqtt: Mqtt) -> None:
             read_accounts(mqtt.password_file, mqtt.account)
     if not external:
         choose_broker(mqtt)
+
+
+def _check_opcua(opcua: OpcUa) -> Iterator[str]:
+    """Check the library and the files of the OPC UA endpoint; yield warnings."""
+    check_library()
+    from shmio.endpoints.opcua.certificates import (  # noqa: PLC0415  it needs the extra
+        application_uri,
+        read_certificates,
+        read_identity,
+    )
+
+    read_tokens(opcua.account, "opcua.account")
+    for name in opcua.trusted:
+        read_certificates("opcua.trusted", Path(name))
+    identity = read_identity(opcua)
+    if identity is not None and application_uri(identity[0]) is None:
+        yield (
+            f"opcua.certificate: {opcua.certificate}: it has no application URI (a URI among its subject alternative "
+            "names), without which many clients refuse it"
+        )
 
 
 def _check_group(name: str | None) -> None:
@@ -101,7 +126,7 @@ def _check_folder(key: str, folder: Path) -> list[str]:
 
 def exposure(config: Config) -> str | None:
     """Return a line on what other users of this host may do without authentication, or None."""
-    ways = [*_open_grpc(config), *_open_mqtt(config)]
+    ways = [*_open_grpc(config), *_open_mqtt(config), *_open_opcua(config)]
     users = other_users() if ways else []
     if not users:
         return None
@@ -151,6 +176,17 @@ def _open_mqtt(config: Config) -> Iterator[str]:
     free = any(account.name is None and "write" in account.roles for account in mqtt.account)
     if free and not (mqtt.tls and mqtt.tls.ca) and any(source.writable for source in config.source):
         yield f"write by MQTT at {mqtt.listen}"
+
+
+def _open_opcua(config: Config) -> Iterator[str]:
+    """Yield what clients without account and certificate may do by OPC UA."""
+    opcua = config.opcua
+    if opcua is None or opcua.trusted:
+        return
+    guarded = bool(opcua.account or opcua.client)
+    given = opcua.anonymous if opcua.anonymous is not None else [] if guarded else ROLES
+    if roles := [role for role in given if role != "read"]:
+        yield f"{_joined(roles)} by OPC UA at {opcua.listen}"
 
 
 def _joined(words: Iterable[str]) -> str:

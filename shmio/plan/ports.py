@@ -34,6 +34,8 @@ def check_listening(config: Config) -> None:
         listening += [(key, address.listen) for key, address in config.grpc.listening.items()]
     if config.mqtt and config.mqtt.listen:
         listening.append(("mqtt.listen", config.mqtt.listen))
+    if config.opcua:
+        listening.append(("opcua.listen", config.opcua.listen))
     seen: list[tuple[str, str, int, set[str]]] = []
     sockets: dict[UnixAddress, str] = {}
     for key, text in listening:

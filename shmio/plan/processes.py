@@ -14,7 +14,7 @@ from shmio.errors import ConfigError
 from shmio.layout.model import Layout
 from shmio.segment import Attributes, BlockSpec, Origin, ProcessSpec, segment_size
 
-RANKS: Final[Mapping[str, int]] = {"emulator": 0, "recorder": 0, "source": 1, "grpc": 2, "mqtt": 2}
+RANKS: Final[Mapping[str, int]] = {"emulator": 0, "recorder": 0, "source": 1, "grpc": 2, "mqtt": 2, "opcua": 2}
 """Order of start by kind: emulators, then sources, then endpoints.
 
 The recorder starts before the sources and stops after them, to record their last frames and events.
@@ -37,6 +37,7 @@ MODULES: Final[Mapping[str, str]] = {
     "emulator": "shmio.emulators",
     "grpc": "shmio.endpoints.grpc",
     "mqtt": "shmio.endpoints.mqtt",
+    "opcua": "shmio.endpoints.opcua",
     "recorder": "shmio.recorder",
 }
 """The module that each kind of process runs."""
@@ -190,6 +191,8 @@ def make_plan(
         sections.append(("grpc", "grpc", msgspec.to_builtins(config.grpc) | place))
     if config.mqtt and mode != "log":
         sections += _mqtt(config.mqtt)
+    if config.opcua and mode != "log":
+        sections.append(("opcua", "opcua", msgspec.to_builtins(config.opcua)))
     if config.recorder:
         paths = {"directory": config.path(config.recorder.directory), "config_file": config_file.resolve()}
         recorder = msgspec.to_builtins(config.recorder) | {key: str(path) for key, path in paths.items()}
@@ -216,6 +219,7 @@ def process_names(config: Config) -> list[str]:
     names = [emulator.name for emulator in config.emulator] + [source.name for source in config.source]
     names += ["grpc"] if config.grpc else []
     names += [name for name, _, _ in _mqtt(config.mqtt)] if config.mqtt else []
+    names += ["opcua"] if config.opcua else []
     return [*names, "recorder"] if config.recorder else names
 
 

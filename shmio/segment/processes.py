@@ -36,6 +36,7 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "emulator": ("cycles", "overruns"),
     "grpc": ("streams", "messages", "dropped", "published", "refused"),
     "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed"),
+    "opcua": ("sessions", "items", "writes", "refused"),
     "recorder": ("frames", "events", "missed", "bytes"),
 }
 """Names of a worker's counters, by kind of process, in the order of the report (at most 8)."""
@@ -47,7 +48,7 @@ GUEST_SLOTS: Final = 4
 They are the last slots of the table, and have the first command queues.
 """
 
-WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5}
+WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5, "opcua": 6}
 """Command queue of each process of the instance that sends commands, by its name.
 
 The name of such a process equals its kind.

@@ -1,0 +1,1 @@
+"""The OPC UA endpoint: serves the instance as an address space."""

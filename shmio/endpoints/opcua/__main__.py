@@ -1,0 +1,63 @@
+"""The process of the OPC UA endpoint."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import logging
+from typing import Final
+
+import msgspec
+
+from shmio import worker
+from shmio.config import OpcUa
+from shmio.config.opcua import EXTRA
+from shmio.errors import ConfigError
+from shmio.logs import LogRateLimit
+from shmio.worker import BEAT_S, Worker
+
+LOGGERS: Final = ("shmio.opcua", "asyncua", "asyncio")
+"""Loggers whose lines clients can cause; their rate is limited."""
+
+
+def run(worker: Worker) -> None:
+    """Serve clients until the worker is stopped."""
+    if importlib.util.find_spec("asyncua") is None:
+        raise ConfigError(EXTRA)
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs each client's every request
+    limits = {name: LogRateLimit(one_kind=name != "shmio.opcua") for name in LOGGERS}
+    for name, limit in limits.items():
+        logging.getLogger(name).addFilter(limit)
+    try:
+        asyncio.run(_serve(worker))
+    finally:
+        for name, limit in limits.items():
+            logging.getLogger(name).removeFilter(limit)
+
+
+async def _serve(worker: Worker) -> None:
+    from shmio.endpoints.opcua.endpoint import Endpoint  # noqa: PLC0415  it needs the extra
+
+    loop = asyncio.get_running_loop()
+    stopping = asyncio.Event()
+    worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
+    endpoint = Endpoint(worker.segment, worker.slot, msgspec.convert(worker.config, OpcUa))
+    starting = loop.create_task(endpoint.start())
+    while not starting.done():  # creating many nodes must not stop the heartbeat
+        await asyncio.wait((starting,), timeout=BEAT_S)
+        worker.report()
+    starting.result()
+    worker.log.info("serving opc.tcp://%s", endpoint.server.address)
+    worker.running()
+    while not stopping.is_set():
+        endpoint.follow_reloads()
+        worker.report(endpoint.counters)
+        try:
+            await asyncio.wait_for(stopping.wait(), BEAT_S)
+        except TimeoutError:
+            continue
+    await endpoint.stop()
+
+
+if __name__ == "__main__":
+    raise SystemExit(worker.main(run))

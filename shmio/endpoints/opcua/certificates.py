@@ -1,0 +1,73 @@
+"""The certificate files of the section ``[opcua]``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
+
+from shmio.config import OpcUa
+from shmio.errors import ConfigError
+
+MAX_PEM_BYTES: Final = 1 << 20
+MIN_KEY_BITS: Final = 2048
+
+
+def read_certificates(key: str, file: Path) -> list[x509.Certificate]:
+    """Return the certificates of a PEM or DER file; ConfigError."""
+    data = _read(key, file)
+    try:
+        if b"-----BEGIN" in data:
+            return list(x509.load_pem_x509_certificates(data))
+        return [x509.load_der_x509_certificate(data)]
+    except ValueError:
+        raise ConfigError(f"{key}: {file}: no usable certificate in PEM or DER") from None
+
+
+def read_identity(opcua: OpcUa) -> tuple[x509.Certificate, rsa.RSAPrivateKey] | None:
+    """Return the server's certificate and key, or None if it has none.
+
+    Raises:
+        ConfigError: A file is unusable, or the key is not that of the certificate.
+
+    """
+    if opcua.certificate is None or opcua.key is None:
+        return None
+    certificate = read_certificates("opcua.certificate", Path(opcua.certificate))[0]
+    data = _read("opcua.key", Path(opcua.key))
+    try:
+        load = serialization.load_pem_private_key if b"-----BEGIN" in data else serialization.load_der_private_key
+        key = load(data, password=None)
+    except (ValueError, TypeError):
+        raise ConfigError(f"opcua.key: {opcua.key}: no usable private key in PEM or DER, without a password") from None
+    if not isinstance(key, rsa.RSAPrivateKey) or key.key_size < MIN_KEY_BITS:
+        raise ConfigError(
+            f"opcua.key: {opcua.key}: the policies of OPC UA need an RSA key of {MIN_KEY_BITS} bits or more"
+        )
+    if key.public_key() != certificate.public_key():
+        raise ConfigError(f"opcua.key: {opcua.key}: not the key of opcua.certificate")
+    return certificate, key
+
+
+def application_uri(certificate: x509.Certificate) -> str | None:
+    """Return the application URI in a certificate, or None if it has none."""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return None
+    found = names.get_values_for_type(x509.UniformResourceIdentifier)
+    return found[0] if found else None
+
+
+def _read(key: str, file: Path) -> bytes:
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(MAX_PEM_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"{key}: {file}: {error.strerror}") from None
+    if len(data) > MAX_PEM_BYTES:
+        raise ConfigError(f"{key}: {file}: larger than {MAX_PEM_BYTES} bytes")
+    return data

@@ -1,0 +1,85 @@
+"""Sends clients' writes to one source, and waits for their outcomes."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from typing import Final
+
+from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, InFlightTable
+from shmio.errors import CommandError
+from shmio.layout.model import Register
+from shmio.layout.values.write import sizes
+from shmio.local.writer import REPLACED, RETIRED, PendingCommand, SourceWriter
+from shmio.segment import Block
+from shmio.segment.commands import End, worst
+
+ROOM_S: Final = 2.0
+"""How long a write waits for room among the commands that are under way."""
+
+
+class CommandClient:
+    """Sends commands to one source. Use it only in the event loop's thread, once it is created."""
+
+    def __init__(self, block: Block, writer: int) -> None:
+        """Prepare to send commands. For a large layout this takes seconds."""
+        self.block = block
+        self._source_writer = SourceWriter(block, writer)
+        self._source_writer.prepare()
+        self._in_flight = InFlightTable(writer)
+        self._events = block.events.cursor()
+        self._room = asyncio.Event()
+
+    def is_writable(self, register: Register) -> bool:
+        """Return whether the configuration allows writing all of a register, an element or a part."""
+        return self._source_writer.is_writable(register)
+
+    async def write(self, register: Register, value: object) -> End:
+        """Write a value, and wait until the device or an injection has taken it, or not.
+
+        Raises:
+            CommandError: The command was not sent.
+            ValueRangeError: The value does not fit the register; the command was not sent.
+
+        """
+        cost = CommandCost.of(sizes(register))
+        await self._await_room(cost)
+        return await self._sent(self._source_writer.submit({register.path: value}), cost)
+
+    async def lift(self, injection: int) -> End:
+        """Lift an injection. CommandError: the command was not sent."""
+        cost = CommandCost.of(())
+        await self._await_room(cost)
+        return await self._sent(self._source_writer.ask_to_lift(injection), cost)
+
+    async def _await_room(self, cost: CommandCost) -> None:
+        try:
+            async with asyncio.timeout(ROOM_S):
+                while self._in_flight and self._in_flight.open_events + cost.events > MAX_OPEN:
+                    self._room.clear()
+                    await self._room.wait()
+        except TimeoutError:
+            raise CommandError(f"{self.block.source}: too many commands are under way") from None
+        if self.block.retired:
+            raise CommandError(RETIRED)
+
+    async def _sent(self, command: PendingCommand, cost: CommandCost) -> End:
+        answer: asyncio.Future[Sequence[End]] = asyncio.get_running_loop().create_future()
+
+        def done(ends: Sequence[End]) -> None:
+            if not answer.done():
+                answer.set_result(ends)
+
+        self._in_flight.add(command, cost, done)
+        return worst(await answer)
+
+    def poll(self) -> None:
+        """Read new events, and end the commands whose outcome is known or overdue."""
+        while (event := self._events.poll()) is not None:
+            self._in_flight.hear(event)
+        if self._events.take_missed():
+            self._in_flight.hurry()
+        self._in_flight.expire()
+        if self._events.ended:
+            self._in_flight.end(REPLACED)
+        self._room.set()

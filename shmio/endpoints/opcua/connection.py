@@ -1,0 +1,269 @@
+"""A client's connection: the framing, the secure channel and the order of requests, with limits."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+from typing import Any, Final
+
+from asyncua import ua
+from asyncua.common.utils import Buffer, NotEnoughData, ServiceError
+from asyncua.server.binary_server_asyncio import OPCUAProtocol
+from asyncua.server.uaprocessor import UaProcessor
+from asyncua.ua.ua_binary import header_from_binary, struct_from_binary, uatcp_to_binary
+
+from shmio.logs import fields
+
+MAX_CONNECTIONS: Final = 100
+MAX_SESSIONS: Final = 100
+MAX_CHUNK_BYTES: Final = 65_535
+MAX_MESSAGE_BYTES: Final = 4 << 20
+MAX_WAITING: Final = 32
+"""Number of messages that wait from which on a connection is not read."""
+MAX_UNSENT_BYTES: Final = 1 << 20
+"""Bytes that wait for a client from which on its requests are not processed."""
+STUCK_S: Final = 30.0
+"""Time after which a client that does not read is disconnected."""
+ACTIVATION_S: Final = 10.0
+"""Time limit for a new client to activate a session."""
+
+_KINDS: Final = (b"HEL", b"OPN", b"MSG", b"CLO")
+_IDS = ua.ObjectIds
+_WITHOUT_SESSION: Final = frozenset({
+    _IDS.GetEndpointsRequest_Encoding_DefaultBinary, _IDS.FindServersRequest_Encoding_DefaultBinary,
+    _IDS.CloseSecureChannelRequest_Encoding_DefaultBinary,
+})  # fmt: skip
+_SESSIONS: Final = frozenset({
+    _IDS.CreateSessionRequest_Encoding_DefaultBinary, _IDS.ActivateSessionRequest_Encoding_DefaultBinary,
+    _IDS.CloseSessionRequest_Encoding_DefaultBinary,
+})  # fmt: skip
+_SERVED: Final = frozenset({
+    _IDS.ReadRequest_Encoding_DefaultBinary, _IDS.WriteRequest_Encoding_DefaultBinary,
+    _IDS.BrowseRequest_Encoding_DefaultBinary, _IDS.BrowseNextRequest_Encoding_DefaultBinary,
+    _IDS.TranslateBrowsePathsToNodeIdsRequest_Encoding_DefaultBinary,
+    _IDS.RegisterNodesRequest_Encoding_DefaultBinary, _IDS.UnregisterNodesRequest_Encoding_DefaultBinary,
+    _IDS.CallRequest_Encoding_DefaultBinary,
+    _IDS.CreateSubscriptionRequest_Encoding_DefaultBinary, _IDS.ModifySubscriptionRequest_Encoding_DefaultBinary,
+    _IDS.DeleteSubscriptionsRequest_Encoding_DefaultBinary, _IDS.TransferSubscriptionsRequest_Encoding_DefaultBinary,
+    _IDS.SetPublishingModeRequest_Encoding_DefaultBinary, _IDS.SetMonitoringModeRequest_Encoding_DefaultBinary,
+    _IDS.CreateMonitoredItemsRequest_Encoding_DefaultBinary, _IDS.ModifyMonitoredItemsRequest_Encoding_DefaultBinary,
+    _IDS.DeleteMonitoredItemsRequest_Encoding_DefaultBinary,
+    _IDS.PublishRequest_Encoding_DefaultBinary, _IDS.RepublishRequest_Encoding_DefaultBinary,
+})  # fmt: skip
+"""The services that a session has; all others, which could change the address space, are refused."""
+
+log = logging.getLogger("shmio.opcua")
+
+Fault = ua.StatusCodes
+
+
+class Processor(UaProcessor):
+    """Processes the requests of one connection."""
+
+    iserver: Any  # InternalServer of the module server, which imports this one
+    session: Any
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self._pass = asyncio.Event()
+        self._pass.set()
+
+    def can_send(self) -> bool:
+        """Return whether the client reads what it is sent."""
+        return self._pass.is_set() and not self._transport.is_closing()
+
+    def hold(self) -> None:
+        """Process no requests until :meth:`release`."""
+        self._pass.clear()
+
+    def release(self) -> None:
+        """Process requests again."""
+        self._pass.set()
+
+    async def proceed(self) -> None:
+        """Wait until the client reads what it is sent."""
+        await self._pass.wait()
+
+    def publish(self, result: ua.PublishResult, request: Any) -> None:
+        """Send a publication as the answer to a request for one."""
+        response = ua.PublishResponse()
+        response.Parameters = result
+        result.Results = request.results
+        self.send_response(request.requesthdr.RequestHandle, request.seqhdr, response)
+
+    def open_secure_channel(self, algohdr: Any, seqhdr: Any, body: Any) -> None:
+        """Open or renew a channel; the client's certificate must be trusted, if the configuration says so."""
+        access = self.iserver.access
+        certificate = self._connection.security_policy.peer_certificate
+        if self.encrypted and access.asks_certificates and not (certificate and access.trusts(certificate)):
+            raise ua.uaerrors.UaStatusCodeError(Fault.BadCertificateUntrusted)
+        super().open_secure_channel(algohdr, seqhdr, body)
+
+    @property
+    def encrypted(self) -> bool:
+        """Whether nobody else can read the channel."""
+        return bool(self._connection.security_policy.Mode == ua.MessageSecurityMode.SignAndEncrypt)
+
+    async def _process_message(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
+        try:
+            return await self._serve(typeid, requesthdr, seqhdr, body)
+        except (ServiceError, ua.uaerrors.UaStatusCodeError):
+            raise
+        except (NotEnoughData, RecursionError, UnicodeDecodeError, ua.UaError, ValueError, struct.error) as error:
+            log.warning("a request cannot be decoded: %s", type(error).__name__, extra=fields(peer=str(self.name)))
+            raise ServiceError(Fault.BadDecodingError) from None
+        except Exception:
+            log.exception("a request failed", extra=fields(peer=str(self.name)))
+            raise ServiceError(Fault.BadInternalError) from None
+
+    async def _serve(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
+        kind = typeid.Identifier if typeid.NamespaceIndex == 0 else None
+        if kind not in _WITHOUT_SESSION:
+            # Everybody may open a channel without security, to ask which ones there are. It is for nothing else.
+            if not self.encrypted and not self.iserver.plain_text:
+                raise ServiceError(Fault.BadSecurityPolicyRejected)
+            if kind not in _SESSIONS and kind not in _SERVED:
+                raise ServiceError(Fault.BadServiceUnsupported)
+        if kind == _IDS.CreateSessionRequest_Encoding_DefaultBinary and self.session is not None:
+            await self.session.close_session()  # asyncua would keep it for ever
+            self.session = None
+        elif kind == _IDS.ActivateSessionRequest_Encoding_DefaultBinary:
+            return await self._activate(typeid, requesthdr, seqhdr, body)
+        elif kind in _SERVED and self.session is not None:
+            session: Any = self.session
+            if not session.is_activated():
+                raise ServiceError(Fault.BadSessionNotActivated)
+            if requesthdr.AuthenticationToken != session.auth_token:
+                raise ServiceError(Fault.BadSessionIdInvalid)
+            if kind == _IDS.BrowseNextRequest_Encoding_DefaultBinary:
+                session.touch()
+                response = ua.BrowseNextResponse()
+                response.Results = session.browse_more(struct_from_binary(ua.BrowseNextParameters, body))
+                self.send_response(requesthdr.RequestHandle, seqhdr, response)
+                return True
+            if kind == _IDS.ModifyMonitoredItemsRequest_Encoding_DefaultBinary:
+                session.need("read")
+        return bool(await super()._process_message(typeid, requesthdr, seqhdr, body))
+
+    async def _activate(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
+        session: Any = self.session or self.iserver.lookup_external_session(requesthdr.AuthenticationToken)
+        if session is None or session.auth_token != requesthdr.AuthenticationToken:
+            raise ServiceError(Fault.BadSessionIdInvalid)
+        session.trusted_channel = self.encrypted or self.iserver.loopback
+        taken_over = self.session is None
+        try:
+            done = bool(await super()._process_message(typeid, requesthdr, seqhdr, body))
+        except BaseException:
+            if taken_over:
+                self.session = None
+            raise
+        for one in self.iserver.subscriptions.of(session):
+            session.attach(one, self.forward_publish_response, self.get_publish_request)
+        return done
+
+    def _should_close_session_on_transport_loss(self) -> bool:
+        session: Any = self.session
+        if session is None or not session.is_activated():
+            return session is not None
+        return not self.iserver.subscriptions.of(session)
+
+
+class Protocol(OPCUAProtocol):
+    """Receives messages: it bounds their size and number, and disconnects a client that sends anything else."""
+
+    iserver: Any  # InternalServer of the module server, which imports this one
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.messages: asyncio.Queue[tuple[Any, Any]] = asyncio.Queue()
+        self._received = bytearray()
+        self._greeted = False
+        self._paused = False
+        self._stuck: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Accept a connection, if there are not too many."""
+        super().connection_made(transport)
+        if self.transport is None:  # refused
+            return
+        self.processor: Any = Processor(self.iserver, self.transport, self.limits)
+        self.processor.set_policies(self.policies)
+        self.transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
+
+    def connection_lost(self, ex: BaseException | None) -> None:
+        """Clean up."""
+        if self._stuck is not None:
+            self._stuck.cancel()
+        if self.transport is not None:
+            super().connection_lost(ex)
+
+    def pause_writing(self) -> None:
+        """Stop processing requests of a client that does not read, and disconnect it after a while."""
+        if self.processor is not None:
+            self.processor.hold()
+        self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._drop, "it does not read what it is sent")
+
+    def resume_writing(self) -> None:
+        """Process requests again."""
+        if self._stuck is not None:
+            self._stuck.cancel()
+            self._stuck = None
+        if self.processor is not None:
+            self.processor.release()
+
+    def data_received(self, data: bytes) -> None:
+        """Split what comes into messages."""
+        self._received += data
+        while len(self._received) >= 8:
+            kind, chunk, size = struct.unpack_from("<3scI", self._received)
+            known = kind in _KINDS and chunk in (b"F", b"C", b"A") and (kind == b"HEL") != self._greeted
+            if not known or not (12 if self._greeted else 8) < size <= MAX_CHUNK_BYTES:
+                self._drop("it sends what is not OPC UA")
+                return
+            if len(self._received) < size:
+                return
+            self._greeted = True
+            message = Buffer(bytes(self._received[:size]))
+            del self._received[:size]
+            self.messages.put_nowait((header_from_binary(message), message))
+        if self.messages.qsize() > MAX_WAITING and not self._paused and self.transport is not None:
+            self._paused = True
+            self.transport.pause_reading()
+
+    async def _process_received_message_loop(self) -> None:
+        while True:
+            header, message = await self.messages.get()
+            if header is None:
+                return
+            if self._paused and self.messages.qsize() < MAX_WAITING // 2 and self.transport is not None:
+                self._paused = False
+                self.transport.resume_reading()
+            await self.processor.proceed()
+            try:
+                if not await self.processor.process(header, message):
+                    break
+            except ua.uaerrors.UaStatusCodeError as error:
+                self._fail(error.code)
+                break
+            except Exception as error:  # noqa: BLE001  what a client sends must not end anything but its connection
+                log.warning(
+                    "a client was disconnected: its message cannot be processed: %s",
+                    type(error).__name__, extra=fields(peer=str(self.peer_name)),
+                )  # fmt: skip
+                self._fail(Fault.BadTcpInternalError if header.MessageType == b"HEL" else Fault.BadDecodingError)
+                break
+            await asyncio.sleep(0)  # others come next
+        if self.transport is not None:
+            self.transport.close()
+
+    def _fail(self, code: int) -> None:
+        """Tell the client why it is disconnected."""
+        if self.transport is not None and not self.transport.is_closing():
+            self.transport.write(uatcp_to_binary(ua.MessageType.Error, ua.ErrorMessage(ua.StatusCode(code), "")))
+
+    def _drop(self, why: str) -> None:
+        log.warning("a client was disconnected: %s", why, extra=fields(peer=str(self.peer_name)))
+        self._received.clear()
+        if self.transport is not None:
+            self.transport.abort()

@@ -1,0 +1,246 @@
+"""The OPC UA server: asyncua's protocol stack, with this endpoint's nodes, sessions and limits."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from asyncua import Server as Library
+from asyncua import ua
+from asyncua.common.connection import TransportLimits
+from asyncua.common.utils import ServiceError
+from asyncua.crypto import uacrypto
+from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
+from asyncua.server.internal_server import InternalServer as LibraryInternalServer
+from asyncua.server.internal_session import InternalSession
+from asyncua.ua import ua_binary
+
+from shmio.config import Address, OpcUa
+from shmio.endpoints.opcua.access import Access
+from shmio.endpoints.opcua.certificates import application_uri, read_identity
+from shmio.endpoints.opcua.connection import (
+    ACTIVATION_S,
+    MAX_CHUNK_BYTES,
+    MAX_CONNECTIONS,
+    MAX_MESSAGE_BYTES,
+    MAX_SESSIONS,
+    Protocol,
+)
+from shmio.endpoints.opcua.session import MAX_CALLS, MAX_NODES, MAX_WRITES, Session
+from shmio.endpoints.opcua.space import Space
+from shmio.endpoints.opcua.subscriptions import Subscriptions
+from shmio.errors import EndpointError
+from shmio.version import __version__
+
+_ENCRYPTING: Final = (
+    ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
+    ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
+    ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
+)
+_OAEP: Final[dict[str, Callable[[Any, bytes], bytes]]] = {
+    "http://www.w3.org/2001/04/xmlenc#rsa-oaep": uacrypto.decrypt_rsa_oaep,
+    "http://opcfoundation.org/UA/security/rsa-oaep-sha2-256": uacrypto.decrypt_rsa_oaep_sha256,
+}
+"""Encryptions of passwords that are accepted; that of PKCS 1.5 tells an attacker too much."""
+_SHA1: Final = "http://www.w3.org/2000/09/xmldsig#rsa-sha1"
+_LIMITS: Final = {
+    "MaxNodesPerRead": MAX_NODES, "MaxNodesPerWrite": MAX_WRITES, "MaxNodesPerMethodCall": MAX_CALLS,
+    "MaxNodesPerBrowse": MAX_NODES, "MaxNodesPerTranslateBrowsePathsToNodeIds": MAX_NODES,
+    "MaxNodesPerRegisterNodes": MAX_NODES, "MaxMonitoredItemsPerCall": MAX_NODES,
+}  # fmt: skip
+
+log = logging.getLogger("shmio.opcua")
+
+
+@dataclass
+class Counters:
+    """Counts of what clients have done."""
+
+    writes: int = 0
+    refused: int = 0
+
+
+class InternalServer(LibraryInternalServer):
+    """What all connections share."""
+
+    time_task: Any
+
+    def __init__(self, instance: str, access: Access, address: Address, *, plain_text: bool) -> None:
+        self.counters = Counters()
+        self.subscriptions = Subscriptions()
+        self.access = access
+        self.loopback = address.loopback
+        self.plain_text = plain_text
+        """True if clients may use channels without security."""
+        self.space: Space
+        self.catch_up: Callable[[], object] = lambda: None
+        """Reads all new frames, so that clients read the newest values."""
+        super().__init__(user_manager=self)
+        self.instance = instance
+        self.allow_remote_admin = False
+        self.max_connections = MAX_CONNECTIONS
+        self.max_pending_activation_seconds = ACTIVATION_S
+        self.max_session_timeout_ms = 300_000
+
+    async def init(self, shelffile: Any = None) -> None:
+        """Create the standard's nodes and the instance's root."""
+        await super().init(shelffile)
+        self.space = Space(self.instance, self.aspace)
+
+    async def stop(self) -> None:
+        """Stop at once; the library would wait for its clock."""
+        if self.time_task is not None:
+            self.time_task.cancel()
+            await asyncio.wait((self.time_task,))
+            self.time_task = None
+        await super().stop()
+
+    def create_session(self, name: str, user: Any = None, external: bool = False) -> InternalSession:  # noqa: ARG002
+        """Create a session, if there are not too many."""
+        if len(self._external_sessions) >= MAX_SESSIONS:
+            raise ServiceError(ua.StatusCodes.BadTooManySessions)
+        return Session(self, self.aspace, self.subscription_service, name, external=external)
+
+    @property
+    def sessions(self) -> int:
+        """Number of sessions."""
+        return len(self._external_sessions)
+
+    def get_user(self, _server: Any, username: str | None, password: str | None, certificate: bytes | None) -> Any:
+        """Return the user with these credentials, or None."""
+        user = self.access.identify(username, password, certificate)
+        if user is None:
+            log.warning("a client was refused: %s", "wrong name or password" if username else "no role for it")
+        return user
+
+    def decrypt_user_token(self, isession: Any, token: ua.UserNameIdentityToken) -> tuple[str, str]:
+        """Return the name and the password that a client sends."""
+        name, secret = token.UserName or "", token.Password or b""
+        if not token.EncryptionAlgorithm:
+            if not isession.trusted_channel:
+                log.warning("a client sent its password where others can read it: have it replaced")
+                raise ServiceError(ua.StatusCodes.BadIdentityTokenRejected)
+            return name, secret.decode() if isinstance(secret, bytes) else str(secret)
+        decrypt = _OAEP.get(token.EncryptionAlgorithm)
+        if decrypt is None or self.private_key is None:
+            raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
+        plain = decrypt(self.private_key, secret)
+        (length,) = struct.unpack_from("<I", plain)
+        nonce = plain[4 + length - len(isession.nonce) : 4 + length]
+        if length < len(isession.nonce) or nonce != isession.nonce:  # recorded earlier, and sent again
+            raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
+        return name, plain[4 : 4 + length - len(isession.nonce)].decode()
+
+    def verify_x509_token(self, isession: Any, token: ua.X509IdentityToken, signature: ua.SignatureData) -> bytes:
+        """Check that a client has the key of its certificate."""
+        if signature.Algorithm == _SHA1:
+            raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
+        if not self.access.trusts(token.CertificateData):
+            raise ServiceError(ua.StatusCodes.BadIdentityTokenRejected)
+        return super().verify_x509_token(isession, token, signature)
+
+
+class _Listener(BinaryServer):
+    """Accepts connections."""
+
+    def _make_protocol(self) -> OPCUAProtocol:
+        return Protocol(
+            iserver=self.iserver,
+            policies=self._policies,
+            clients=self.clients,
+            closing_tasks=self.closing_tasks,
+            limits=self.limits,
+        )
+
+
+class Server(Library):
+    """The server of one instance. Use it only in the event loop's thread."""
+
+    iserver: InternalServer
+
+    def __init__(self, instance: str, config: OpcUa) -> None:
+        """Read certificates and accounts.
+
+        Raises:
+            ConfigError: A file is not usable.
+
+        """
+        identity = read_identity(config)
+        self.address = Address.parse(config.listen)
+        plain_text = identity is None or config.insecure
+        super().__init__(InternalServer(instance, Access(config), self.address, plain_text=plain_text))
+        self.name = f"shmio {instance}"
+        self.product_uri, self.manufacturer_name = "urn:shmio", "shmio"
+        self.application_type = ua.ApplicationType.Server
+        self.namespace = f"urn:shmio:{instance}"
+        self._application_uri = f"urn:shmio:{instance}:server"
+        policies = [ua.SecurityPolicyType.NoSecurity] if plain_text else []
+        if identity is not None:
+            self.iserver.certificate, self.iserver.private_key = identity
+            self._application_uri = application_uri(identity[0]) or self._application_uri
+            policies += _ENCRYPTING
+        self.set_security_policy(policies)
+        self._permission_ruleset = None  # each service asks for its role
+        tokens: list[type] = []
+        if self.iserver.access.anonymous or config.client:
+            tokens.append(ua.AnonymousIdentityToken)
+        if config.account:
+            tokens.append(ua.UserNameIdentityToken)
+        if config.client:
+            tokens.append(ua.X509IdentityToken)
+        self.set_identity_tokens(tokens or [ua.AnonymousIdentityToken])
+        host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
+        self.set_endpoint(f"opc.tcp://{host}:{self.address.port}/")
+        self.limits = TransportLimits(
+            MAX_CHUNK_BYTES, MAX_CHUNK_BYTES, MAX_MESSAGE_BYTES // MAX_CHUNK_BYTES + 1, MAX_MESSAGE_BYTES
+        )
+
+    async def init(self, shelf_file: Any = None) -> None:
+        """Create the standard's nodes."""
+        await super().init(shelf_file)
+        await self.register_namespace(self.namespace)
+        await self.set_build_info(
+            self.product_uri, self.manufacturer_name, "shmio", __version__, "0", datetime.now(UTC)
+        )
+        for name, most in _LIMITS.items():
+            node = ua.NodeId(getattr(ua.ObjectIds, f"Server_ServerCapabilities_OperationLimits_{name}"))
+            await self.get_node(node).write_value(most, ua.VariantType.UInt32)
+
+    async def start(self) -> None:
+        """Begin to listen. EndpointError: the address cannot be used."""
+        await self._setup_server_nodes()
+        await self.iserver.start()
+        listener = _Listener(self.iserver, self.address.host, self.address.port, self.limits)
+        listener.set_policies(self._policies)
+        try:
+            await listener.start()
+        except OSError as error:
+            await self.iserver.stop()
+            raise EndpointError(f"cannot listen on {self.address}: {error.strerror}") from None
+        self.bserver = listener
+
+    @property
+    def port(self) -> int:
+        """The port on which it listens."""
+        return self.bserver.port if self.bserver is not None else 0
+
+
+def bound_decoding() -> None:
+    """Make the library refuse arrays of nothing.
+
+    Each element of such an array takes no byte of the message, so that a short message could fill
+    the memory.
+    """
+    original = ua_binary.unpack_uatype_array
+
+    def unpack(vtype: Any, data: Any) -> Any:
+        if vtype == ua.VariantType.Null:
+            raise ua.uaerrors.UaStatusCodeError(ua.StatusCodes.BadDecodingError)
+        return original(vtype, data)
+
+    ua_binary.unpack_uatype_array = unpack

@@ -1,0 +1,258 @@
+"""The address space: the standard's own nodes, which asyncua has, and those of the instance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from asyncua import ua
+from asyncua.common.utils import ServiceError
+from asyncua.server.address_space import AddressSpace, NodeData
+
+from shmio.endpoints.opcua.feed import Feed, Watch
+from shmio.endpoints.opcua.nodes import (
+    NAMESPACE,
+    OBJECTS,
+    ROOT,
+    Method,
+    Node,
+    RegisterNode,
+    Roles,
+    SourceNode,
+    VariableNode,
+)
+from shmio.errors import PathError
+from shmio.layout.topic import find
+
+MAX_IDENTIFIER: Final = 4096
+"""Maximum number of characters of a node id that is looked up."""
+_ANY: Final = ua.NodeId()
+
+Reference = Any  # ua.ReferenceDescription
+
+
+class Space:
+    """All nodes that clients see. Use it only in the event loop's thread."""
+
+    def __init__(self, instance: str, standard: AddressSpace) -> None:
+        self.root = Node(ROOT, instance, None)
+        self.sources: dict[str, SourceNode] = {}
+        self._standard = standard
+        self._static: dict[tuple[ua.NodeId, int], StaticWatch] = {}
+        self._supertypes: dict[ua.NodeId, frozenset[ua.NodeId]] = {}
+        standard[OBJECTS].references.append(self.root.description())
+
+    def add(self, source: SourceNode) -> None:
+        """Add a source; it continues the watches of one with the same name."""
+        before = self.sources.get(source.name)
+        self.sources[source.name] = self.root.children[source.name] = source
+        if before is not None:
+            self._move(before.feed, source)
+
+    def remove(self, name: str) -> None:
+        """Remove a source. Clients that monitor its variables see that they are unknown."""
+        source = self.sources.pop(name)
+        del self.root.children[name]
+        for watch in source.feed.watches:
+            source.feed.adopt(watch, None, None)
+
+    def _move(self, old: Feed, source: SourceNode) -> None:
+        for watch in old.watches:
+            node = self.find(ua.NodeId(watch.key, NAMESPACE))
+            if isinstance(node, RegisterNode):
+                source.feed.adopt(watch, node.register.path, node.value)
+            else:
+                source.feed.adopt(watch, None, node.value if isinstance(node, VariableNode) else None)
+
+    # ---- look up -----------------------------------------------------------------------------------------------------
+
+    def find(self, node_id: ua.NodeId) -> Node | None:
+        """Return a node of the instance by its id; elements, slices and bits of registers, too."""
+        if node_id.NamespaceIndex != NAMESPACE:
+            return None
+        if node_id == ROOT:
+            return self.root
+        text = node_id.Identifier
+        if not isinstance(text, str) or len(text) > MAX_IDENTIFIER:
+            return None
+        path, mark, name = text.partition("#")
+        if not path:
+            return self.root.children.get(f"#{name}") if mark else None
+        first, _, rest = path.partition("/")
+        source = self.sources.get(first)
+        if source is None:
+            return None
+        node = source.by_path.get(rest) or self._part(source, rest)
+        if not mark or node is None:
+            return node
+        owner, inner, last = name.partition("#")
+        named = getattr(node, "property_named", lambda _: None)(owner)
+        return named.property_named(last) if inner and isinstance(named, Method) else None if inner else named
+
+    def _part(self, source: SourceNode, path: str) -> Node | None:
+        """Return the node of an element, a slice or a bit, which clients can use but do not browse."""
+        try:
+            register = find(source.feed.block.layout, path)
+        except PathError:
+            return None
+        if register.path != path:
+            return None  # one node has one id
+        holder: Node | None = None
+        above = path
+        while holder is None:
+            above = above.rpartition("/")[0]
+            holder = source.by_path.get(above)
+        name = path.rpartition("/")[2]
+        return RegisterNode(ua.NodeId(f"{source.name}/{path}", NAMESPACE), name, holder, source.feed, register)
+
+    def knows(self, node_id: ua.NodeId) -> bool:
+        """Return whether there is such a node."""
+        return self.find(node_id) is not None or node_id in self._standard
+
+    def read(self, node_id: ua.NodeId, attribute: int, roles: Roles) -> ua.DataValue:
+        """Return an attribute of a node."""
+        node = self.find(node_id)
+        if node is not None:
+            return node.read(attribute, roles)
+        return self._standard.read_attribute_value(node_id, attribute)
+
+    # ---- references --------------------------------------------------------------------------------------------------
+
+    def references(self, node_id: ua.NodeId) -> Iterator[Reference] | None:
+        """Return the references of a node, or None if there is no such node."""
+        node = self.find(node_id)
+        if node is not None:
+            return node.references()
+        found: NodeData | None = self._standard.get(node_id)
+        return None if found is None else iter(found.references)
+
+    def browse(self, asked: ua.BrowseDescription) -> Iterator[Reference] | None:
+        """Return the references of a node that a client asks for, or None if there is no such node."""
+        found = self.references(asked.NodeId)
+        return None if found is None else (one for one in found if self._suits(asked, one))
+
+    def _suits(self, asked: ua.BrowseDescription, reference: Reference) -> bool:
+        if asked.BrowseDirection == ua.BrowseDirection.Forward and not reference.IsForward:
+            return False
+        if asked.BrowseDirection == ua.BrowseDirection.Inverse and reference.IsForward:
+            return False
+        if asked.NodeClassMask and not asked.NodeClassMask & reference.NodeClass:
+            return False
+        return self._is_type(reference.ReferenceTypeId, asked.ReferenceTypeId, subtypes=asked.IncludeSubtypes)
+
+    def _is_type(self, reference: ua.NodeId, asked: ua.NodeId, *, subtypes: bool) -> bool:
+        if asked in (_ANY, reference):
+            return True
+        return subtypes and asked in self._above(reference)
+
+    def _above(self, reference: ua.NodeId) -> frozenset[ua.NodeId]:
+        """Return the types of which a reference type is a subtype."""
+        if reference not in self._supertypes:
+            above, at = set[ua.NodeId](), reference
+            while (data := self._standard.get(at)) is not None:
+                parents = [
+                    one.NodeId for one in data.references
+                    if not one.IsForward and one.ReferenceTypeId == ua.NodeId(ua.ObjectIds.HasSubtype)
+                ]  # fmt: skip
+                if not parents or parents[0] in above:
+                    break
+                at = parents[0]
+                above.add(at)
+            self._supertypes[reference] = frozenset(above)
+        return self._supertypes[reference]
+
+    def follow(self, start: ua.NodeId, elements: list[ua.RelativePathElement]) -> list[ua.NodeId]:
+        """Return the nodes at the end of a path of browse names.
+
+        Raises:
+            ServiceError: There is no such start, or a name is empty.
+
+        """
+        if not elements or any(not element.TargetName or not element.TargetName.Name for element in elements):
+            raise ServiceError(ua.StatusCodes.BadBrowseNameInvalid)
+        if not self.knows(start):
+            raise ServiceError(ua.StatusCodes.BadNodeIdUnknown)
+        found = [start]
+        for element in elements:
+            found = [target for node in found for target in self._targets(node, element)]
+        return found
+
+    def _targets(self, node_id: ua.NodeId, element: ua.RelativePathElement) -> Iterator[ua.NodeId]:
+        for reference in self.references(node_id) or ():
+            if (
+                reference.BrowseName == element.TargetName
+                and reference.IsForward != element.IsInverse
+                and self._is_type(reference.ReferenceTypeId, element.ReferenceTypeId, subtypes=element.IncludeSubtypes)
+            ):
+                yield reference.NodeId
+
+    # ---- changes -----------------------------------------------------------------------------------------------------
+
+    def watch(self, node_id: ua.NodeId, attribute: int, roles: Roles) -> tuple[Watch, float]:
+        """Return the watch of an attribute, and the shortest time between two changes in ms.
+
+        Raises:
+            ServiceError: There is no such node or attribute.
+
+        """
+        node = self.find(node_id)
+        if isinstance(node, VariableNode) and attribute == ua.AttributeIds.Value:
+            found = node.watch()
+            if found is not None:
+                return found, node.period_ms
+        value = self.read(node_id, attribute, roles)
+        if value.StatusCode is not None and value.StatusCode.value in (
+            ua.StatusCodes.BadNodeIdUnknown,
+            ua.StatusCodes.BadAttributeIdInvalid,
+        ):
+            raise ServiceError(value.StatusCode.value)
+        key = (node_id, attribute)
+        if key not in self._static:
+            self._static[key] = StaticWatch(
+                self, key, None if node is not None else self._standard, lambda: self.read(node_id, attribute, roles)
+            )
+        return self._static[key], 0.0
+
+    def forget(self, key: tuple[ua.NodeId, int]) -> None:
+        """Forget a watch that has no listeners."""
+        self._static.pop(key, None)
+
+
+class StaticWatch(Watch):
+    """The changes of an attribute of one of the standard's nodes, or of one that never changes."""
+
+    __slots__ = ("_handle", "_node", "_space", "_standard")
+
+    def __init__(
+        self,
+        space: Space,
+        node: tuple[ua.NodeId, int],
+        standard: AddressSpace | None,
+        get: Callable[[], ua.DataValue],
+    ) -> None:
+        super().__init__(_Unfollowed(), str(node), get)  # type: ignore[arg-type]  # it has what a watch needs of a feed
+        self._space, self._node, self._standard = space, node, standard
+        self._handle = 0
+        if standard is not None:
+            _, self._handle = standard.add_datachange_callback(*node, self._changed)
+
+    async def _changed(self, _handle: int, _value: Any, _error: Any = None) -> None:
+        self.changed()
+
+    def remove(self, listener: Any) -> None:
+        """Tell a listener about changes no longer; the watch ends with its last one."""
+        self.listeners.pop(listener, None)
+        if not self.listeners:
+            if self._standard is not None:
+                self._standard.delete_datachange_callback(self._handle)
+            self._space.forget(self._node)
+
+
+class _Unfollowed:
+    """Takes the place of a feed, for watches of attributes that no source changes."""
+
+    def count(self) -> None:
+        """Do nothing."""
+
+    def release(self, watch: Watch) -> None:
+        """Do nothing."""

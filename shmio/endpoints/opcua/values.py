@@ -1,0 +1,145 @@
+"""Values of registers for OPC UA: data types, units, and the state of a register in a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final, NamedTuple
+
+from asyncua import ua
+
+from shmio.layout.model import NUMBERS, Register
+from shmio.layout.values.codec import Value, codec
+from shmio.local.reading import holds_none
+from shmio.model.statuses import (
+    BAD_WAITING_FOR_INITIAL_DATA,
+    GOOD,
+    quality_of,
+    status_area,
+)
+from shmio.segment import Block, Frame, FrameFollower, Provenance, Quality
+
+BAD_DECODING_ERROR: Final = 0x80070000
+BAD_NO_COMMUNICATION: Final = 0x80310000
+BAD_OUT_OF_SERVICE: Final = 0x808D0000
+UNCERTAIN: Final = 0x40000000
+GOOD_LOCAL_OVERRIDE: Final = 0x00960000
+"""The status of an injected value (OPC 10000-8, section 6.3): it does not come from the device."""
+
+_TYPES: Final = {
+    ua.VariantType.Boolean: ("BOOL",),
+    ua.VariantType.Byte: ("BYTE", "USINT"),
+    ua.VariantType.SByte: ("SINT",),
+    ua.VariantType.UInt16: ("WORD", "UINT"),
+    ua.VariantType.Int16: ("INT",),
+    ua.VariantType.UInt32: ("DWORD", "UDINT", "S5TIME", "TIME_OF_DAY"),
+    ua.VariantType.Int32: ("DINT", "TIME"),
+    ua.VariantType.UInt64: ("LWORD", "ULINT", "LTOD"),
+    ua.VariantType.Int64: ("LINT", "LTIME"),
+    ua.VariantType.Float: ("REAL",),
+    ua.VariantType.Double: ("LREAL",),
+}
+_TYPE_OF: Final = {name: found for found, names in _TYPES.items() for name in names}
+"""The data type of each elementary type; all others are texts, as everywhere in shmio."""
+
+_UNITS: Final = {
+    "%": "P1", "1/min": "RPM", "1/s": "C97", "A": "AMP", "Hz": "HTZ", "K": "KEL", "N": "NEW", "Nm": "NU", "Pa": "PAL",
+    "V": "VLT", "W": "WTT", "bar": "BAR", "cm": "CMT", "deg": "DD", "g": "GRM", "h": "HUR", "kHz": "KHZ", "kN": "B47",
+    "kPa": "KPA", "kV": "KVT", "kW": "KWT", "kWh": "KWH", "kg": "KGM", "km": "KMT", "l": "LTR", "l/min": "L2",
+    "m": "MTR", "m/s": "MTS", "m/s2": "MSK", "m3": "MTQ", "m3/h": "MQH", "mA": "4K", "mV": "2Z", "mbar": "MBR",
+    "min": "MIN", "mm": "MMT", "mm/s": "C16", "ms": "C26", "rad": "C81", "rad/s": "2A", "rpm": "RPM", "s": "SEC",
+    "°": "DD", "°C": "CEL", "°F": "FAH", "µm": "4H", "Ω": "OHM",
+}  # fmt: skip
+"""UNECE common codes of units (OPC 10000-8, section 5.6.3)."""
+_UNECE: Final = "http://www.opcfoundation.org/UA/units/un/cefact"
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def data_type(register: Register) -> ua.VariantType:
+    """Return the data type of a register or of its elements."""
+    return _TYPE_OF.get(register.element.base, ua.VariantType.String)
+
+
+def is_number(register: Register) -> bool:
+    """Return whether a register holds numbers."""
+    return register.element.base in NUMBERS
+
+
+def dimensions(register: Register) -> list[int]:
+    """Return the sizes of an array's dimensions; empty for a scalar."""
+    return list(register.shape) if register.dims else []
+
+
+def variant(register: Register, value: Value) -> ua.Variant:
+    """Return a register's value as OPC UA sends it."""
+    sizes = dimensions(register)
+    return ua.Variant(value, data_type(register), sizes if len(sizes) > 1 else None, is_array=bool(sizes))
+
+
+def unit(text: str, namespace: str) -> ua.EUInformation:
+    """Return a unit; one without a UNECE code is in the instance's namespace."""
+    code = _UNITS.get(text)
+    name = ua.LocalizedText(text)
+    if code is None:
+        return ua.EUInformation(namespace, -1, name, name)
+    return ua.EUInformation(_UNECE, int.from_bytes(code.encode(), "big"), name, name)
+
+
+def moment(ns: int) -> datetime:
+    """Return a time as OPC UA sends it."""
+    return _EPOCH + timedelta(microseconds=ns // 1000)
+
+
+class RegisterState(NamedTuple):
+    """State of a register in a frame.
+
+    Attributes:
+        value: The value; None while the status is bad.
+        code: The OPC UA status code.
+        source_ns: UTC time of the value at its origin, in ns since 1970; 0: unknown.
+    """
+
+    value: Value
+    code: int
+    source_ns: int
+
+
+def register_state(follower: FrameFollower, register: Register, injected: Sequence[Any] = ()) -> RegisterState:
+    """Return the present state of a register, an element or a part.
+
+    Args:
+        follower: Follows the block, and knows the last frame.
+        register: The register, element or part.
+        injected: The injections over ``/out`` that the frame shows.
+    """
+    block, frame = follower.block, follower.frame
+    code = block_status(block, frame)
+    if frame is None or quality_of(code) is Quality.BAD:
+        return RegisterState(None, code, 0 if frame is None else frame.source_ns)
+    source_ns = frame.source_ns
+    if (area := status_area(block.layout)) is not None:
+        status = area.get(frame.image, area.index(register))
+        source_ns = status.source_ns or source_ns
+        if status.quality is Quality.BAD:
+            return RegisterState(None, status.code, source_ns)
+        code = code or status.code
+    value = codec(register, block.layout.byte_order).decode(frame.image)
+    if holds_none(value):
+        return RegisterState(None, BAD_DECODING_ERROR, source_ns)
+    if code == GOOD and frame.effective is not None and any(one.covers(register) for one in injected):
+        code = GOOD_LOCAL_OVERRIDE
+    return RegisterState(value, code, source_ns)
+
+
+def block_status(block: Block, frame: Frame | None) -> int:
+    """Return the status code that a block's present quality gives all its registers."""
+    if frame is None:
+        return BAD_WAITING_FOR_INITIAL_DATA
+    quality, _ = block.assess(frame)
+    if quality is Quality.BAD:
+        if frame.quality is not Quality.BAD:  # it is stale: its source has stopped publishing
+            return BAD_OUT_OF_SERVICE
+        return BAD_NO_COMMUNICATION if frame.provenance is Provenance.LIVE else BAD_OUT_OF_SERVICE
+    if frame.source_ns == 0:
+        return BAD_WAITING_FOR_INITIAL_DATA
+    return UNCERTAIN if quality is Quality.UNCERTAIN else GOOD
