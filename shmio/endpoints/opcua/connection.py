@@ -139,7 +139,7 @@ class Processor(UaProcessor):
             if kind == _IDS.BrowseNextRequest_Encoding_DefaultBinary:
                 session.touch()
                 response = ua.BrowseNextResponse()
-                response.Results = session.browse_more(struct_from_binary(ua.BrowseNextParameters, body))
+                response.Parameters.Results = session.browse_more(struct_from_binary(ua.BrowseNextParameters, body))
                 self.send_response(requesthdr.RequestHandle, seqhdr, response)
                 return True
             if kind == _IDS.ModifyMonitoredItemsRequest_Encoding_DefaultBinary:

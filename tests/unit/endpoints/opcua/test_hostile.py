@@ -20,7 +20,7 @@ HELLO = ua.Hello(0, 65535, 65535, 0, 0, "opc.tcp://127.0.0.1/")
 
 
 def hello() -> bytes:
-    body = struct_to_binary(HELLO)
+    body: bytes = struct_to_binary(HELLO)
     return b"HELF" + struct.pack("<I", 8 + len(body)) + body
 
 
@@ -114,7 +114,9 @@ def test_a_client_cannot_use_the_subscriptions_or_the_session_of_another_one(seg
             assert taken.StatusCode.name == "BadSubscriptionIdInvalid"
             one.publish(image(step=2))
             await changes.until("cell/step", lambda value: value.Value.Value == 2)
-            tokens = {session.auth_token.Identifier for session in one.endpoint.server.iserver._external_sessions.values()}
+            tokens = {
+                session.auth_token.Identifier for session in one.endpoint.server.iserver._external_sessions.values()
+            }
             assert all(isinstance(token, bytes) and len(token) == 32 for token in tokens)
 
     serve(segment, test)
@@ -170,7 +172,7 @@ def test_services_that_would_change_the_address_space_are_refused(segment: Segme
     serve(segment, test)
 
 
-def test_a_client_that_does_not_read_does_not_fill_the_memory(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_does_not_read_is_disconnected(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shmio.endpoints.opcua.connection.STUCK_S", 0.3)
 
     async def test(one: Served) -> None:

@@ -15,7 +15,6 @@ SMALLER = Layout(
 )  # fmt: skip
 
 
-
 def follows(one: Served) -> bool:
     """Let the endpoint look for a reload, as its process does all the time."""
     one.endpoint.follow_reloads()
