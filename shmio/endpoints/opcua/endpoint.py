@@ -9,6 +9,7 @@ from functools import partial
 
 from shmio.config import OpcUa
 from shmio.endpoints.opcua.feed import Feed
+from shmio.endpoints.opcua.methods import Stepping, add_injections, add_step
 from shmio.endpoints.opcua.nodes import SourceNode
 from shmio.endpoints.opcua.server import Server, bound_decoding
 from shmio.segment import ProcessSlot, Segment
@@ -39,6 +40,8 @@ class Endpoint:
         """Create the nodes, and begin to listen. EndpointError: the address cannot be used."""
         await self.server.init()
         self.server.iserver.catch_up = self.poll
+        self._stepping = Stepping(self._segment)
+        add_step(self.server.iserver.space.root, self._stepping)
         self._add(await asyncio.to_thread(self._read, ()))
         await self.server.start()
 
@@ -66,6 +69,8 @@ class Endpoint:
         if self._reading is not None and self._reading.done():
             reading, self._reading = self._reading, None
             self._add(reading.result())
+        if self._stepping.turn.locked():
+            return  # a step looks at the sources, too
         if self._reading is None and self._segment.generation != self._generation:
             known = {source.feed.block.section for source in self.sources.values()}
             self._reading = asyncio.get_running_loop().create_task(asyncio.to_thread(self._read, known))
@@ -82,7 +87,10 @@ class Endpoint:
         self._segment.refresh()
         root, namespace = self.server.iserver.space.root, self.server.namespace
         blocks = [block for block in self._segment.blocks.values() if block.section not in known]
-        return [SourceNode(root, Feed(block, self._writer, namespace)) for block in blocks]
+        sources = [SourceNode(root, Feed(block, self._writer, namespace)) for block in blocks]
+        for source in sources:
+            add_injections(source)
+        return sources
 
     def _add(self, sources: list[SourceNode]) -> None:
         loop = asyncio.get_running_loop()

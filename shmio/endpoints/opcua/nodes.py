@@ -360,10 +360,6 @@ class SourceNode(Node):
             parent.children[last] = found
         return found
 
-    def property_named(self, name: str) -> Node | None:
-        """Return a property or a method of the source."""
-        return self.children.get(f"#{name}")
-
 
 def _id(source: str, path: str) -> ua.NodeId:
     return ua.NodeId(f"{source}/{path}", NAMESPACE)

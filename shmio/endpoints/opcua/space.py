@@ -76,18 +76,21 @@ class Space:
         if not isinstance(text, str) or len(text) > MAX_IDENTIFIER:
             return None
         path, mark, name = text.partition("#")
+        node = self._at(path)
+        if not mark or node is None:
+            return node if path else None
+        owner, inner, last = name.partition("#")
+        named = node.property_named(owner) if isinstance(node, RegisterNode) else node.children.get(f"#{owner}")
+        if not inner:
+            return named
+        return named.property_named(last) if isinstance(named, Method) else None
+
+    def _at(self, path: str) -> Node | None:
         if not path:
-            return self.root.children.get(f"#{name}") if mark else None
+            return self.root
         first, _, rest = path.partition("/")
         source = self.sources.get(first)
-        if source is None:
-            return None
-        node = source.by_path.get(rest) or self._part(source, rest)
-        if not mark or node is None:
-            return node
-        owner, inner, last = name.partition("#")
-        named = getattr(node, "property_named", lambda _: None)(owner)
-        return named.property_named(last) if inner and isinstance(named, Method) else None if inner else named
+        return None if source is None else source.by_path.get(rest) or self._part(source, rest)
 
     def _part(self, source: SourceNode, path: str) -> Node | None:
         """Return the node of an element, a slice or a bit, which clients can use but do not browse."""

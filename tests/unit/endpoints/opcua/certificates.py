@@ -25,7 +25,7 @@ def self_signed(folder: Path, uri: str, name: str = "localhost") -> tuple[Path, 
         .add_extension(usage, critical=True).sign(key, hashes.SHA256())
     )  # fmt: skip
     stem = uri.replace(":", "-")
-    public, private = folder / f"{stem}.pem", folder / f"{stem}.key"
+    public, private = folder / f"{stem}.pem", folder / f"{stem}-key.pem"
     public.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
     private.write_bytes(
         key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any
 
 from asyncua import Client, ua
@@ -17,6 +18,8 @@ from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE
 
 WRITER = 6
 TIMEOUT_S = 30
+ABOUT = ("Quality", "Reason", "Lift", "LiftAll", "Injections")
+"""Properties and methods of each source."""
 
 
 def spec(source: str = "cell", layout: Any = LAYOUT, stale_ns: int = STALE_NS) -> BlockSpec:
@@ -88,7 +91,8 @@ class Changes:
 async def served(segment: Segment, **config: Any) -> AsyncIterator[Served]:
     config.setdefault("listen", "127.0.0.1:0")
     with Segment.open(segment.instance, writable=True) as opened:
-        endpoint = Endpoint(opened, opened.processes.find("opcua"), OpcUa(**config))
+        slot: Any = SimpleNamespace(writer=WRITER)
+        endpoint = Endpoint(opened, slot, OpcUa(**config))
         await endpoint.start()
         try:
             yield Served(segment, endpoint)

@@ -6,17 +6,17 @@ from asyncua import ua
 
 from shmio.segment import Quality, Segment
 from tests.unit.endpoints.harness import LAYOUT, image
-from tests.unit.endpoints.opcua.harness import Changes, Served, node, serve
+from tests.unit.endpoints.opcua.harness import ABOUT, Changes, Served, node, serve
 
 
 def test_the_instance_is_a_tree_of_objects_and_variables(segment: Segment, instance: str) -> None:
     async def test(one: Served) -> None:
         async with one.client() as client:
             root = await client.nodes.objects.get_child(f"2:{instance}")
-            assert [(await child.read_browse_name()).Name for child in await root.get_children()] == ["cell"]
+            assert [(await child.read_browse_name()).Name for child in await root.get_children()] == ["Step", "cell"]
             source = await root.get_child("2:cell")
             names = {(await child.read_browse_name()).Name for child in await source.get_children()}
-            assert names == {"axis", "running", "inputs", "step", "bits", "name", "long", "secret", "Quality", "Reason"}
+            assert names == {"axis", "running", "inputs", "step", "bits", "name", "long", "secret", *ABOUT}
             position = await source.get_child(["2:axis", "2:position"])
             assert position.nodeid == ua.NodeId("cell/axis/position", 2)
             assert await position.read_data_type() == ua.NodeId(ua.ObjectIds.Float)

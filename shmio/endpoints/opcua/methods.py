@@ -1,0 +1,105 @@
+"""Methods that clients call: to step virtual time, and to lift injections."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+from typing import Any, Final
+
+from asyncua import ua
+from asyncua.common.utils import ServiceError
+
+from shmio.endpoints.opcua.nodes import Method, Node, Property, SourceNode
+from shmio.errors import CommandError, TimeError
+from shmio.local.time_control import Coordinator
+from shmio.segment import EventKind, Segment
+
+PATIENCE_S: Final = 2.0
+"""How long a step waits until another program gives up the time."""
+
+
+class Stepping:
+    """Steps the instance's time for clients. Use it only in the event loop's thread."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.turn = asyncio.Lock()
+        """Held during a step."""
+        self._segment = segment
+        self._coordinator = Coordinator(segment)
+
+    async def step(self, length_ms: float) -> list[ua.Variant]:
+        """Step by ``length_ms``, or by the step size if that is 0; return the step's number and time.
+
+        Raises:
+            ServiceError: The length is not valid.
+            ShmioError: Time is real, another program moves it, or the step failed.
+
+        """
+        if not math.isfinite(length_ms) or length_ms < 0:
+            raise ServiceError(ua.StatusCodes.BadOutOfRange)
+        async with self.turn:
+            return await asyncio.to_thread(self._step, round(length_ms * 1e6) or None)
+
+    def _step(self, length_ns: int | None) -> list[ua.Variant]:
+        if not self._segment.clock.read().virtual:
+            raise TimeError("time is real: it can be stepped when a program has stopped it, as shmio step does")
+        try:
+            self._coordinator.take_over(PATIENCE_S, steps=True)
+            done = self._coordinator.step(length_ns)
+        finally:
+            self._coordinator.close()
+        return [ua.Variant(done.number, ua.VariantType.UInt64), ua.Variant(done.time_ns / 1e9, ua.VariantType.Double)]
+
+
+def add_step(root: Node, stepping: Stepping) -> None:
+    """Give the instance's object a method that steps its time."""
+    method = Method(root, "Step", "control", "Steps virtual time; it returns when all sources are done", stepping.step)
+    method.inputs = [_argument("Length", ua.ObjectIds.Double, "in ms; 0: the step size")]
+    method.outputs = [
+        _argument("Number", ua.ObjectIds.UInt64, "number of the step"),
+        _argument("Time", ua.ObjectIds.Double, "the instance's time after it, in s"),
+    ]
+    root.children["#Step"] = method
+
+
+def add_injections(source: SourceNode) -> None:
+    """Give a source's object a list of its injections, and methods that lift them."""
+    block, commands = source.feed.block, source.feed.commands
+
+    def standing() -> dict[int, str]:
+        return {one.number: f"{one.name} ({one.direction})" for one in block.standing.read() if not one.lifted}
+
+    async def lift(number: int) -> list[ua.Variant]:
+        if number not in standing():
+            raise ServiceError(ua.StatusCodes.BadNotFound)
+        kind, reason = await commands.lift(number)
+        if kind is not EventKind.LIFTED and number in standing():
+            raise CommandError(f"{source.name}: injection {number} was not lifted: {reason}")
+        return []
+
+    async def lift_all() -> list[ua.Variant]:
+        numbers = list(standing())
+        for number in numbers:
+            if number in standing():  # another program may have lifted it meanwhile
+                await lift(number)
+        return [ua.Variant(len(numbers), ua.VariantType.UInt32)]
+
+    one = Method(source, "Lift", "inject", "Lifts an injection, whoever laid it", lift)
+    one.inputs = [_argument("Number", ua.ObjectIds.UInt64, "as in Injections")]
+    every = Method(source, "LiftAll", "inject", "Lifts all injections of this source, whoever laid them", lift_all)
+    every.outputs = [_argument("Lifted", ua.ObjectIds.UInt32, "how many there were")]
+    listed = Property(
+        source, "Injections", ua.ObjectIds.String, _texts(lambda: [f"{n}: {text}" for n, text in standing().items()])
+    )
+    listed.sizes = [0]
+    for node in (one, every, listed):
+        source.children[f"#{node.name}"] = node
+
+
+def _texts(get: Callable[[], list[str]]) -> Callable[[], ua.Variant]:
+    return lambda: ua.Variant(get(), ua.VariantType.String, is_array=True)
+
+
+def _argument(name: str, kind: int, text: str) -> Any:
+    return ua.Argument(Name=name, DataType=ua.NodeId(kind), ValueRank=-1, Description=ua.LocalizedText(text))
