@@ -23,6 +23,7 @@ GROUP = "shmio.connectors"
 
 BUILT_IN = {
     "memory": "shmio.connectors.models.memory:Memory",
+    "modbus": "shmio.connectors.modbus.connector:ModbusConnector",
     "remote": "shmio.connectors.models.remote:Remote",
     "replay": "shmio.connectors.replay.source:Replay",
     "simulation": "shmio.connectors.models.simulation:Simulation",

@@ -1,0 +1,184 @@
+"""Addresses of Modbus registers in tag tables, and the words that a value takes there.
+
+An address is ``[unit N] TABLE NUMBER[.BIT] [TYPE]``: ``holding 100``, ``unit 2 input 7``, ``coil 3``,
+``holding 100.3``, ``holding 100 UINT``. Numbers count from 0, as in the protocol. The numbers of
+manuals, which count from 1 and begin with the digit of their table, are read, too: ``40101`` and
+``400101`` are ``holding 100``. TYPE is the type in the device, if it is not that of the register.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, Literal
+
+from shmio.layout.model import ElementType, Register, element_type
+from shmio.layout.values.codec import Scalar
+
+Order = Literal["big", "little"]
+MAX_ADDRESS: Final = 65_535
+MAX_UNIT: Final = 255
+
+
+class Table(Enum):
+    """A table of a Modbus device (specification, section 4.3)."""
+
+    COIL = "coil"
+    DISCRETE = "discrete"
+    INPUT = "input"
+    HOLDING = "holding"
+
+    @property
+    def of_bits(self) -> bool:
+        """True if an address of the table is a bit, False if it is a word of 16 bits."""
+        return self in (Table.COIL, Table.DISCRETE)
+
+    @property
+    def writable(self) -> bool:
+        """True if a client may write to the table."""
+        return self in (Table.COIL, Table.HOLDING)
+
+
+_OF_DIGIT: Final = {"0": Table.COIL, "1": Table.DISCRETE, "3": Table.INPUT, "4": Table.HOLDING}
+_ADDRESS: Final = re.compile(
+    r"(?:unit\s+(?P<unit>[0-9]{1,3})\s+)?"
+    r"(?:(?P<table>coil|discrete|input|holding)\s+(?P<number>[0-9]{1,5})|(?P<manual>[0134][0-9]{4,5}))"
+    r"(?:\.(?P<bit>[0-9]{1,2}))?(?:\s+(?P<type>[A-Za-z_]+(?:\[[0-9]+\])?))?",
+    re.IGNORECASE,
+)
+_CODES: Final = {
+    "SINT": "b", "USINT": "B", "BYTE": "B", "INT": "h", "UINT": "H", "WORD": "H", "DINT": "i", "UDINT": "I",
+    "DWORD": "I", "TIME": "i", "REAL": "f", "LINT": "q", "ULINT": "Q", "LWORD": "Q", "LREAL": "d", "LTIME": "q",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where a device has the first element of a register.
+
+    Attributes:
+        unit: Unit id behind a gateway; None: the source's default.
+        table: The table.
+        number: Number in the table, from 0.
+        bit: Bit of the word, 0 to 15; None: the whole word.
+        kind: Type in the device.
+
+    """
+
+    unit: int | None
+    table: Table
+    number: int
+    bit: int | None
+    kind: ElementType
+
+    @property
+    def width(self) -> int:
+        """Number of table entries that an element takes: bits or words."""
+        if self.table.of_bits or self.bit is not None:
+            return 1
+        return -(-self.kind.length // 2) if self.kind.base == "STRING" else max(1, self.kind.size // 2)
+
+
+def parse(register: Register) -> Address:
+    """Return the address of a register of a tag table.
+
+    Raises:
+        ValueError: The address is malformed, or does not suit the register's type.
+
+    """
+    text = register.address.strip()
+    if not text:
+        raise ValueError("its `address` is missing; write one such as holding 100")
+    found = _ADDRESS.fullmatch(text)
+    if found is None:
+        raise ValueError(
+            f"{text!r} is no Modbus address; write coil, discrete, input or holding and a number from 0, such as "
+            "holding 100, or the number of a manual, such as 40101"
+        )
+    if found["manual"]:
+        table, number = _OF_DIGIT[found["manual"][0]], int(found["manual"][1:]) - 1
+    else:
+        table, number = Table(found["table"].lower()), int(found["number"])
+    unit = None if found["unit"] is None else int(found["unit"])
+    if not 0 <= number <= MAX_ADDRESS or (unit is not None and unit > MAX_UNIT):
+        raise ValueError(f"{text!r}: numbers go from 0 to {MAX_ADDRESS}, unit ids to {MAX_UNIT}")
+    kind = register.element if found["type"] is None else element_type(found["type"])
+    if kind is None:
+        raise ValueError(f"{text!r}: there is no type {found['type']!r}")
+    address = Address(unit, table, number, None if found["bit"] is None else int(found["bit"]), kind)
+    _check(address, register, text)
+    return address
+
+
+def _check(address: Address, register: Register, text: str) -> None:
+    """Raise ValueError if the address does not suit the register."""
+    kind, table, is_bit = address.kind, address.table, register.type == "BOOL"
+    if address.bit is not None and (table.of_bits or address.bit > 15):
+        raise ValueError(f"{text!r}: bits 0 to 15 are of a word in the tables input and holding")
+    if is_bit != (table.of_bits or address.bit is not None):
+        raise ValueError(
+            f"{text!r}: a BOOL needs a coil, a discrete input, or a bit of a word such as holding 100.3"
+            if is_bit
+            else f"{text!r}: a {register.type} needs a word; one bit is a BOOL"
+        )
+    if is_bit and register.dims and not table.of_bits:
+        raise ValueError(f"{text!r}: an array of BOOL needs coils or discrete inputs")
+    if not is_bit and kind.base != "STRING" and kind.base not in _CODES:
+        raise ValueError(f"{text!r}: Modbus has no {kind.name}; it has {', '.join(_CODES)} and STRING[n]")
+    if (kind.base == "STRING") != (register.element.base == "STRING"):
+        raise ValueError(f"{text!r}: a {register.type} and a {kind.name} do not fit each other")
+    if register.element.base != "STRING" and not is_bit and register.element.base not in _CODES:
+        raise ValueError(f"a {register.type} cannot come from a number of a device")
+    if address.number + register.count * address.width - 1 > MAX_ADDRESS:
+        raise ValueError(f"{text!r}: the value ends after address {MAX_ADDRESS}")
+
+
+class WordCodec:
+    """Converts an element between its words in the device and its value in the register."""
+
+    def __init__(self, address: Address, register: Register, word_order: Order, byte_order: Order) -> None:
+        self._text = address.kind.base == "STRING"
+        self._bytes = 2 * address.width
+        self._swap_bytes, self._swap_words = byte_order == "little", word_order == "little" and not self._text
+        self._scale = register.scale
+        self._whole = register.element.base not in ("REAL", "LREAL")
+        self._whole_there = address.kind.base not in ("REAL", "LREAL")
+        code = "B" if self._text else _CODES[address.kind.base]
+        self._struct = struct.Struct(f">{'x' if address.kind.size == 1 else ''}{code}")
+        self._name = address.kind.name
+
+    def decode(self, data: bytes) -> Scalar:
+        """Return the value of an element's words, as the device sent them."""
+        data = self._ordered(data)
+        if self._text:
+            return data.partition(b"\0")[0].decode("latin-1")
+        number: int | float = self._struct.unpack(data)[0]
+        value = number if self._scale is None else number * self._scale[0] + self._scale[1]
+        return round(value) if self._whole and math.isfinite(value) else value
+
+    def encode(self, value: Scalar) -> bytes:
+        """Return the words for a value of the register; ValueError if the device's type cannot hold it."""
+        if self._text:
+            data = str(value).encode("latin-1", "replace")
+            if len(data) > self._bytes:
+                raise ValueError(f"the device's {self._name} holds {self._bytes} characters, not {len(data)}")
+            return self._ordered(data.ljust(self._bytes, b"\0"))
+        if not isinstance(value, int | float):
+            raise TypeError(f"{value!r} is not a number")
+        number: float = value if self._scale is None else (value - self._scale[1]) / self._scale[0]
+        try:
+            return self._ordered(self._struct.pack(round(number) if self._whole_there else float(number)))
+        except (struct.error, OverflowError, ValueError):
+            raise ValueError(f"{value} does not fit the device's {self._name}") from None
+
+    def _ordered(self, data: bytes) -> bytes:
+        """Swap bytes and words, from the device's order to big-endian or back."""
+        if not (self._swap_bytes or self._swap_words):
+            return data
+        words = [data[at : at + 2] for at in range(0, len(data), 2)]
+        if self._swap_words:
+            words.reverse()
+        return b"".join(word[::-1] for word in words) if self._swap_bytes else b"".join(words)

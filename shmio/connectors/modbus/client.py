@@ -1,0 +1,172 @@
+"""A Modbus TCP client: one request at a time, and no doubt about its answer.
+
+Each answer must have the transaction, unit and function of the request, and exactly the length that
+the request asks for. Anything else ends the connection, and so does a time-out: a late answer can
+never be taken for the next one. That is why this is not pymodbus's client, which skips answers that
+it does not expect, and repeats writes after a time-out.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import Final
+
+from shmio.connectors.modbus.address import Table
+from shmio.errors import ConnectorError
+
+READ: Final = {Table.COIL: 1, Table.DISCRETE: 2, Table.HOLDING: 3, Table.INPUT: 4}
+WRITE_COIL, WRITE_WORD, WRITE_COILS, WRITE_WORDS, MASK_WORD = 5, 6, 15, 16, 22
+MAX_WRITE_WORDS: Final = 123
+MAX_WRITE_BITS: Final = 1968
+_HEADER: Final = 7
+_MAX_PDU: Final = 253
+_FAILED: Final = 0x80
+
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE, ACKNOWLEDGE, BUSY = 1, 2, 3, 4, 5, 6
+NO_PATH, NO_ANSWER = 10, 11
+_NAMES: Final = {
+    ILLEGAL_FUNCTION: "illegal function", ILLEGAL_ADDRESS: "illegal data address", ILLEGAL_VALUE: "illegal data value",
+    DEVICE_FAILURE: "device failure", ACKNOWLEDGE: "acknowledged, not done yet", BUSY: "device busy",
+    8: "memory parity error", NO_PATH: "gateway path unavailable",
+    NO_ANSWER: "no answer from the unit behind the gateway",
+}  # fmt: skip
+
+
+class RefusedError(ConnectorError):
+    """The device answered with an exception; ``code`` is its number (specification, section 7)."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"the device refuses the request: {_NAMES.get(code, 'unknown exception')} (exception {code})")
+        self.code = code
+
+
+class ModbusClient:
+    """The connection to one device or gateway. Use it from one thread."""
+
+    def __init__(self, host: str, port: int, timeout_ms: int) -> None:
+        self._host, self._port, self._timeout_ms = host, port, timeout_ms
+        self.peer = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        """``host:port`` for messages, with IPv6 addresses in brackets."""
+        self._socket: socket.socket | None = None
+        self._transaction = 0  # continues after a reconnect, so that a late answer matches no new request
+        self._deadline_ns = 0
+        self.sent = False
+        """Whether any byte of the last request may have left this host."""
+
+    def begin(self) -> None:
+        """Start the time-out of the requests that follow."""
+        self._deadline_ns = time.monotonic_ns() + self._timeout_ms * 1_000_000
+
+    @property
+    def connected(self) -> bool:
+        """True if the connection is open, as far as the client knows."""
+        return self._socket is not None
+
+    def connect(self) -> None:
+        """Connect within the time-out, plus the name lookup.
+
+        Raises:
+            ConnectorError: The device cannot be reached.
+
+        """
+        self.close()
+        try:
+            self._socket = socket.create_connection((self._host, self._port), self._timeout_ms / 1000)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError as error:
+            raise self._explained(error) from None
+
+    def close(self) -> None:
+        """Close the connection. It may be called at any time and more than once."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def read(self, unit: int, table: Table, start: int, count: int) -> bytes:
+        """Read entries of a table; return their bytes as the device sends them, bits packed from the lowest.
+
+        Raises:
+            RefusedError: The device refuses the request. The connection stays open.
+            ConnectorError: The connection is lost.
+
+        """
+        size = -(-count // 8) if table.of_bits else 2 * count
+        answer = self.call(unit, READ[table], start.to_bytes(2, "big") + count.to_bytes(2, "big"), 1 + size)
+        if answer[0] != size:
+            raise self._failed(f"it answered with {answer[0]} bytes instead of {size}")
+        return answer[1:]
+
+    def write(self, unit: int, function: int, data: bytes) -> None:
+        """Write, and check the confirmation, which repeats the beginning of the request.
+
+        Raises:
+            RefusedError: The device refuses the request. The connection stays open.
+            ConnectorError: The connection is lost.
+
+        """
+        echo = 6 if function == MASK_WORD else 4
+        if self.call(unit, function, data, echo) != data[:echo]:
+            raise self._failed("its confirmation is that of another write")
+
+    def call(self, unit: int, function: int, data: bytes, size: int) -> bytes:
+        """Exchange a request; return the data of the answer, ``size`` bytes."""
+        self.sent = False
+        if self._socket is None:
+            raise ConnectorError(f"not connected to {self.peer}")
+        self._transaction = (self._transaction + 1) & 0xFFFF
+        head = self._transaction.to_bytes(2, "big") + b"\0\0"
+        request = head + (2 + len(data)).to_bytes(2, "big") + bytes((unit, function)) + data
+        try:
+            self.sent = True
+            self._socket.settimeout(self._left_s())
+            self._socket.sendall(request)
+            got = self._receive(_HEADER + 1)
+            length = int.from_bytes(got[4:6], "big") - 2
+            if got[:4] != head:
+                raise self._failed("it answered a request that is not in flight")
+            if got[6] != unit or got[7] & ~_FAILED != function or not 0 <= length < _MAX_PDU:
+                raise self._failed("its answer does not belong to the request")
+            if got[7] & _FAILED:
+                if length != 1:
+                    raise self._failed("its answer does not belong to the request")
+                raise RefusedError(self._receive(1)[0])
+            if length != size:
+                raise self._failed(f"it answered with {length} bytes instead of {size}")
+            return self._receive(size)
+        except OSError as error:
+            self.close()
+            raise self._explained(error) from None
+
+    def _receive(self, size: int) -> bytes:
+        data = bytearray()
+        while len(data) < size:
+            if self._socket is None:
+                raise ConnectionResetError
+            self._socket.settimeout(self._left_s())
+            if not (part := self._socket.recv(size - len(data))):
+                raise ConnectionResetError
+            data += part
+        return bytes(data)
+
+    def _left_s(self) -> float:
+        left_ns = self._deadline_ns - time.monotonic_ns()
+        if left_ns <= 0:
+            raise TimeoutError
+        return left_ns / 1e9
+
+    def _failed(self, what: str) -> ConnectorError:
+        """Close the connection, and return an error about a wrong answer."""
+        self.close()
+        return ConnectorError(f"{self.peer} does not answer as a Modbus device does: {what}")
+
+    def _explained(self, error: OSError) -> ConnectorError:
+        if isinstance(error, TimeoutError):
+            return ConnectorError(f"no answer within {self._timeout_ms} ms from {self.peer}")
+        if isinstance(error, ConnectionRefusedError):
+            return ConnectorError(f"connection refused by {self.peer}")
+        if isinstance(error, socket.gaierror):
+            return ConnectorError(f"host name {self._host!r} cannot be resolved: {error.strerror}")
+        if isinstance(error, ConnectionError):
+            return ConnectorError(f"{self.peer} closed the connection")
+        return ConnectorError(f"{self.peer} cannot be reached: {error.strerror or error}")

@@ -1,0 +1,362 @@
+"""The connector ``modbus``: reads the addresses of a tag table, and writes to them."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Final
+
+import msgspec
+
+from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.modbus import client
+from shmio.connectors.modbus.address import Address, Order, Table, WordCodec, parse
+from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError
+from shmio.connectors.modbus.plan import Element, Limits, ReadRequest, plan
+from shmio.connectors.register_image import RegisterImage
+from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.model import Layout, Register, bit_positions
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.write import Write, apply
+from shmio.model.statuses import (
+    BAD_COMMUNICATION_ERROR,
+    BAD_DEVICE_FAILURE,
+    BAD_NO_COMMUNICATION,
+    BAD_NOT_SUPPORTED,
+    BAD_OUT_OF_RANGE,
+    BAD_RESOURCE_UNAVAILABLE,
+    BAD_TIMEOUT,
+)
+
+RETRY_NS: Final = 10_000_000_000
+"""How long an address that the device refuses is left alone."""
+GATEWAY_RETRY_NS: Final = 1_000_000_000
+"""How long a unit that does not answer its gateway is left alone."""
+_STATUS: Final = {
+    client.ILLEGAL_FUNCTION: BAD_NOT_SUPPORTED,
+    client.ILLEGAL_ADDRESS: BAD_OUT_OF_RANGE,
+    client.ILLEGAL_VALUE: BAD_OUT_OF_RANGE,
+    client.DEVICE_FAILURE: BAD_DEVICE_FAILURE,
+    client.ACKNOWLEDGE: BAD_RESOURCE_UNAVAILABLE,
+    client.BUSY: BAD_RESOURCE_UNAVAILABLE,
+    client.NO_PATH: BAD_NO_COMMUNICATION,
+    client.NO_ANSWER: BAD_TIMEOUT,
+}
+_OF_ADDRESSES: Final = frozenset({client.ILLEGAL_FUNCTION, client.ILLEGAL_ADDRESS, client.ILLEGAL_VALUE})
+_OF_UNITS: Final = frozenset({client.NO_PATH, client.NO_ANSWER})
+
+log = logging.getLogger("shmio.source")
+
+
+class ModbusOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """Address of the device, and what it can do."""
+
+    host: Annotated[str, msgspec.Meta(min_length=1, max_length=253)]
+    port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 502
+    timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 2000
+    """Time-out in ms for connecting, for reading all registers, and for the writes of a cycle."""
+    unit: Annotated[int, msgspec.Meta(ge=0, le=255)] = 1
+    """Unit id of addresses that name none."""
+    word_order: Order = "big"
+    """Which word of a number of several words comes first: ``big`` is the highest."""
+    byte_order: Order = "big"
+    """Order of the bytes within a word; that of the protocol is ``big``."""
+    max_registers: Annotated[int, msgspec.Meta(ge=1, le=125)] = 125
+    """Most words in one request."""
+    max_bits: Annotated[int, msgspec.Meta(ge=1, le=2000)] = 2000
+    """Most coils or discrete inputs in one request."""
+    max_gap: Annotated[int, msgspec.Meta(ge=0, le=124)] = 16
+    """Most unused words, or bits, that a request reads to save another request."""
+
+
+class _Register:
+    """A register with its address, and its elements in the device."""
+
+    def __init__(self, index: int, register: Register, address: Address, options: ModbusOptions) -> None:
+        self.index, self.register, self.address = index, register, address
+        self.unit = options.unit if address.unit is None else address.unit
+        self.codec = None
+        if not address.table.of_bits and address.bit is None:
+            self.codec = WordCodec(address, register, options.word_order, options.byte_order)
+
+    def element(self, place: int) -> Element:
+        address = self.address
+        start = address.number + place * address.width
+        return Element(self.unit, address.table, start, address.width, self.index, place)
+
+    def value(self, data: bytes, at: int) -> Any:
+        """Return an element's value; it begins at entry ``at`` of a request's bytes."""
+        if self.address.table.of_bits:
+            return bool(data[at // 8] >> at % 8 & 1)
+        if self.codec is None:
+            return bool(int.from_bytes(data[2 * at : 2 * at + 2], "big") >> (self.address.bit or 0) & 1)
+        return self.codec.decode(data[2 * at : 2 * (at + self.address.width)])
+
+
+class ModbusConnector(Connector):
+    """Reads all registers of a layout in each cycle.
+
+    Addresses that the device refuses are bad by themselves: a refused request is split until they
+    are found, and they are tried again every 10 s.
+    """
+
+    Options = ModbusOptions
+    can_write = True
+    register_quality = True
+
+    def __init__(self, options: ModbusOptions, layout: Layout) -> None:
+        self._options, self._layout = options, layout
+        self._client = ModbusClient(options.host, options.port, options.timeout)
+        self._registers: list[_Register] = []
+        for index, register in enumerate(layout.registers):
+            try:
+                address = parse(register)
+                if register.writable and not address.table.writable:
+                    raise ValueError(f"nothing can be written to the table {address.table.value}")
+            except ValueError as error:
+                raise ConfigError(f"layout: {register.path}: {error}") from None
+            self._registers.append(_Register(index, register, address, options))
+        limits = Limits(options.max_registers, options.max_bits, options.max_gap)
+        elements = (one.element(place) for one in self._registers for place in range(one.register.count))
+        try:
+            self._requests = plan(elements, limits)
+        except ValueError as error:
+            raise ConfigError(f"layout: {error}: raise max_registers or max_bits") from None
+        self._image = RegisterImage(layout) if layout.status_offset is not None else None
+        self._left_alone: dict[object, tuple[int, int]] = {}  # by request or unit: until when (ns), and the status
+        self._masks_refused = False
+
+    @property
+    def timeout_s(self) -> float:
+        """The longest time that any hook blocks, in s."""
+        return self._options.timeout / 1000
+
+    def describe(self) -> str:
+        """Return the peer and the number of requests of a cycle as a text for logs."""
+        return f"to {self._client.peer} in {len(self._requests)} requests a cycle"
+
+    def connect(self) -> None:
+        """Connect to the device; ConnectorError if it cannot be reached."""
+        self._client.connect()
+        self._left_alone.clear()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._client.close()
+
+    # -- reading -------------------------------------------------------------------------------------------------------
+
+    def read(self) -> bytes:
+        """Read all registers; ConnectorError if the connection is lost."""
+        if self._image is None:
+            raise ConnectorError("the layout has no status area")
+        self._client.begin()
+        now_ns = time.monotonic_ns()
+        values: dict[int, list[Any]] = {}
+        failed: dict[int, int] = {}
+        for request in list(self._requests):
+            self._fetch(request, now_ns, values, failed)
+        for one in self._registers:
+            found = values.get(one.index, [])
+            if one.index in failed:
+                self._image.fail(one.index, failed[one.index])
+            else:
+                value: Value = _nested(found, one.register.shape) if one.register.dims else found[0]
+                self._image.put(one.index, value)
+        return bytes(self._image)
+
+    def _fetch(self, request: ReadRequest, now_ns: int, values: dict[int, list[Any]], failed: dict[int, int]) -> None:
+        """Read a request's elements; if the device refuses it, find the addresses that it refuses."""
+        until = max((self._left_alone.get(key, (0, 0)) for key in (request, request.unit)), key=lambda one: one[0])
+        if until[0] > now_ns:
+            failed.update((one.register, until[1]) for one in request.elements)
+            return
+        try:
+            data = self._client.read(request.unit, request.table, request.start, request.count)
+        except RefusedError as error:
+            parts = request.halves() if error.code in _OF_ADDRESSES else [request]
+            if len(parts) > 1:
+                place = self._requests.index(request)
+                self._requests[place : place + 1] = parts
+                for part in parts:
+                    self._fetch(part, now_ns, values, failed)
+                return
+            status = _STATUS.get(error.code, BAD_COMMUNICATION_ERROR)
+            key, pause_ns = (request.unit, GATEWAY_RETRY_NS) if error.code in _OF_UNITS else (request, RETRY_NS)
+            if error.code in _OF_ADDRESSES | _OF_UNITS:
+                self._left_alone[key] = now_ns + pause_ns, status
+            log.warning("%s: %s", self._named(request), error)
+            failed.update((one.register, status) for one in request.elements)
+            return
+        for one in request.elements:
+            register = self._registers[one.register]
+            found = values.setdefault(one.register, [None] * register.register.count)
+            found[one.place] = register.value(data, one.start - request.start)
+
+    def _named(self, request: ReadRequest) -> str:
+        first = self._registers[request.elements[0].register].register.path
+        more = f" and {len(request.elements) - 1} more" if len(request.elements) > 1 else ""
+        return f"{first}{more} (unit {request.unit}, {request.table.value} {request.start})"
+
+    # -- writing -------------------------------------------------------------------------------------------------------
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Write to the device, one write after the other: see :meth:`Connector.write`."""
+        if not self._client.connected:
+            raise WriteLostError(f"not connected to {self._client.peer}", [Lost.UNSENT] * len(writes))
+        self._client.begin()
+        outcomes: list[str | Lost] = []
+        for write in writes:
+            done = False
+            try:
+                reason = ""
+                for step in self._steps(write):
+                    self._exchange(*step)
+                    done = True
+            except (RefusedError, ValueError) as error:
+                reason = str(error)
+            except ConnectorError as error:
+                unsent = not (done or self._client.sent)
+                outcomes.append(Lost.UNSENT if unsent else Lost.UNKNOWN)
+                outcomes += [Lost.UNSENT] * (len(writes) - len(outcomes))
+                raise WriteLostError(str(error), outcomes) from None
+            outcomes.append(reason)
+        return [str(outcome) for outcome in outcomes]
+
+    def _exchange(self, unit: int, function: int, data: bytes) -> None:
+        """Send one request of a write.
+
+        If the device does not know function 22, read the word, change the bit and write the word: a
+        change that the device makes in between is lost.
+        """
+        if function != client.MASK_WORD or not self._masks_refused:
+            try:
+                self._client.write(unit, function, data)
+            except RefusedError as error:
+                if function != client.MASK_WORD or error.code != client.ILLEGAL_FUNCTION:
+                    raise
+                self._masks_refused = True
+                log.warning("the device cannot write single bits (function 22): their words are read and written back")
+            else:
+                return
+        start, keep, put = (int.from_bytes(data[at : at + 2], "big") for at in (0, 2, 4))
+        word = int.from_bytes(self._client.read(unit, Table.HOLDING, start, 1), "big")
+        self._client.write(unit, client.WRITE_WORD, data[:2] + (word & keep | put).to_bytes(2, "big"))
+
+    def _steps(self, write: Write) -> Iterator[tuple[int, int, bytes]]:
+        """Yield the requests (unit, function, data) of a write.
+
+        Raises:
+            ValueError: The device cannot hold the value, or the write names nothing that can be written.
+
+        """
+        offset, mask, data = write
+        touched = False
+        for one in self._registers:
+            register = one.register
+            if register.offset + register.size <= offset or register.offset >= offset + len(data):
+                continue
+            if register.bit is not None and not register.dims and mask != 1 << register.bit and mask:
+                continue
+            touched = True
+            if not one.address.table.writable:
+                raise ValueError(f"nothing can be written to the table {one.address.table.value}")
+            if mask and register.bit is None:
+                yield self._bit_of_word(one, write)
+            else:
+                yield from self._values(one, write)
+        if not touched:
+            raise ValueError("no register of the tag table is there")
+
+    def _bit_of_word(self, one: _Register, write: Write) -> tuple[int, int, bytes]:
+        """Return the request that writes one bit of an integer, and leaves the others alone (function 22)."""
+        register, address = one.register, one.address
+        options = self._options
+        if register.scale is not None or address.kind is not register.element or address.kind.base == "STRING":
+            raise ValueError("a bit of a converted value cannot be written: write the whole value")
+        size = register.element.size
+        element, byte = divmod(write.offset - register.offset, register.element.stride)
+        byte = byte if self._layout.byte_order == "little" else size - 1 - byte  # 0: the lowest
+        word, high = divmod(byte, 2)
+        if options.byte_order == "little":
+            high = 1 - high if size > 1 else 1
+        word = word if options.word_order == "little" else address.width - 1 - word
+        bit = write.mask << 8 * high
+        keep, put = 0xFFFF ^ bit, bit if write.data[0] & write.mask else 0
+        start = address.number + element * address.width + word
+        return one.unit, client.MASK_WORD, b"".join(number.to_bytes(2, "big") for number in (start, keep, put))
+
+    def _values(self, one: _Register, write: Write) -> Iterator[tuple[int, int, bytes]]:
+        """Yield the requests that write the elements of a register that a write covers."""
+        register, address = one.register, one.address
+        image = bytearray(self._layout.size)
+        covered = bytearray(self._layout.size)
+        apply(write, image)
+        apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
+        chosen = [
+            place
+            for place, (at, bit) in enumerate(_places(register))
+            if covered[at] & (0xFF if bit is None else 1 << bit)
+        ]
+        values = _flat(codec(register, self._layout.byte_order).decode(bytes(image)))
+        for first, some in _runs(chosen, self._most(one)):
+            start = (address.number + first * address.width).to_bytes(2, "big")
+            yield self._request(one, start, [values[place] for place in range(first, first + some)])
+
+    def _most(self, one: _Register) -> int:
+        """Return how many elements one request writes at most."""
+        if one.address.bit is not None:
+            return 1
+        return MAX_WRITE_BITS if one.address.table.of_bits else max(1, MAX_WRITE_WORDS // one.address.width)
+
+    def _request(self, one: _Register, start: bytes, values: list[Any]) -> tuple[int, int, bytes]:
+        """Return the request that writes consecutive elements from an address on."""
+        address = one.address
+        if address.table is Table.COIL:
+            if len(values) == 1:
+                return one.unit, client.WRITE_COIL, start + (b"\xff\0" if values[0] else b"\0\0")
+            packed = sum(bool(value) << bit for bit, value in enumerate(values)).to_bytes(
+                -(-len(values) // 8), "little"
+            )
+            return one.unit, client.WRITE_COILS, start + len(values).to_bytes(2, "big") + bytes((len(packed),)) + packed
+        if address.bit is not None:
+            bit = 1 << address.bit
+            masks = (0xFFFF ^ bit).to_bytes(2, "big") + (bit if values[0] else 0).to_bytes(2, "big")
+            return one.unit, client.MASK_WORD, start + masks
+        words = b"".join(map(one.codec.encode, values)) if one.codec else b""
+        if len(words) == 2:
+            return one.unit, client.WRITE_WORD, start + words
+        return one.unit, client.WRITE_WORDS, start + (len(words) // 2).to_bytes(2, "big") + bytes((len(words),)) + words
+
+
+def _places(register: Register) -> Iterator[tuple[int, int | None]]:
+    """Yield the byte where each element begins, and its bit if it is a BOOL."""
+    if register.type == "BOOL":
+        for byte, bit in bit_positions(register):
+            yield register.offset + byte, bit
+    else:
+        for place in range(register.count):
+            yield register.offset + place * register.element.stride, None
+
+
+def _runs(places: Sequence[int], most: int) -> Iterator[tuple[int, int]]:
+    """Yield (first, count) of each run of consecutive numbers, in pieces of at most ``most``."""
+    at = 0
+    while at < len(places):
+        count = 1
+        while at + count < len(places) and places[at + count] == places[at] + count and count < most:
+            count += 1
+        yield places[at], count
+        at += count
+
+
+def _flat(value: Value) -> list[Any]:
+    return [inner for item in value for inner in _flat(item)] if isinstance(value, list) else [value]
+
+
+def _nested(values: list[Any], shape: tuple[int, ...]) -> Value:
+    """Return a flat list as nested lists of this shape."""
+    for length in reversed(shape[1:]):
+        values = [values[at : at + length] for at in range(0, len(values), length)]
+    return values

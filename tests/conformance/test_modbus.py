@@ -1,0 +1,90 @@
+"""The common conformance suites, run with the Modbus connector against a device made with libmodbus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from shmio.connectors.base import Connector
+from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
+from shmio.layout.model import Layout
+from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import codec
+from shmio.segment import EventKind, Quality, Write
+from shmio.testing.conformance import Run
+from shmio.testing.proxy import FaultProxy
+from shmio.testing.write_conformance import SPARE, WriteConformance, Writer
+from tests.unit.connectors.modbus.device import Device
+
+
+def framing(data: bytes | bytearray) -> int:
+    """Return the length of the frame at the start of ``data``; 0 if it is not known yet."""
+    return 6 + int.from_bytes(data[4:6], "big") if len(data) >= 6 else 0
+
+
+def layout(words: int) -> Layout:
+    tags = {
+        "counted": {"type": f"ARRAY[1..{words}] OF UINT", "address": "holding 0"},
+        "flags": {"type": "BYTE", "address": f"holding {words}"},
+        "copy": {"type": "BYTE", "address": f"holding {words + 1}"},
+        "spare": {"type": f"ARRAY[1..{SPARE}] OF BYTE", "address": "holding 1000"},
+        "missing": {"type": "UINT", "address": "holding 3000"},
+    }
+    return place_tags("device", tags).with_statuses()
+
+
+class ModbusRig:
+    """The device behind a proxy."""
+
+    def __init__(self, proxy: FaultProxy, words: int) -> None:
+        self.proxy = proxy
+        self.layout = layout(words)
+        registers = self.layout.registers
+        self._codecs = [codec(register, "little") for register in registers[:3]]
+        self._one_request = words < 100
+        self.flags, self.spare, missing = (registers[index].offset for index in (1, 3, 4))
+        self.refused = Write(missing, 0, b"\1\0")
+
+    def connector(self) -> Connector:
+        address = self.proxy.address
+        return ModbusConnector(ModbusOptions(host=address.host, port=address.port, timeout=200), self.layout)
+
+    def generation(self, raw: bytes) -> int:
+        counted, flags, copy = (one.decode(raw) for one in self._codecs)
+        assert isinstance(counted, list)
+        assert isinstance(flags, int)
+        numbers = [one for one in counted if isinstance(one, int)]
+        if self._one_request:
+            assert len(set(numbers)) == 1, "words of different moments in one request"
+        assert sorted(numbers) == numbers, "a request has an older answer than the one before it"
+        assert flags & 0xFE == copy, "a write has changed the neighbours of its bit"
+        return numbers[0]
+
+
+class TestModbus(WriteConformance):
+    @pytest.fixture(params=[50, 300], ids=["one request", "several requests"])
+    def rig(self, request: pytest.FixtureRequest) -> Iterator[ModbusRig]:
+        with Device() as device:
+            device.count(0, request.param)
+            with FaultProxy(device.address, framing=framing) as proxy:
+                yield ModbusRig(proxy, request.param)
+
+    @pytest.mark.parametrize("at", [0, 2, 5, 6, 7, 8])
+    def test_an_answer_with_any_wrong_byte_in_its_header_is_dropped(self, run: Run, rig: ModbusRig, at: int) -> None:
+        """Transaction, protocol, length, unit, function and byte count: each must be that of the request."""
+        run.good()
+        rig.proxy.edit(lambda frame: frame[:at] + bytes((frame[at] ^ 0x11,)) + frame[at + 1 :])
+        run.bad()
+        rig.proxy.pass_all()
+        run.good()
+
+    def test_a_confirmation_of_another_write_confirms_nothing(self, run: Run, writer: Writer, rig: ModbusRig) -> None:
+        """The outcome is unknown, and the connection is dropped."""
+        rig.proxy.edit(lambda frame: frame[:9] + bytes((frame[9] ^ 1,)) + frame[10:] if frame[7] in (6, 16) else frame)
+        end = writer.write(Write(rig.spare, 0, b"x"))
+        assert end.kind == EventKind.UNKNOWN
+        assert "another write" in end.text
+        run.until(lambda frame: frame.quality is Quality.BAD)
+        rig.proxy.pass_all()
+        run.good()

@@ -1,0 +1,259 @@
+"""The connector against a device made with libmodbus."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from shmio.connectors.modbus import connector as module
+from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
+from shmio.connectors.registry import convert_options
+from shmio.errors import ConfigError
+from shmio.layout.model import Layout
+from shmio.layout.tags import place_tags
+from shmio.layout.topic import find
+from shmio.layout.values.codec import codec
+from shmio.layout.values.write import encode
+from shmio.model.statuses import (
+    BAD_OUT_OF_RANGE,
+    BAD_TIMEOUT,
+    GOOD,
+    StatusArea,
+)
+from tests.unit.connectors.modbus.device import WORDS, Device
+
+
+@pytest.fixture
+def device() -> Iterator[Device]:
+    with Device() as device:
+        yield device
+
+
+def options_of(given: dict[str, Any]) -> ModbusOptions:
+    """Return the options as the configuration would give them."""
+    found = convert_options("modbus", given)
+    assert isinstance(found, ModbusOptions)
+    return found
+
+
+def layout_of(tags: Mapping[str, object]) -> Layout:
+    return place_tags("plant", tags).with_statuses()
+
+
+@contextmanager
+def connected(device: Device, tags: Mapping[str, object], **options: Any) -> Iterator[tuple[ModbusConnector, Layout]]:
+    layout = layout_of(tags)
+    given = {"host": device.address.host, "port": device.address.port, "timeout": 5000} | options
+    connector = ModbusConnector(options_of(given), layout)
+    try:
+        connector.connect()
+        yield connector, layout
+    finally:
+        connector.close()
+
+
+def values(connector: ModbusConnector, layout: Layout) -> dict[str, object]:
+    image = connector.read()
+    area = StatusArea(layout)
+    return {
+        register.path: codec(register, layout.byte_order).decode(image)
+        if (code := area.get(image, index).code) == GOOD
+        else hex(code)
+        for index, register in enumerate(layout.registers)
+    }
+
+
+def tag(kind: str, address: str, **more: Any) -> dict[str, Any]:
+    return {"type": kind, "address": address, **more}
+
+
+def words(code: str, *numbers: Any) -> list[int]:
+    data = struct.pack(f">{code}", *numbers)
+    return list(struct.unpack(f">{len(data) // 2}H", data))
+
+
+def test_all_tables_and_types(device: Device) -> None:
+    device.set("coil", 3, [1])
+    device.set("discrete", 10, [1, 0, 1, 1, 0, 0, 0, 0, 1])
+    device.set("input", 7, words("h", -5))
+    device.set("holding", 0, words("HhIiQqfd", 65000, -2, 4_000_000_000, -7, 2**63, -9, 1.5, -2.25))
+    device.set("holding", 40, [0x4142, 0x4300, 0xFFFF], unit=2)
+    device.set("holding", 50, [0b1000])
+    tags = {
+        "lamp": tag("BOOL", "coil 3"),
+        "inputs": tag("ARRAY[0..8] OF BOOL", "discrete 10"),
+        "temperature": tag("INT", "input 7"),
+        "u16": tag("UINT", "holding 0"),
+        "i16": tag("INT", "40002"),
+        "u32": tag("UDINT", "holding 2"),
+        "i32": tag("DINT", "400005"),
+        "u64": tag("ULINT", "holding 6"),
+        "i64": tag("LINT", "holding 10"),
+        "f32": tag("REAL", "holding 14"),
+        "f64": tag("LREAL", "holding 16"),
+        "name": tag("STRING[4]", "unit 2 holding 40"),
+        "byte": tag("BYTE", "unit 2 holding 42"),
+        "flag": tag("BOOL", "holding 50.3"),
+        "list": tag("ARRAY[1..2, 0..1] OF UINT", "holding 0"),
+    }
+    with connected(device, tags) as (connector, layout):
+        assert values(connector, layout) == {
+            "lamp": True, "inputs": [True, False, True, True, False, False, False, False, True], "temperature": -5,
+            "u16": 65000, "i16": -2, "u32": 4_000_000_000, "i32": -7, "u64": 2**63, "i64": -9, "f32": 1.5,
+            "f64": -2.25, "name": "ABC", "byte": 0xFF, "flag": True, "list": [[65000, 65534], [0xEE6B, 0x2800]],
+        }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("word_order", "byte_order", "sent"),
+    [
+        ("big", "big", [0x0102, 0x0304]),
+        ("little", "big", [0x0304, 0x0102]),
+        ("big", "little", [0x0201, 0x0403]),
+        ("little", "little", [0x0403, 0x0201]),
+    ],
+)
+def test_word_and_byte_order_in_both_directions(
+    device: Device, word_order: str, byte_order: str, sent: list[int]
+) -> None:
+    device.set("holding", 5, sent)
+    tags = {"n": tag("UDINT", "holding 5"), "b": tag("ARRAY[0..1] OF DWORD", "holding 20")}
+    with connected(device, tags, word_order=word_order, byte_order=byte_order) as (connector, layout):
+        assert values(connector, layout)["n"] == 0x01020304
+        assert connector.write(encode(layout.registers[1], [0, 0x01020304], "little")) == [""]
+        assert device.get("holding", 22, 2) == sent
+        for bit in (0, 9, 17, 30):
+            register = find(layout, f"b/1.%X{bit}")
+            assert connector.write(encode(register, not 0x01020304 >> bit & 1, "little")) == [""]
+            assert values(connector, layout)["b"] == [0, 0x01020304 ^ 1 << bit]
+            assert connector.write(encode(register, bool(0x01020304 >> bit & 1), "little")) == [""]
+
+
+def test_scales_and_types_of_the_device(device: Device) -> None:
+    device.set("holding", 0, words("hH", -125, 40000))
+    tags = {
+        "level": tag("REAL", "holding 0 INT", scale=[0.1, 20]),
+        "count": tag("DINT", "holding 1 UINT"),
+        "whole": tag("INT", "holding 0", scale=2),
+    }
+    with connected(device, tags) as (connector, layout):
+        assert values(connector, layout) == {"level": 7.5, "count": 40000, "whole": -250}
+        assert connector.write(encode(find(layout, "level"), 20.5, "little")) == [""]
+        assert device.get("holding", 0) == [5]
+        (refusal,) = connector.write(encode(find(layout, "count"), 70_000, "little"))
+        assert "does not fit the device's UINT" in refusal
+        assert device.get("holding", 1) == [40000]
+
+
+def test_requests_are_merged_within_the_limits(device: Device) -> None:
+    device.set("holding", 0, list(range(700)))
+    tags = {f"n{at}": tag("UINT", f"holding {at}") for at in range(0, 600, 2)}
+    tags["long"] = tag("ARRAY[0..299] OF UINT", "holding 400")
+    tags["coils"] = tag("ARRAY[1..100] OF BOOL", "coil 0")
+    with connected(device, tags, max_bits=64) as (connector, layout):
+        found = values(connector, layout)
+        assert [found[f"n{at}"] for at in range(0, 600, 2)] == list(range(0, 600, 2))
+        assert found["long"] == list(range(400, 700))
+        counts = [(function, count) for function, _, count in device.calls()]
+        assert counts == [(1, 64), (1, 36), *[(3, 125)] * 5, (3, 72)]
+
+
+def test_one_bad_address_among_good_ones_is_bad_alone_and_not_asked_in_each_cycle(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = [10**12]
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns[0])
+    tags = {f"n{at}": tag("UINT", f"holding {WORDS - 50 + at}") for at in range(60)}
+    with connected(device, tags) as (connector, layout):
+        found = values(connector, layout)
+        for at in range(60):
+            assert found[f"n{at}"] == (0 if at < 50 else hex(BAD_OUT_OF_RANGE))
+        device.calls()
+        assert values(connector, layout) == found
+        assert all(address + count <= WORDS for _, address, count in device.calls())
+        now_ns[0] += module.RETRY_NS
+        values(connector, layout)
+        assert any(address >= WORDS for _, address, _ in device.calls())
+
+
+def test_writes_of_all_kinds(device: Device) -> None:
+    device.set("holding", 30, [0b0101])
+    tags = {
+        "lamp": tag("BOOL", "coil 3"),
+        "lamps": tag("ARRAY[0..19] OF BOOL", "coil 10"),
+        "speed": tag("REAL", "holding 10"),
+        "list": tag("ARRAY[0..299] OF UINT", "holding 100"),
+        "flag": tag("BOOL", "holding 30.1"),
+        "word": tag("WORD", "holding 30"),
+        "name": tag("STRING[5]", "unit 2 holding 40"),
+    }
+    with connected(device, tags) as (connector, layout):
+
+        def write(path: str, value: object) -> list[str]:
+            return connector.write(encode(find(layout, path), value, "little"))
+
+        assert write("lamp", True) == write("lamps/7", True) == [""]
+        assert device.get("coil", 3) == [1]
+        assert [bool(one) for one in device.get("coil", 10, 20)] == [at == 7 for at in range(20)]
+        assert set(write("lamps", [at % 3 == 0 for at in range(20)])) == {""}
+        assert [bool(one) for one in device.get("coil", 10, 20)] == [at % 3 == 0 for at in range(20)]
+        assert set(write("lamps/3..5", [False, True, True])) == {""}
+        assert [bool(one) for one in device.get("coil", 12, 5)] == [False, False, True, True, True]
+        assert write("speed", -2.5) == [""]
+        assert device.get("holding", 10, 2) == words("f", -2.5)
+        assert write("list", list(range(300))) == [""]
+        assert device.get("holding", 100, 300) == list(range(300))
+        assert write("list/7", 9) == [""]
+        assert device.get("holding", 106, 3) == [6, 9, 8]
+        assert write("flag", True) == write("word.%X12", True) == [""]
+        assert device.get("holding", 30) == [0b0101 | 2 | 1 << 12]
+        assert write("name", "abc") == [""]
+        assert device.get("holding", 40, 3, unit=2) == [0x6162, 0x6300, 0]
+        assert {call[0] for call in device.calls()} == {5, 6, 15, 16, 22}
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"type": "INT"}, "`address` is missing"),
+        (tag("INT", "hold 3"), "no Modbus address"),
+        (tag("INT", "holding 70000"), "numbers go from 0 to 65535"),
+        (tag("INT", "unit 300 holding 1"), "unit ids to 255"),
+        (tag("INT", "40000"), "numbers go from 0"),
+        (tag("BOOL", "holding 3"), "a BOOL needs a coil"),
+        (tag("INT", "coil 3"), "a INT needs a word"),
+        (tag("BOOL", "holding 3.16"), "bits 0 to 15"),
+        (tag("ARRAY[0..3] OF BOOL", "holding 3.1"), "an array of BOOL needs coils"),
+        (tag("DATE", "holding 3"), "Modbus has no DATE"),
+        (tag("INT", "holding 3 STRING[4]"), "do not fit each other"),
+        (tag("INT", "holding 3 FOO"), "there is no type 'FOO'"),
+        (tag("DINT", "holding 65535"), "ends after address 65535"),
+        (tag("INT", "input 3", writable=True), "nothing can be written to the table input"),
+        (tag("STRING[254]", "holding 3"), "127 words"),
+    ],
+)
+def test_a_wrong_address_is_named_with_its_register(entry: Mapping[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=r"layout: (plant/x: )?") as error:
+        ModbusConnector(options_of({"host": "127.0.0.1"}), layout_of({"plant/x": entry}))
+    assert message in str(error.value)
+
+
+def test_a_unit_that_does_not_answer_its_gateway_leaves_the_others_good(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = [10**12]
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns[0])
+    tags = {"here": tag("UINT", "holding 1"), "there": tag("UINT", "unit 9 holding 1")}
+    tags["too"] = tag("BOOL", "unit 9 coil 1")
+    with connected(device, tags) as (connector, layout):
+        bad = hex(BAD_TIMEOUT)
+        assert values(connector, layout) == {"here": 0, "there": bad, "too": bad}
+        assert len(device.calls()) == 2  # the second request to the unit is not sent: it would cost a time-out
+        now_ns[0] += module.GATEWAY_RETRY_NS
+        assert values(connector, layout)["here"] == 0
+        assert len(device.calls()) == 2
