@@ -111,7 +111,7 @@ class Program:
     def _read(self, sources: Sequence[Source]) -> None:
         report = self._general
         for source in sources:
-            if source.file.endswith(tags.SUFFIX):
+            if source.file.lower().endswith(tags.SUFFIXES):
                 if len(sources) == 1:
                     self._table = tags.compile_tags(source.file, source.text, report)
                     self.blocks = (BlockName(self._table.name, None),)

@@ -1,6 +1,6 @@
-"""Compile tag tables: TOML files that name the registers of a source without a data block.
+"""Compile tag tables: files that name the registers of a source without a data block.
 
-::
+A table is a TOML file, or a sheet (``tag_sheets.py``) with the same columns. In TOML::
 
     name = "cell"                 # optional: the file's name
     [registers]
@@ -38,6 +38,7 @@ from msgspec.structs import replace
 
 from shmio.config.faults import MAX_PARTS, explain, explain_toml, too_long
 from shmio.errors import Diagnostic, PathError, ValueRangeError
+from shmio.layout import tag_sheets
 from shmio.layout.model import (
     MAX_BLOCK_BYTES,
     MAX_DIMENSIONS,
@@ -60,7 +61,7 @@ from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
 from shmio.layout.values.literal import parse_literal, split_array
 from shmio.logs import printable
 
-SUFFIX: Final = ".toml"
+SUFFIXES: Final = (".toml", *tag_sheets.SUFFIXES)
 _MAX_ALIGN: Final = 8
 _PLACE = re.compile(r" \(at (?:line ([0-9]+), column ([0-9]+)|end of document)\)")
 _LONG_NUMBER = re.compile(r"[0-9_]{4300}")
@@ -98,10 +99,22 @@ def compile_tags(file: str, data: bytes, report: Report) -> Layout:
     Raises:
         LayoutError: The table is wrong; ``diagnostics`` has everything found.
     """
+    if file.lower().endswith(tag_sheets.SUFFIXES):
+        return _compile_sheet(file, data, report)
     table = _read(file, data, report)
     report.raise_errors()
     lines = _Lines(data.decode())
     return _place_table(file, table, report, lines.line_of)
+
+
+def _compile_sheet(file: str, data: bytes, report: Report) -> Layout:
+    """Compile a table of a CSV file or a spreadsheet; LayoutError as for :func:`compile_tags`."""
+    if len(data) > MAX_SOURCE_BYTES:
+        report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
+        report.raise_errors()
+    sheet = tag_sheets.read_sheet(file, data, report)
+    report.raise_errors()
+    return _place_table(file, _Table(dict(sheet.registers)), report, lambda path: sheet.rows.get(path, 1))
 
 
 def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder = "little") -> Layout:

@@ -1,0 +1,191 @@
+"""Reads tag tables from CSV files and spreadsheets: a header row, then a row for each register.
+
+The columns are ``path`` and ``type``, and any of ``address``, ``unit``, ``comment``, ``scale``,
+``initial``, ``deadband`` and ``writable``, in any order. Cells have the texts that a spreadsheet
+program writes: comma, semicolon or tab between them, and with semicolons a decimal comma.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from shmio.config.faults import meant
+from shmio.errors import Diagnostic
+from shmio.layout.model import MAX_REGISTERS
+from shmio.layout.report import Report
+from shmio.layout.topic import shorten
+from shmio.logs import printable
+
+SUFFIXES: Final = (".csv", ".xlsx")
+COLUMNS: Final = ("path", "type", "address", "unit", "comment", "scale", "initial", "deadband", "writable")
+_NEEDED: Final = ("path", "type")
+_BOOLS: Final = {"true": True, "yes": True, "1": True, "x": True, "false": False, "no": False, "0": False}
+_MAX_UNPACKED: Final = 64 << 20
+_MAX_MEMBERS: Final = 1000
+_NUMBER: Final = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+
+
+class Sheet(NamedTuple):
+    """The registers of a table, and the row in which each is."""
+
+    registers: Mapping[str, object]
+    rows: Mapping[str, int]
+
+
+def read_sheet(file: str, data: bytes, report: Report) -> Sheet:
+    """Read a table; errors go to the report."""
+    try:
+        rows, comma = _rows_of(file, data)
+        return _sheet(file, rows, report, decimal_comma=comma)
+    except (ValueError, csv.Error) as error:
+        report.add(Diagnostic(file, 1, 1, f"not a tag table: {error}"))
+        return Sheet({}, {})
+
+
+def _rows_of(file: str, data: bytes) -> tuple[Iterable[tuple[int, Sequence[str]]], bool]:
+    """Return the rows with their numbers, and whether numbers have a decimal comma; ValueError."""
+    if file.lower().endswith(".xlsx"):
+        return _spreadsheet(data), False
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ValueError(f"line {line} is not in UTF-8: save the file as 'CSV UTF-8'") from None
+    header = text.partition("\n")[0]
+    delimiter = max(",;\t", key=header.count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    return _numbered(reader), delimiter == ";"
+
+
+def _numbered(reader: Iterator[list[str]]) -> Iterator[tuple[int, Sequence[str]]]:
+    """Yield the rows of a CSV file with the lines on which they begin."""
+    line = 1
+    for row in reader:
+        yield line, row
+        line = reader.line_num + 1  # type: ignore[attr-defined]  # csv's readers have it
+
+
+def _spreadsheet(data: bytes) -> Iterator[tuple[int, Sequence[str]]]:
+    """Yield the rows of a workbook's first sheet, or of its sheet ``tags``.
+
+    Raises:
+        ValueError: It is not a workbook, too large, or the library is missing.
+
+    """
+    try:
+        from openpyxl import load_workbook  # noqa: PLC0415  an extra
+    except ImportError:
+        raise ValueError("to read an .xlsx file: pip install 'shmio[xlsx]', or save it as CSV") from None
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+        if len(members) > _MAX_MEMBERS or sum(member.file_size for member in members) > _MAX_UNPACKED:
+            raise ValueError(f"it unpacks to more than {_MAX_UNPACKED} bytes or {_MAX_MEMBERS} files")
+        book = load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+    except ValueError:
+        raise
+    except Exception as error:  # noqa: BLE001  openpyxl raises errors of any kind for damaged files
+        raise ValueError(f"the file is not a workbook, or damaged ({type(error).__name__})") from None
+    try:
+        sheet = next((one for one in book.worksheets if one.title.lower() == "tags"), book.worksheets[0])
+        for number, row in enumerate(sheet.iter_rows(values_only=True), 1):
+            yield number, [_text(cell) for cell in row]
+    except Exception as error:  # noqa: BLE001  as above, while it reads the rows
+        raise ValueError(f"the workbook is damaged ({type(error).__name__})") from None
+    finally:
+        book.close()
+
+
+def _text(cell: object) -> str:
+    if cell is None:
+        return ""
+    if isinstance(cell, bool):
+        return "true" if cell else "false"
+    return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell)
+
+
+def _sheet(file: str, rows: Iterable[tuple[int, Sequence[str]]], report: Report, *, decimal_comma: bool) -> Sheet:
+    """Convert rows to what a TOML table would have; ValueError if the header is wrong."""
+    rows = iter(rows)
+    _, header = next(rows, (1, ()))
+    columns = _columns([cell.strip().lower() for cell in header])
+    registers: dict[str, object] = {}
+    places: dict[str, int] = {}
+    for number, row in rows:
+        cells = {name: cell.strip() for name, cell in zip(columns, row, strict=False) if name and cell.strip()}
+        if not cells:
+            continue
+        path = cells.pop("path", "")
+        try:
+            if any(cell.strip() for cell in row[len(columns) :]):
+                raise ValueError("the row has more cells than the header")
+            if not path:
+                raise ValueError("the path is missing")
+            if path in registers:
+                raise ValueError(f"given twice, first in row {places[path]}")
+            registers[path] = _entry(cells, decimal_comma=decimal_comma)
+            places[path] = number
+        except ValueError as error:
+            report.add(Diagnostic(file, number, 1, f"{shorten(printable(path)) or 'row'}: {error}"))
+        if len(registers) > MAX_REGISTERS:
+            raise ValueError(f"expected at most {MAX_REGISTERS} registers")
+    if not registers and not report.errors:
+        raise ValueError("there are no rows below the header")
+    return Sheet(registers, places)
+
+
+def _columns(header: Sequence[str]) -> list[str]:
+    """Return the names of the columns; ValueError if one is missing, unknown or there twice."""
+    while header and not header[-1]:
+        header = header[:-1]
+    if missing := [name for name in _NEEDED if name not in header]:
+        found = shorten(printable(", ".join(header))) or "nothing"
+        raise ValueError(
+            f"its first row must name the columns {' and '.join(missing)}; it has {found}. "
+            f"The columns are {', '.join(COLUMNS)}"
+        )
+    for name in header:
+        if name and name not in COLUMNS:
+            known = ", ".join(COLUMNS)
+            raise ValueError(f"there is no column {shorten(printable(name))!r}, only {known}{meant(name, COLUMNS)}")
+        if name and header.count(name) > 1:
+            raise ValueError(f"the column {name} is there twice")
+    return list(header)
+
+
+def _entry(cells: Mapping[str, str], *, decimal_comma: bool) -> dict[str, object]:
+    """Return a row's cells as the entry of a TOML table; ValueError if one is wrong."""
+    if "type" not in cells:
+        raise ValueError("the type is missing")
+    entry: dict[str, object] = {name: cells[name] for name in COLUMNS[1:5] if name in cells}
+    if "initial" in cells:
+        real = cells["type"].upper() in ("REAL", "LREAL")
+        entry["initial"] = _with_point(cells["initial"], decimal_comma) if real else cells["initial"]
+    if "scale" in cells:
+        numbers = [_number("scale", part, decimal_comma) for part in re.split(r"[\s;]+", cells["scale"])]
+        entry["scale"] = numbers[0] if len(numbers) == 1 else numbers
+    if "deadband" in cells:
+        entry["deadband"] = _number("deadband", cells["deadband"], decimal_comma)
+    if "writable" in cells:
+        found = _BOOLS.get(cells["writable"].lower())
+        if found is None:
+            raise ValueError(f"writable: expected true or false, found {shorten(printable(cells['writable']))!r}")
+        entry["writable"] = found
+    return entry
+
+
+def _with_point(text: str, decimal_comma: bool) -> str:
+    """Return a number with a decimal point."""
+    return text.replace(",", ".") if decimal_comma and text.count(",") == 1 and "." not in text else text
+
+
+def _number(name: str, text: str, decimal_comma: bool) -> float:
+    number = _with_point(text, decimal_comma)
+    if not _NUMBER.fullmatch(number):
+        raise ValueError(f"{name}: expected a number, found {shorten(printable(text))!r}")
+    return float(number)
