@@ -793,7 +793,14 @@ def test_status_has_the_documented_keys_in_order(instance: str, capsys: pytest.C
     page = (ROOT / "docs/reference/cli-supervisor.md").read_text()
     layout = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
     blocks = [BlockSpec("cell", layout, 20_000_000, 3600 * 10**9, 1 << 16)]
-    kinds = {"source": "cell", "emulator": "plc", "grpc": "grpc", "mqtt": "mqtt", "recorder": "recorder"}
+    kinds = {
+        "source": "cell",
+        "emulator": "plc",
+        "grpc": "grpc",
+        "opcua": "opcua",
+        "mqtt": "mqtt",
+        "recorder": "recorder",
+    }
     with Segment.create(instance, blocks, [ProcessSpec(name, kind) for kind, name in kinds.items()]) as segment:
         assert main(["status", "--json", "--instance", instance]) == 0
         segment.unlink()
