@@ -208,3 +208,11 @@ def test_a_status_area_that_does_not_fit_is_refused(layout: Layout, key: str, by
     document[key] += by
     with pytest.raises(LayoutError):
         load_layout(json.dumps(document).encode())
+
+
+def test_a_status_area_that_is_not_aligned_is_refused(layout: Layout) -> None:
+    document = json.loads(layout.with_statuses().to_json())
+    document["status_offset"] += 4
+    document["size"] += 4
+    with pytest.raises(LayoutError, match="not aligned"):
+        load_layout(json.dumps(document).encode())

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.modbus import connector as module
 from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
 from shmio.connectors.registry import convert_options
@@ -25,6 +26,7 @@ from shmio.model.statuses import (
     GOOD,
     StatusArea,
 )
+from shmio.testing.proxy import FaultProxy
 from tests.unit.connectors.modbus.device import WORDS, Device
 
 
@@ -257,3 +259,29 @@ def test_a_unit_that_does_not_answer_its_gateway_leaves_the_others_good(
         now_ns[0] += module.GATEWAY_RETRY_NS
         assert values(connector, layout)["here"] == 0
         assert len(device.calls()) == 2
+
+
+def test_a_gap_may_join_two_requests(device: Device) -> None:
+    tags = {"one": tag("UINT", "holding 0"), "two": tag("UINT", "holding 20")}
+    for max_gap, expected in ((18, [(3, 0, 1), (3, 20, 1)]), (19, [(3, 0, 21)])):
+        with connected(device, tags, max_gap=max_gap) as (connector, _):
+            connector.read()
+            assert device.calls() == expected
+
+
+def test_each_lost_write_is_reported_by_what_is_known_of_it(device: Device) -> None:
+    tags = {"list": tag("ARRAY[0..2] OF UINT", "holding 0")}
+    framing = lambda data: 6 + int.from_bytes(data[4:6], "big") if len(data) >= 6 else 0  # noqa: E731
+    with FaultProxy(device.address, framing=framing) as proxy:
+        address = proxy.address
+        with connected(device, tags, host=address.host, port=address.port, timeout=300) as (connector, layout):
+            passed = iter((True, False))
+            proxy.edit(lambda frame: frame if next(passed, False) else None)
+            writes = [encode(find(layout, f"list/{place}"), 7, "little")[0] for place in range(3)]
+            with pytest.raises(WriteLostError, match="no answer within 300 ms") as lost:
+                connector.write(writes)
+            assert lost.value.outcomes == ("", Lost.UNKNOWN, Lost.UNSENT)
+            assert not device.get("holding", 2)[0]
+            with pytest.raises(WriteLostError, match="not connected") as lost:
+                connector.write(writes[:1])
+            assert lost.value.outcomes == (Lost.UNSENT,)

@@ -7,10 +7,12 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from shmio.client import connect_aio
+from shmio.endpoints.grpc.encoding import Subject, unless_bad
 from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, UNCERTAIN_LAST_USABLE_VALUE
 from shmio.model.values import Quality
-from shmio.segment import BlockWriter
+from shmio.segment import BlockWriter, EventKind, Record
 from shmio.wire import simlog_v2_pb2 as v2
+from tests.unit.endpoints.grpc.test_grpc import Recorder
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, message, serve
 from tests.unit.statuses import COUNT, LAYOUT, SOURCE_NS, SPEED, first_image, plant
 
@@ -105,5 +107,43 @@ def test_a_stream_of_shmio_v1_sends_changed_statuses_alone(instance: str) -> Non
             update = await anext(updates)
             (reading,) = update.readings
             assert (reading.quality, reading.source_time) == (Quality.GOOD, (SOURCE_NS + 60) / 1e9)
+
+    served(instance, test)
+
+
+def test_a_value_written_to_a_bad_register_is_shown_on_in(instance: str) -> None:
+    async def test(endpoint: Endpoint, writer: BlockWriter) -> None:
+        image = first_image()
+        image.fail(COUNT, BAD_NODE_ID_UNKNOWN)
+        writer.publish(bytes(image), cycle=1)
+        stream = endpoint.subscribe("plant/count/in")
+        await stream.initial_metadata()
+        writer.event(Record(EventKind.ACCEPTED, "", 7, 1, 0, 1, 0, 0, 2, b"\x05\0"))
+        assert await text(stream) == "5"
+
+    served(instance, test)
+
+
+def test_a_value_that_waits_in_a_stream_is_dropped_when_its_register_turns_bad(instance: str) -> None:
+    async def test(endpoint: Endpoint, writer: BlockWriter) -> None:
+        image = first_image()
+        feed = endpoint.feeds["plant"]
+        registers = (LAYOUT.registers[SPEED],)
+        speed = Subject("raw", "speed", registers, unless_bad(lambda one: one.image, registers, LAYOUT))
+        stream = Recorder()
+        feed.listen(speed, stream)
+        writer.publish(bytes(image), cycle=1)
+
+        async def delivered() -> bool:
+            return bool(stream.got)
+
+        async def dropped() -> bool:
+            return stream.lost == 1
+
+        await endpoint.until(delivered)
+        image.fail(SPEED, BAD_NODE_ID_UNKNOWN)
+        writer.publish(bytes(image), cycle=2)
+        await endpoint.until(dropped)
+        feed.leave(speed, stream)
 
     served(instance, test)
