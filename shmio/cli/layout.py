@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from shmio.cli import layout_import
 from shmio.cli.run import add_json, complete, dumps, run
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program, Source
@@ -21,10 +22,14 @@ _HEADINGS = ("offset", "size", "type", "path", "initial", "comment")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit status: 0 done, 1 failed, 2 wrong usage."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["import"]:
+        return layout_import.main(given[1:])
     parser = argparse.ArgumentParser(
         prog="shmio-layout",
         description="Compile the data blocks of a source exported by TIA Portal or STEP 7 and print each register: "
-        "path, type, byte offset, bit, size.",
+        "path, type, byte offset, bit, size. 'shmio-layout import FILE' converts a tag list "
+        "into a tag table; see its --help.",
     )
     parser.add_argument("file", metavar="FILE", help="the source with the data blocks (.db, .awl, .scl)")
     parser.add_argument(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import csv
 import io
 import re
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -19,14 +18,13 @@ from shmio.errors import Diagnostic
 from shmio.layout.model import MAX_REGISTERS
 from shmio.layout.report import Report
 from shmio.layout.topic import shorten
+from shmio.layout.workbook import WorkbookError, read_rows
 from shmio.logs import printable
 
 SUFFIXES: Final = (".csv", ".xlsx")
 COLUMNS: Final = ("path", "type", "address", "unit", "comment", "scale", "initial", "deadband", "writable")
 _NEEDED: Final = ("path", "type")
 _BOOLS: Final = {"true": True, "yes": True, "1": True, "x": True, "false": False, "no": False, "0": False}
-_MAX_UNPACKED: Final = 64 << 20
-_MAX_MEMBERS: Final = 1000
 _NUMBER: Final = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 
 
@@ -42,6 +40,9 @@ def read_sheet(file: str, data: bytes, report: Report) -> Sheet:
     try:
         rows, comma = _rows_of(file, data)
         return _sheet(file, rows, report, decimal_comma=comma)
+    except WorkbookError as error:
+        report.add(Diagnostic(file, error.row, 1, f"not a tag table: {error}"))
+        return Sheet({}, {})
     except (ValueError, csv.Error) as error:
         report.add(Diagnostic(file, 1, 1, f"not a tag table: {error}"))
         return Sheet({}, {})
@@ -50,7 +51,7 @@ def read_sheet(file: str, data: bytes, report: Report) -> Sheet:
 def _rows_of(file: str, data: bytes) -> tuple[Iterable[tuple[int, Sequence[str]]], bool]:
     """Return the rows with their numbers, and whether numbers have a decimal comma; ValueError."""
     if file.lower().endswith(".xlsx"):
-        return _spreadsheet(data), False
+        return read_rows(data, _sheet_of_tags), False
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -70,43 +71,8 @@ def _numbered(reader: Iterator[list[str]]) -> Iterator[tuple[int, Sequence[str]]
         line = reader.line_num + 1  # type: ignore[attr-defined]  # csv's readers have it
 
 
-def _spreadsheet(data: bytes) -> Iterator[tuple[int, Sequence[str]]]:
-    """Yield the rows of a workbook's first sheet, or of its sheet ``tags``.
-
-    Raises:
-        ValueError: It is not a workbook, too large, or the library is missing.
-
-    """
-    try:
-        from openpyxl import load_workbook  # noqa: PLC0415  an extra
-    except ImportError:
-        raise ValueError("to read an .xlsx file: pip install 'shmio[xlsx]', or save it as CSV") from None
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = archive.infolist()
-        if len(members) > _MAX_MEMBERS or sum(member.file_size for member in members) > _MAX_UNPACKED:
-            raise ValueError(f"it unpacks to more than {_MAX_UNPACKED} bytes or {_MAX_MEMBERS} files")
-        book = load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-    except ValueError:
-        raise
-    except Exception as error:  # noqa: BLE001  openpyxl raises errors of any kind for damaged files
-        raise ValueError(f"the file is not a workbook, or damaged ({type(error).__name__})") from None
-    try:
-        sheet = next((one for one in book.worksheets if one.title.lower() == "tags"), book.worksheets[0])
-        for number, row in enumerate(sheet.iter_rows(values_only=True), 1):
-            yield number, [_text(cell) for cell in row]
-    except Exception as error:  # noqa: BLE001  as above, while it reads the rows
-        raise ValueError(f"the workbook is damaged ({type(error).__name__})") from None
-    finally:
-        book.close()
-
-
-def _text(cell: object) -> str:
-    if cell is None:
-        return ""
-    if isinstance(cell, bool):
-        return "true" if cell else "false"
-    return str(int(cell)) if isinstance(cell, float) and cell.is_integer() else str(cell)
+def _sheet_of_tags(names: Sequence[str]) -> str | None:
+    return next((name for name in names if name.lower() == "tags"), names[0] if names else None)
 
 
 def _sheet(file: str, rows: Iterable[tuple[int, Sequence[str]]], report: Report, *, decimal_comma: bool) -> Sheet:

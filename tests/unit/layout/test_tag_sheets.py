@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import io
+import re
 import zipfile
 from collections.abc import Sequence
 from typing import Any
@@ -164,3 +165,21 @@ def test_a_damaged_workbook_is_a_table_or_refused(changes: list[tuple[int, int]]
         compiled("tags.xlsx", bytes(damaged))
     except LayoutError:
         return
+
+
+@pytest.mark.parametrize(
+    ("pattern", "absurd"), [('<row r="2"', '<row r="99999999999"'), ('ref="A1:[A-Z0-9]+"', 'ref="A1:XFD1048576"')]
+)
+def test_a_workbook_with_absurd_numbers_of_rows_is_read_within_bounds(pattern: str, absurd: str) -> None:
+    with zipfile.ZipFile(io.BytesIO(WORKBOOK)) as opened:
+        parts = {name: opened.read(name) for name in opened.namelist()}
+    [sheet] = [name for name, content in parts.items() if b'<row r="2"' in content]
+    changed, count = re.subn(pattern, absurd, parts[sheet].decode())
+    assert count == 1
+    with zipfile.ZipFile(stream := io.BytesIO(), "w") as made:
+        for name, content in parts.items():
+            made.writestr(name, changed if name == sheet else content)
+    if "row" in pattern:
+        assert "there are no rows" in refusal("tags.xlsx", stream.getvalue())
+    else:
+        assert compiled("tags.xlsx", stream.getvalue()) == compiled("tags.xlsx", WORKBOOK)

@@ -1,0 +1,55 @@
+"""``shmio-layout import``: convert a plant's tag list into a tag table."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from shmio.cli.run import run
+from shmio.layout.importing.found import ImportingError
+from shmio.layout.importing.importer import FORMATS, MAX_BYTES, import_tags
+from shmio.logs import printable
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command; return its exit status: 0 done, 1 failed, 2 wrong usage."""
+    parser = argparse.ArgumentParser(
+        prog="shmio-layout import",
+        description=f"Convert a tag list into a tag table, and report what was left out. Imports {FORMATS}.",
+    )
+    parser.add_argument("file", metavar="FILE", type=Path, help="the list, as the vendor's tool wrote it")
+    parser.add_argument(
+        "-o", "--output", metavar="TABLE.toml", type=Path, help="the new tag table; default: standard output"
+    )
+    parser.add_argument(
+        "--writable", action="store_true", help="commands may write what the vendor's tool lets others write"
+    )
+    options = parser.parse_args(arguments)
+    return run(parser.prog, lambda: _import(options.file, options.output, writable=options.writable), options)
+
+
+def _import(file: Path, output: Path | None, *, writable: bool) -> int:
+    if output is not None and output.suffix != ".toml":
+        raise ImportingError(f"{output}: the table is TOML: have its name end in .toml")
+    with file.open("rb") as stream:
+        data = stream.read(MAX_BYTES + 1)
+    try:
+        found = import_tags(data)
+    except ImportingError as error:
+        raise ImportingError(f"{file}: {error}") from None
+    for line in found.report():
+        print(printable(line), file=sys.stderr)
+    if not found.tags:
+        raise ImportingError(f"{file}: nothing to import")
+    table = found.to_toml(file.name, writable=writable)
+    if output is None:
+        print(table, end="")
+        return 0
+    try:
+        with output.open("x", encoding="utf-8") as stream:
+            stream.write(table)
+    except FileExistsError:
+        raise ImportingError(f"{output}: exists already; remove it, or name another file") from None
+    return 0

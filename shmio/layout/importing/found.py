@@ -1,0 +1,125 @@
+"""What an importer found: tags that fit into a tag table, and what it left out and why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from shmio.errors import LayoutError, PathError, ShmioError
+from shmio.layout.model import MAX_REGISTERS
+from shmio.layout.tags import place_tags
+from shmio.layout.topic import canonical_path, encode_segment, shorten
+from shmio.logs import printable
+
+MAX_TEXT: Final = 1000
+_NAMES_SHOWN: Final = 5
+
+
+class ImportingError(ShmioError):
+    """A file is no tag list that can be imported; the text says why."""
+
+
+@dataclass
+class Found:
+    """The tags of a file, in its order.
+
+    Attributes:
+        kind: Name of the format, for people.
+        tags: For each path the entry of a tag table.
+        remarks: What people should know of the file as a whole.
+
+    """
+
+    kind: str
+    tags: dict[str, dict[str, object]] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+    _skipped: dict[str, list[str]] = field(default_factory=dict)
+    _heads: set[str] = field(default_factory=set)
+
+    def add(self, names: tuple[str, ...], kind: str, **columns: object) -> None:
+        """Add a tag, or skip it if no tag table can have it.
+
+        Args:
+            names: The segments of the path, as the vendor spells them.
+            kind: The type in a tag table.
+            columns: Other columns of a tag table; None and "" count as left out.
+
+        """
+        shown = "/".join(names)
+        try:
+            path = canonical_path("/".join(encode_segment(name) for name in names))
+        except PathError as error:
+            return self.skip(shown, f"the name cannot be a path: {error}")
+        entry = {"type": kind, **{name: cell for name, cell in columns.items() if cell not in (None, "", False)}}
+        if isinstance(comment := entry.get("comment"), str):
+            entry["comment"] = " ".join(printable(comment).split())[:MAX_TEXT]
+        if isinstance(unit := entry.get("unit"), str) and len(unit) > 64:
+            del entry["unit"]
+        heads = list(_heads(path))
+        if path in self.tags:
+            return self.skip(shown, "the name is there twice")
+        if path in self._heads or any(head in self.tags for head in heads):
+            return self.skip(shown, "the name is that of a tag and of a group of tags")
+        if len(self.tags) >= MAX_REGISTERS:
+            return self.skip(shown, f"a tag table has at most {MAX_REGISTERS} registers")
+        try:
+            place_tags("import", {path: entry})
+        except LayoutError as error:
+            found = error.diagnostics[0].message if error.diagnostics else str(error)
+            return self.skip(shown, found.removeprefix(f"{shorten(printable(path))}: "))
+        self.tags[path] = entry
+        self._heads.update(heads)
+        return None
+
+    def skip(self, name: str, why: str) -> None:
+        """Leave out one thing of the file."""
+        self._skipped.setdefault(why, []).append(name)
+
+    @property
+    def skipped(self) -> Mapping[str, list[str]]:
+        """The names of what was left out, by reason."""
+        return self._skipped
+
+    def report(self) -> Iterator[str]:
+        """Yield the lines of the report."""
+        yield f"imported {len(self.tags)} tag{'s' * (len(self.tags) != 1)} from {self.kind}"
+        for why, names in self._skipped.items():
+            shown = ", ".join(shorten(name, 60) for name in names[:_NAMES_SHOWN])
+            more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+            yield f"skipped {len(names)}: {why}: {shown}{more}"
+        yield from self.remarks
+
+    def to_toml(self, source: str, *, writable: bool) -> str:
+        """Return the tag table.
+
+        Args:
+            source: Name of the file, for the first line.
+            writable: Whether to keep which tags the vendor's tool lets others write.
+
+        """
+        lines = [f"# {printable(self.kind)}, imported from {printable(source)}", "[registers]"]
+        for path, entry in self.tags.items():
+            cells = {name: cell for name, cell in entry.items() if writable or name != "writable"}
+            lines.append(f"{_toml(path)} = {_entry(cells)}")
+        return "\n".join([*lines, ""])
+
+
+def _heads(path: str) -> Iterator[str]:
+    head = path.rpartition("/")[0]
+    while head:
+        yield head
+        head = head.rpartition("/")[0]
+
+
+def _entry(cells: Mapping[str, object]) -> str:
+    if cells.keys() == {"type"}:
+        return _toml(cells["type"])
+    return "{ " + ", ".join(f"{name} = {_toml(cell)}" for name, cell in cells.items()) + " }"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,0 +1,44 @@
+"""Import the workbook that TIA Portal exports from *PLC tags* (``PLCTags.xlsx``)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from shmio.layout.importing.found import Found, ImportingError
+from shmio.layout.importing.s7_address import value_type
+from shmio.layout.workbook import WorkbookError, read_rows
+
+SHEET: Final = "PLC Tags"
+_NEEDED: Final = ("name", "data type", "logical address")
+
+
+def read(data: bytes) -> Found:
+    """Return the tags of the sheet ``PLC Tags``; ImportingError if the file is no such workbook."""
+    try:
+        rows = read_rows(data, lambda names: SHEET if SHEET in names else None)
+    except WorkbookError as error:
+        raise ImportingError(f"{error}; expected an export of TIA Portal's PLC tags with the sheet {SHEET!r}") from None
+    found = Found("PLC tags of TIA Portal")
+    header = {name.strip().lower(): place for place, name in enumerate(rows[0][1])} if rows else {}
+    if missing := [name for name in _NEEDED if name not in header]:
+        raise ImportingError(f"the sheet {SHEET!r} lacks the columns {', '.join(missing)}")
+    for number, cells in rows[1:]:
+
+        def cell(column: str, cells: list[str] = cells) -> str:
+            place = header.get(column)
+            return cells[place].strip() if place is not None and place < len(cells) else ""
+
+        name, kind, address = cell("name"), cell("data type"), cell("logical address")
+        comment = cell("comment")
+        if not name:
+            found.skip(f"row {number}", "the row has no name")
+        elif not address:
+            found.skip(name, "the tag has no address")
+        elif kind.startswith('"'):
+            found.skip(name, "a PLC data type; name its members in the table")
+        else:
+            found.add(
+                (name,), value_type(kind), address=address, comment="" if comment == "<No Value>" else comment,
+                writable=cell("hmi writeable").lower() == "true",
+            )  # fmt: skip
+    return found
