@@ -27,6 +27,7 @@ _INSTEAD: Final = (
     "in TIA Portal, open the context menu of the data block, choose 'Generate source from blocks', and name the "
     ".db file that it writes"
 )
+_CONVERT: Final = "'shmio-layout import' makes a tag table of it; for a data block, "
 _ZIP: Final = b"PK\x03\x04"
 _OLD_OFFICE: Final = b"\xd0\xcf\x11\xe0"
 _CONTROLS: Final = bytes({*range(32)} - {*b"\t\n\f\r"})
@@ -81,9 +82,9 @@ def foreign(file: str, data: bytes) -> str:
     wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = decode(head[: len(head) & ~1] if wide else head).text
     if _MARKUP.match(text) or name.endswith(".xml"):
-        return f"this is XML, as TIA Portal Openness exports blocks, which shmio cannot read: {_INSTEAD}"
+        return f"this is XML, as TIA Portal Openness exports blocks: {_CONVERT}{_INSTEAD}"
     if name.endswith((".csv", ".sdf", ".tsv")) or _is_table(text, data):
-        return f"this is a table of tags without their places in a data block: {_INSTEAD}"
+        return f"this is a table of tags without their places in a data block: {_CONVERT}{_INSTEAD}"
     controls = len(head) - len(head.translate(None, _CONTROLS))
     if not wide and controls > max(len(head) // 20, 8):
         return f"this is not a text file: {_INSTEAD}"
