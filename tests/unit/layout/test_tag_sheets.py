@@ -86,6 +86,7 @@ def as_xlsx(rows: Sequence[Sequence[Any]], title: str = "tags") -> bytes:
         ("tags.xlsx", as_xlsx([HEADER, *ROWS])),
         ("tags.xlsx", as_xlsx([HEADER, *ROWS], "Pumps")),
     ],
+    ids=["commas", "semicolons", "tabs", "other order", "workbook", "other sheet"],  # a workbook has the time in it
 )
 def test_a_sheet_says_the_same_as_toml(file: str, data: bytes) -> None:
     assert compiled(file, data).registers == compiled("tags.toml", TABLE.encode()).registers

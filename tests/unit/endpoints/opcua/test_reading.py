@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from asyncua import ua
 
+from shmio.layout.model import Layout, Register
+from shmio.model.statuses import RegisterStatus, status_area
 from shmio.segment import Quality, Segment
 from tests.unit.endpoints.harness import LAYOUT, image
-from tests.unit.endpoints.opcua.harness import ABOUT, Changes, Served, node, serve
+from tests.unit.endpoints.opcua.harness import ABOUT, Changes, Served, node, processes, serve, spec
 
 
 def test_the_instance_is_a_tree_of_objects_and_variables(segment: Segment, instance: str) -> None:
@@ -92,3 +94,59 @@ def test_bad_quality_reaches_every_variable(segment: Segment) -> None:
             await changes.until("cell/step", lambda value: value.StatusCode.is_good())
 
     serve(segment, test)
+
+
+def test_a_stale_value_and_bytes_that_are_no_value_are_bad(instance: str) -> None:
+    layout = Layout(
+        "DB1", 1, 8, False,
+        (Register("day", "DATE_AND_TIME", (), 0, None, 8, 1),),
+    )  # fmt: skip
+
+    async def test(one: Served) -> None:
+        one.publish(b"\x24\x02\x29\x12\x34\x56\x78\x94")
+        async with one.client() as client:
+            changes = Changes()
+            subscription = await client.create_subscription(20, changes)
+            await subscription.subscribe_data_change(node(client, "cell/day"))
+            await changes.until("cell/day", lambda value: value.Value.Value == "2024-02-29T12:34:56.789")
+            one.publish(b"\xff" * 8)
+            await changes.until("cell/day", lambda value: value.StatusCode.name == "BadDecodingError")
+            await changes.until("cell/day", lambda value: value.StatusCode.name == "BadOutOfService")
+            found = await node(client, "cell/day").read_data_value(raise_on_bad_status=False)
+            assert found.StatusCode.name == "BadOutOfService"
+
+    with Segment.create(instance, [spec(layout=layout, stale_ns=300_000_000)], processes()) as segment:
+        serve(segment, test)
+        segment.unlink()
+
+
+def test_each_register_has_the_status_and_time_that_its_device_gives(instance: str) -> None:
+    registers = (Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1))
+    layout = Layout("TAGS", None, 4, False, registers).with_statuses()
+    area = status_area(layout)
+    assert area is not None
+
+    def frame(code: int, time_ns: int) -> bytes:
+        raw = bytearray(layout.size)
+        raw[:4] = b"\0\1\0\2"
+        area.put(raw, 0, RegisterStatus(0, 1_000_000_000))
+        area.put(raw, 1, RegisterStatus(code, time_ns))
+        return bytes(raw)
+
+    async def test(one: Served) -> None:
+        one.publish(frame(0, 2_000_000_000))
+        async with one.client() as client:
+            changes = Changes()
+            subscription = await client.create_subscription(20, changes)
+            await subscription.subscribe_data_change([node(client, "cell/a"), node(client, "cell/b")])
+            good = await changes.until("cell/b", lambda value: value.Value.Value == 2)
+            assert good.SourceTimestamp.timestamp() == 2
+            one.publish(frame(0x808C0000, 3_000_000_000))
+            bad = await changes.until("cell/b", lambda value: value.StatusCode.is_bad())
+            assert (bad.StatusCode.name, bad.SourceTimestamp.timestamp()) == ("BadSensorFailure", 3)
+            assert [path for path, _ in changes.seen].count("cell/a") == 1
+            assert (await node(client, "cell/a").read_data_value()).SourceTimestamp.timestamp() == 1
+
+    with Segment.create(instance, [spec(layout=layout)], processes()) as segment:
+        serve(segment, test)
+        segment.unlink()
