@@ -133,6 +133,7 @@ def test_shmio_v1(cell: Cell, local: Attachment) -> None:
         assert local.write({"cell/Outputs/130": 0x81})[0].done
         values = {"cell/Outputs/130.%X1": True, "cell/Outputs/130.%X7": False, "cell/Outputs/131..132": [8, 9]}
         assert [outcome.kind for outcome in remote.write(values)] == ["written"] * 3
+        until(lambda: local["cell/Outputs/132"] == 9, "the frame after the write")
         read = remote.read("cell/Outputs/130.%X1", "cell/Outputs/130.%X7", "cell/Outputs/131..132")
         assert [(path, read[path]) for path in read] == [
             ("cell/Outputs/130.%X1", True),

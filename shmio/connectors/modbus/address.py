@@ -141,7 +141,7 @@ class WordCodec:
 
     def __init__(self, address: Address, register: Register, word_order: Order, byte_order: Order) -> None:
         self._text = address.kind.base == "STRING"
-        self._bytes = 2 * address.width
+        self._bytes, self._length = 2 * address.width, address.kind.length
         self._swap_bytes, self._swap_words = byte_order == "little", word_order == "little" and not self._text
         self._scale = register.scale
         self._whole = register.element.base not in ("REAL", "LREAL")
@@ -154,7 +154,7 @@ class WordCodec:
         """Return the value of an element's words, as the device sent them."""
         data = self._ordered(data)
         if self._text:
-            return data.partition(b"\0")[0].decode("latin-1")
+            return data[: self._length].partition(b"\0")[0].decode("latin-1")
         number: int | float = self._struct.unpack(data)[0]
         value = number if self._scale is None else number * self._scale[0] + self._scale[1]
         return round(value) if self._whole and math.isfinite(value) else value

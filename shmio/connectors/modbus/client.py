@@ -118,8 +118,8 @@ class ModbusClient:
         head = self._transaction.to_bytes(2, "big") + b"\0\0"
         request = head + (2 + len(data)).to_bytes(2, "big") + bytes((unit, function)) + data
         try:
-            self.sent = True
             self._socket.settimeout(self._left_s())
+            self.sent = True
             self._socket.sendall(request)
             got = self._receive(_HEADER + 1)
             length = int.from_bytes(got[4:6], "big") - 2

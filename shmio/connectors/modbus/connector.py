@@ -125,7 +125,7 @@ class ModbusConnector(Connector):
             raise ConfigError(f"layout: {error}: raise max_registers or max_bits") from None
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
         self._left_alone: dict[object, tuple[int, int]] = {}  # by request or unit: until when (ns), and the status
-        self._masks_refused = False
+        self._no_masks: set[int] = set()  # units that do not know function 22
 
     @property
     def timeout_s(self) -> float:
@@ -140,6 +140,7 @@ class ModbusConnector(Connector):
         """Connect to the device; ConnectorError if it cannot be reached."""
         self._client.connect()
         self._left_alone.clear()
+        self._no_masks.clear()
 
     def close(self) -> None:
         """Close the connection."""
@@ -230,14 +231,14 @@ class ModbusConnector(Connector):
         If the device does not know function 22, read the word, change the bit and write the word: a
         change that the device makes in between is lost.
         """
-        if function != client.MASK_WORD or not self._masks_refused:
+        if function != client.MASK_WORD or unit not in self._no_masks:
             try:
                 self._client.write(unit, function, data)
             except RefusedError as error:
                 if function != client.MASK_WORD or error.code != client.ILLEGAL_FUNCTION:
                     raise
-                self._masks_refused = True
-                log.warning("the device cannot write single bits (function 22): their words are read and written back")
+                self._no_masks.add(unit)
+                log.warning("unit %d cannot write single bits (function 22): words are read and written back", unit)
             else:
                 return
         start, keep, put = (int.from_bytes(data[at : at + 2], "big") for at in (0, 2, 4))
@@ -294,12 +295,16 @@ class ModbusConnector(Connector):
         covered = bytearray(self._layout.size)
         apply(write, image)
         apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
-        chosen = [
-            place
-            for place, (at, bit) in enumerate(_places(register))
-            if covered[at] & (0xFF if bit is None else 1 << bit)
-        ]
+        chosen = []
+        for place, (at, size, bits) in enumerate(_places(register)):
+            part = sum(1 for byte in covered[at : at + size] if byte & bits)
+            if 0 < part < size:
+                raise ValueError("a part of a value cannot be written: write the whole value")
+            if part:
+                chosen.append(place)
         values = _flat(codec(register, self._layout.byte_order).decode(bytes(image)))
+        if any(values[place] is None for place in chosen):
+            raise ValueError(f"the bytes are not a valid {register.type}")
         for first, some in _runs(chosen, self._most(one)):
             start = (address.number + first * address.width).to_bytes(2, "big")
             yield self._request(one, start, [values[place] for place in range(first, first + some)])
@@ -330,14 +335,14 @@ class ModbusConnector(Connector):
         return one.unit, client.WRITE_WORDS, start + (len(words) // 2).to_bytes(2, "big") + bytes((len(words),)) + words
 
 
-def _places(register: Register) -> Iterator[tuple[int, int | None]]:
-    """Yield the byte where each element begins, and its bit if it is a BOOL."""
+def _places(register: Register) -> Iterator[tuple[int, int, int]]:
+    """Yield for each element its first byte, its size, and the bits of each byte that are its own."""
     if register.type == "BOOL":
         for byte, bit in bit_positions(register):
-            yield register.offset + byte, bit
+            yield register.offset + byte, 1, 1 << bit
     else:
         for place in range(register.count):
-            yield register.offset + place * register.element.stride, None
+            yield register.offset + place * register.element.stride, register.element.size, 0xFF
 
 
 def _runs(places: Sequence[int], most: int) -> Iterator[tuple[int, int]]:

@@ -150,13 +150,19 @@ class RegisterChannel(_RuledChannel):
         self._decode = codec(register, follower.block.layout.byte_order).decode
         self._to_text = texts(register)
         self._sent: Value = None
+        self._sent_quality: Quality | None = None
+        """The quality of the register's status in the last message; None if the source gives registers none."""
 
     def moved(self, image: bytes) -> bool:
-        """Return whether the value is outside the dead-band around the last value sent."""
-        if not self._deadband:
+        """Return whether the value is outside the dead-band around the last value sent, or the quality another."""
+        if not self._deadband or self._quality_in(image) is not self._sent_quality:
             return True
         pairs = zip(_flat(self._decode(image)), _flat(self._sent), strict=False)
         return self._sent is None or any(_apart(new, old, self._deadband) for new, old in pairs)
+
+    def _quality_in(self, image: bytes) -> Quality | None:
+        area = self._follower.block.statuses
+        return None if area is None else area.quality(image, area.index(self._register))
 
     def message(self, *, late: bool = False) -> Message:
         """Make the message. Without a good value, a text is empty, and JSON has the reason."""
@@ -187,7 +193,8 @@ class RegisterChannel(_RuledChannel):
 
     def _note(self, value: Value) -> None:
         if self._deadband:
-            self._sent = value
+            self._sent, frame = value, self._follower.frame
+            self._sent_quality = frame and self._quality_in(frame.image)
         self._pause()
 
 

@@ -132,6 +132,8 @@ class InjectionBase:
         self.number = 0
         """The injection's number; 0 until the number is known."""
         self.given = bytearray(image or bytes(block.layout.size))
+        if (statuses := block.layout.status_offset) is not None:
+            self.given[statuses:] = bytes(len(self.given) - statuses)  # a diverted value is good
         """The values that were diverted to the injection so far, as an image."""
         self._block = block
         self._inner: tuple[bytes, bytes] | None = None  # bits that inner layers set, and their values

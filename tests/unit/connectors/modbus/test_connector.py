@@ -12,6 +12,7 @@ import pytest
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.modbus import connector as module
+from shmio.connectors.modbus.client import ModbusClient, RefusedError
 from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
 from shmio.connectors.registry import convert_options
 from shmio.errors import ConfigError
@@ -19,7 +20,7 @@ from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
-from shmio.layout.values.write import encode
+from shmio.layout.values.write import Write, encode
 from shmio.model.statuses import (
     BAD_OUT_OF_RANGE,
     BAD_TIMEOUT,
@@ -285,3 +286,42 @@ def test_each_lost_write_is_reported_by_what_is_known_of_it(device: Device) -> N
             with pytest.raises(WriteLostError, match="not connected") as lost:
                 connector.write(writes[:1])
             assert lost.value.outcomes == (Lost.UNSENT,)
+
+
+def test_a_part_of_a_value_is_refused_and_changes_nothing(device: Device) -> None:
+    device.set("holding", 0, [0x1234, 0x1122, 0x3344])
+    tags = {"w": tag("WORD", "holding 0"), "d": tag("DWORD", "holding 1"), "name": tag("STRING[3]", "holding 5")}
+    with connected(device, tags) as (connector, layout):
+        for path in ("w.%B0", "w.%B1", "d.%W0", "d.%W1", "d.%B2"):
+            (reason,) = connector.write(encode(find(layout, path), 7, "little"))
+            assert "a part of a value" in reason, path
+        (reason,) = connector.write([Write(find(layout, "name").offset, 0, b"\x0a\xff123")])
+        assert "not a valid STRING[3]" in reason
+        assert device.get("holding", 0, 7) == [0x1234, 0x1122, 0x3344, 0, 0, 0, 0]
+        assert device.calls() == []
+
+
+def test_a_text_of_odd_length_ends_before_the_next_byte(device: Device) -> None:
+    device.set("holding", 0, [0x4142, 0x4344, 0x4520])
+    with connected(device, {"name": tag("STRING[5]", "holding 0")}) as (connector, layout):
+        assert values(connector, layout) == {"name": "ABCDE"}
+
+
+def test_a_unit_that_lacks_function_22_does_not_cost_the_others(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = ModbusClient.write
+
+    def refusing(client: ModbusClient, unit: int, function: int, data: bytes) -> None:
+        if (unit, function) == (2, 22):
+            raise RefusedError(1)
+        write(client, unit, function, data)
+
+    monkeypatch.setattr(ModbusClient, "write", refusing)
+    device.set("holding", 0, [0x00F0], unit=2)
+    tags = {"a": tag("BOOL", "holding 0.1"), "b": tag("BOOL", "unit 2 holding 0.1")}
+    with connected(device, tags) as (connector, layout):
+        for path in ("b", "a", "b"):
+            assert connector.write(encode(find(layout, path), True, "little")) == [""]
+        assert [function for function, _, _ in device.calls()] == [3, 6, 22, 3, 6]
+        assert (device.get("holding", 0), device.get("holding", 0, unit=2)) == ([2], [0x00F2])

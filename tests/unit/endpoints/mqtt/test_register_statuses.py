@@ -73,3 +73,31 @@ def test_a_metric_of_sparkplug_has_the_status_of_its_register(instance: str) -> 
         assert sample.at_ms == SOURCE_NS // 10**6 + 5000
         counts = [one for one in device.samples() if one.metric.name == "count"]
         assert [one.quality for one in counts] == [Quality.GOOD]
+
+
+def test_a_dead_band_does_not_hide_that_a_register_turns_bad(instance: str) -> None:
+    with plant(instance) as (segment, writer):
+        follower = follow(segment.blocks["plant"])
+        image, speed = first_image(), LAYOUT.registers[SPEED]
+        channels = [
+            RegisterChannel(follower, speed, "speed", MqttTopic("**", deadband=0.5, payload=payload))
+            for payload in ("text", "json")
+        ]
+
+        def publish() -> list[bool]:
+            writer.publish(bytes(image), cycle=1)
+            frame = follower.newest()
+            assert frame is not None
+            follower.take(frame)
+            moved = [channel.moved(frame.image) for channel in channels]
+            for channel in channels:
+                channel.message()
+            return moved
+
+        assert publish() == [True, True]
+        image.put(SPEED, 1.6)
+        assert publish() == [False, False]
+        for code in (BAD_NODE_ID_UNKNOWN, UNCERTAIN_LAST_USABLE_VALUE, 0):
+            image.put(SPEED, 1.6, 0, code)
+            assert publish() == [True, True]
+        assert publish() == [False, False]

@@ -65,11 +65,11 @@ def test_a_large_cell_is_served_soon(segment: Segment) -> None:
         async with one.client() as client:
             changes = Changes()
             subscription = await client.create_subscription(20, changes)
-            await subscription.subscribe_data_change([node(client, f"large/{one.path}") for one in registers[:10_000]])
-            await changes.until("large/a99/r9999", lambda value: value.Value.Value == 0)
-            segment.writer("large").publish(bytes(19_998) + b"\0\1" + bytes(20_000), cycle=2)
-            await changes.until("large/a99/r9999", lambda value: value.Value.Value == 1)
-            assert len(changes.seen) == 10_001
+            await subscription.subscribe_data_change([node(client, f"large/{one.path}") for one in registers[:2_000]])
+            await changes.until("large/a19/r1999", lambda value: value.Value.Value == 0)
+            segment.writer("large").publish(bytes(3_998) + b"\0\1" + bytes(36_000), cycle=2)
+            await changes.until("large/a19/r1999", lambda value: value.Value.Value == 1)
+            assert len(changes.seen) == 2_001
             children = await node(client, "large").get_children()
             assert len(children) == 200 + len(ABOUT)
 
