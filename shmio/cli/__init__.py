@@ -1,1 +1,1 @@
-"""The commands: thin over the library, imported by nothing."""
+"""The command-line tools: a thin layer over the library, which never imports them."""

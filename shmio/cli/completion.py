@@ -1,6 +1,6 @@
 """Command-line completion by argcomplete: the shell runs the command, which prints the choices.
 
-argcomplete takes options, verbs and choices from the parsers. This module completes other arguments
+argcomplete itself completes options, verbs and choices. This module completes other arguments
 by their ``dest``.
 """
 
@@ -20,13 +20,13 @@ Completer = Callable[..., Iterable[str]]
 
 
 def script(shell: str) -> str:
-    """Return the code that a shell reads at its start; MissingLibraryError."""
+    """Return the code that a shell reads at its start, or raise MissingLibraryError."""
     text: str = _argcomplete().shellcode(PROGRAMS, shell=shell)
     return text
 
 
 def answer(parser: argparse.ArgumentParser) -> None:
-    """Print the possible completions for the shell, and exit; MissingLibraryError."""
+    """Print the possible completions for the shell and exit, or raise MissingLibraryError."""
     completers = _argcomplete().completers
     files = completers.FilesCompleter
 

@@ -13,10 +13,10 @@ from shmio.version import __version__
 
 PROGRAM = "shmio-dump"
 MODULES = {"info": "examine", "verify": "examine", "cut": "rewrite", "merge": "rewrite", "recover": "rewrite"}
-"""The modules of verbs that are not in one of their own name."""
+"""Modules of the verbs whose module has another name than the verb."""
 SOME_FILES = "print JSON: one object, or a list for several files"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
-"""What ``diff`` can ignore, as in shmio.recording.compare, which only that verb imports."""
+"""Choices of ``diff --ignore``, copied from shmio.recording.compare to save its import."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments, rest = parser.parse_known_args(argv)
     if rest and (arguments.verb != "cat" or any(word.startswith("-") for word in rest)):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    if rest:  # argparse leaves patterns that come after an option
+    if rest:  # argparse does not parse patterns that come after an option
         arguments.patterns = [*arguments.patterns, *rest]
 
     around = arguments.verb == "record" and (arguments.before_s, arguments.after_s) != (None, None)
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     module = MODULES.get(arguments.verb, arguments.verb)
     execute = load(f"shmio.cli.recordings.{module}:{arguments.verb}")
-    with exit_on_signals():  # a file that is being made is removed again
+    with exit_on_signals():  # so that an unfinished file is removed
         return run(PROGRAM, lambda: execute(arguments), arguments)
 
 

@@ -1,7 +1,7 @@
 """The console scripts, with few imports, so that Ctrl-C ends a command at once while it loads.
 
-It does not raise an exception then: one during an import leaves a half-loaded library, and C code
-that uses it crashes.
+Ctrl-C raises no exception meanwhile: an exception during an import would leave a half-loaded
+library, and C code that uses such a library crashes.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from shmio.model.cell import Campaign, Cell
 from shmio.model.injection import Happening
 
 TURN_S: Final = 0.2
-"""Interval at which a campaign's events, signals and the end of the time are checked."""
+"""Interval at which to check for a campaign's events, for signals, and for the end of the time."""
 SEED_BITS: Final = 32
 
 
@@ -54,7 +54,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Start, list or remove injections; PathError, ValueRangeError, CommandError."""
+    """Start, list or lift injections.
+
+    Raises:
+        PathError: A path names no register.
+        ValueRangeError: A value does not fit its register.
+        CommandError: The options contradict each other, or a source refused the injection.
+    """
     if options.lift_all or options.lift is not None:
         return _lift(cell, options)
     if options.file is not None:
@@ -92,7 +98,7 @@ def _seed(text: str) -> int:
 
 
 def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, Value]:
-    """Return what a path names, and the value for it; PathError, ValueRangeError."""
+    """Return what a path names, and the value for it, or raise PathError or ValueRangeError."""
     topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.source not in layouts:
         raise PathError(f"{path}: unknown source {topic.source}")
@@ -104,7 +110,7 @@ def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, V
 
 
 def _wait(for_s: float | None) -> None:
-    """Wait for Ctrl-C, SIGTERM, SIGHUP or the end of the time."""
+    """Wait for Ctrl-C, SIGTERM or SIGHUP, at most for this time."""
     with stop_on_signals() as over:
         over.wait(for_s)
 
@@ -132,7 +138,7 @@ def _list(cell: Cell, *, as_json: bool) -> None:
         bits = (Write(offset, mask, bytes(size)) for offset, size, mask in one.ranges)
         over = [f"{one.source}/{path}" for path in paths_of(layouts[one.source], bits)]
         fields = msgspec.to_builtins(one)
-        if one.running is not None:  # the same order of keys from a local and a remote cell
+        if one.running is not None:  # so that local and remote cells give the same order of keys
             declaration = msgspec.convert(one.running.declaration, Declaration)
             fields["running"]["declaration"] = msgspec.to_builtins(declaration)
         found.append(
@@ -158,7 +164,7 @@ def _list(cell: Cell, *, as_json: bool) -> None:
 
 
 def _targets(one_found: dict[str, Any]) -> list[str]:
-    """Return an injection's targets; those of a declared one as declared."""
+    """Return an injection's targets; for a declared injection, the patterns of its declaration."""
     running = one_found.get("running")
     if running is None:
         return list(one_found["registers"])
@@ -178,7 +184,11 @@ def _running(running: dict[str, Any] | None) -> str:
 def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
     """Run a campaign until all its injections are over, the time is up, or Ctrl-C.
 
-    With ``keep``, return as soon as it has started. ConfigError, CommandError: nothing was started.
+    With ``keep``, return as soon as it has started.
+
+    Raises:
+        ConfigError: The file is wrong. Nothing was started.
+        CommandError: A source refused an injection, or its time has passed. Nothing was started.
     """
     seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
     read = read_campaign(options.file)
@@ -201,7 +211,7 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespace) -> None:
-    """Print events until no injection remains, the time is up, or a signal comes."""
+    """Print events until no injection is left, the time is up, or a signal comes."""
     deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
     names = {(one.source, one.number): one.name for one in campaign.declared}
     unheard = set(names)
@@ -212,7 +222,7 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
     if options.keep:
         return
     told: queue.SimpleQueue[Happening | ShmioError | None] = queue.SimpleQueue()
-    threading.Thread(target=_queue, args=(campaign, told), daemon=True).start()  # it ends with the campaign
+    threading.Thread(target=_queue, args=(campaign, told), daemon=True).start()  # the thread ends with the campaign
     while True:
         ended = over.is_set() or (deadline_s is not None and time.monotonic() > deadline_s)
         while not told.empty():

@@ -72,7 +72,7 @@ def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], 
     try:
         compiled = program.compile(None if block is None else (block,), sizes)
     except LayoutError as error:
-        _complain(one for one in error.diagnostics if one.severity == "warning")  # the error's own text has the others
+        _complain(one for one in error.diagnostics if one.severity == "warning")  # the error's text has the errors
         raise
     _complain(compiled.warnings)
     _complain(f"warning: --type-bytes: nothing has the type {name!r}" for name in compiled.unused)
@@ -83,7 +83,7 @@ def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], 
 
 
 def _read(name: str) -> Source:
-    """Read a source, at most slightly more than allowed: the compiler refuses that."""
+    """Read a source, a few bytes more than allowed at most: the compiler refuses larger files."""
     with Path(name).open("rb") as file:
         return Source(name, file.read(MAX_SOURCE_BYTES + 4))
 
@@ -94,7 +94,7 @@ def _complain(lines: Iterable[object]) -> None:
 
 
 def _unread(layout: Layout) -> Iterator[str]:
-    """Yield warnings about initial values that cannot be read, and that an emulated PLC lacks."""
+    """Yield warnings about initial values that cannot be read; an emulated PLC lacks them."""
     for text in initial_value_warnings(layout):
         yield f"{layout.name}: warning: {text}"
 

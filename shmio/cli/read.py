@@ -136,22 +136,23 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
             lines = [*lines[: max(rows - 2, 0)], more]
         up = f"\x1b[{drawn}F" if drawn else ""
         text = "".join(f"{line}\x1b[K\n" for line in lines)
-        sys.stdout.write(f"{up}\x1b[?7l{text}\x1b[J\x1b[?7h")  # the terminal cuts lines that are too long
+        sys.stdout.write(f"{up}\x1b[?7l{text}\x1b[J\x1b[?7h")  # the terminal cuts long lines
         sys.stdout.flush()
         drawn = len(lines)
     return 0
 
 
 def _changes(cell: Cell, patterns: Sequence[str], *, every_frame: bool) -> Iterator[Sequence[Reading]]:
-    """Yield the present readings of all that the patterns name, then those that have changed.
+    """Yield the present readings of all registers that the patterns name, then those that change.
 
-    NotRunningError: The instance has ended, or a reload has removed a source or a register.
+    Raises:
+        NotRunningError: The instance has ended, or a reload has removed a source or a register.
     """
     batch: Sequence[Reading] = cell.get(*patterns)
     last: dict[str, tuple[object, ...]] = {}
     with cell.subscribe(*patterns, every_frame=every_frame) as updates:
         while True:
-            # A stale reason holds the age: its text changes, the fact does not. repr: a NaN equals itself.
+            # The reason of a stale value contains its age: that part is ignored. repr makes NaNs equal.
             now = {one.path: (repr(one.value), one.quality, one.reason.partition(":")[0]) for one in batch}
             yield [one for one in batch if last.get(one.path) != now[one.path]]
             last |= now
@@ -163,7 +164,7 @@ def _changes(cell: Cell, patterns: Sequence[str], *, every_frame: bool) -> Itera
 
 
 def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Sequence[Reading]]:
-    """Yield all that the patterns name, at once and then every ``every_s`` seconds.
+    """Yield the readings of all registers that the patterns name, now and every ``every_s`` s.
 
     Raises:
         PathError: A pattern names nothing.
@@ -183,7 +184,7 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Seq
 
 
 def _load_numpy(readings: Sequence[Reading]) -> None:
-    """Import numpy, which the text of a REAL needs, while Ctrl-C ends the process at once."""
+    """Import numpy, which formats REAL values; Ctrl-C ends the process at once meanwhile."""
     if any(one.register.element.base == "REAL" for one in readings):
         with ended_by_interrupt():
             import numpy as np  # noqa: F401, PLC0415  other values are printed without it

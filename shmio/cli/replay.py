@@ -46,7 +46,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Carry out the action and print the new states; CommandError, PathError, ValueRangeError."""
+    """Carry out the action and print the new states.
+
+    Raises:
+        CommandError: A source refused the action.
+        PathError: A source or register does not exist.
+        ValueRangeError: A number or time is out of range.
+    """
     found = cell.replay(**_wish(options))
     if options.json:
         print(dumps([msgspec.to_builtins(one) for one in found]))
@@ -56,7 +62,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _wish(options: argparse.Namespace) -> Wish:
-    """Return what the action changes."""
+    """Return the changes that the action makes to a replay."""
     action, value = options.action, options.value
     if (value is None) != (action in _ALONE):
         options.refuse(f"{action} takes no VALUE" if value is not None else f"{action} needs a VALUE: {_VERBS[action]}")

@@ -1,4 +1,4 @@
-"""What all commands share: exit status, output, errors without a traceback, and signals."""
+"""Code that all commands share: exit status, output, errors without a traceback, and signals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shmio.logs import printable
 
 MAX_SECONDS = 86_400
 SHOWN_CHARACTERS = 60
-"""Maximum characters of a value on a terminal."""
+"""Maximum number of characters of a value on a terminal."""
 
 
 class PartlyDoneError(CommandError):
@@ -41,7 +41,7 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
     """
     as_json = getattr(options, "json", False)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # a terminal that is not UTF-8
+        sys.stdout.reconfigure(errors="backslashreplace")  # the terminal may not be UTF-8
     try:
         status = command() or 0
         sys.stdout.flush()
@@ -55,7 +55,7 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        _give_up_output()  # the reader has gone (`| head`)
+        _give_up_output()  # the reader has ended, as with `| head`
         return 141
     except OSError as error:
         _tell(f"{error.filename or program}: {error.strerror}", as_json=as_json)
@@ -67,7 +67,7 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
 def load(command: str) -> Callable[[argparse.Namespace], int]:
     """Import the function of a verb, such as ``shmio.cli.instance.status:status``.
 
-    Each verb needs other parts of shmio. Ctrl-C ends the process at once meanwhile.
+    Only the modules that this verb needs are imported. Ctrl-C ends the process at once meanwhile.
     """
     module, _, function = command.partition(":")
     with ended_by_interrupt():
@@ -144,7 +144,7 @@ def add_full(parser: argparse.ArgumentParser) -> None:
 
 
 def room(options: argparse.Namespace) -> int | None:
-    """Return the maximum characters of a value; None, for all, with ``--full`` or no terminal."""
+    """Return the maximum characters of a value; None (no limit) with ``--full`` or no terminal."""
     return None if options.full or not sys.stdout.isatty() else SHOWN_CHARACTERS
 
 
@@ -158,7 +158,7 @@ def dumps(value: Any, indent: int | None = None) -> str:
 def stop_on_signals() -> Iterator[threading.Event]:
     """Yield an event that the first of these signals sets; restore the handlers at the end.
 
-    SIGHUP counts unless it is ignored, as by nohup.
+    SIGHUP is included unless it is ignored, as under nohup.
     """
     stopping = threading.Event()
 
@@ -179,7 +179,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
 @contextmanager
 def ended_by_interrupt() -> Iterator[None]:
-    """Let Ctrl-C end the process at once and quietly, for imports that an exception would break."""
+    """Let Ctrl-C end the process at once and silently; an exception would break an import."""
     main = threading.current_thread() is threading.main_thread()
     heeded = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heeded:
@@ -201,7 +201,7 @@ def exit_on_signals() -> Iterator[None]:
 
     def end(number: int, _frame: FrameType | None) -> None:
         for other in old:
-            signal.signal(other, signal.SIG_IGN)  # an ending shell repeats it, and must not disturb the undoing
+            signal.signal(other, signal.SIG_IGN)  # a shell may repeat it, which must not end the clean-up
         sys.exit(128 + number)
 
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}

@@ -64,7 +64,7 @@ class Pairs(argparse.Action):
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Write all values of each source as one command; CommandError names the first failure."""
+    """Write all values of each source as one command; raise CommandError with the first failure."""
     wanted: dict[str, dict[str, Value]] = {}
     layouts = cell.layouts()
     for path, text in options.pairs:
@@ -90,7 +90,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         if options.json and outcomes:
             raise PartlyDoneError(str(error), _described(outcomes)) from error
         raise
-    finally:  # also what was written before a later source accepted nothing
+    finally:  # also print the outcomes from before a later source failed
         if not options.json:
             _print(outcomes, failed[0][1].text if failed else "")
     if options.json:
@@ -99,7 +99,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def read_value(text: str, register: Register) -> Value:
-    """Return the value of JSON or an S7 literal for a register; ValueRangeError.
+    """Convert JSON or an S7 literal to a value for a register, or raise ValueRangeError.
 
     An array's literal must have all elements: missing ones would be written as zero.
     """
@@ -141,7 +141,7 @@ def _literal(text: str, register: Register) -> Value:
 
 
 def _target(layouts: Mapping[str, Layout], path: str) -> tuple[str, Register]:
-    """Return the source and the register that a path names; PathError."""
+    """Return the source and the register that a path names, or raise PathError."""
     topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.direction == "out":
         raise PathError(f"{path}: an output of a source cannot be written; leave out /out")

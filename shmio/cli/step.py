@@ -66,7 +66,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _ask(cell: Cell) -> None:
-    """Ask the user to confirm a step that pauses the clock while devices go on in real time.
+    """Ask the user to confirm a step that pauses the clock while devices continue in real time.
 
     Raises:
         CommandError: The user does not confirm.

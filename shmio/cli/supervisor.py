@@ -36,7 +36,7 @@ def _parser() -> argparse.ArgumentParser:
     target.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
 
     def verb(name: str, text: str, *parents: argparse.ArgumentParser, command: str = "") -> argparse.ArgumentParser:
-        """Add a verb; ``command`` is its module and function in ``shmio.cli.instance``, if not its name."""
+        """Add a verb; ``command`` is MODULE:FUNCTION in ``shmio.cli.instance``, else the name."""
         made = verbs.add_parser(name, help=text, description=text, parents=parents)
         made.set_defaults(command=command or f"{name}:{name}")
         return made
@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     up.add_argument("--detach", action="store_true", help="return when it runs, and leave it running")
     _add_replay(up)
-    up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor on which a detached one tells its start
+    up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor for the report of a detached start
     verb("down", "stop the instance", target, command="control:down")
     add_json(verb("status", "show the state of the instance and its processes", target))
     text = "list the instances on this host, their files and the addresses on which they listen"

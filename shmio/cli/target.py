@@ -33,14 +33,16 @@ class Target:
     file: Path | None = None
 
     def open(self, *, writable: bool = False) -> Segment:
-        """Open the instance's segment, with the errors of Segment.open.
+        """Open the instance's segment.
 
-        WrongInstanceError: the instance was started from another file.
+        Raises:
+            SegmentError: The segment cannot be opened; see Segment.open.
+            WrongInstanceError: The instance was started from another file.
         """
         return Segment.open(self.name, writable=writable, config=self.file)
 
     def open_supervised(self) -> Segment:
-        """Open the instance's segment; NotRunningError if its supervisor is dead."""
+        """Open the instance's segment; raise NotRunningError if its supervisor is dead."""
         segment = self.open()
         if not segment.supervised:
             segment.close()
@@ -74,9 +76,9 @@ def target(arguments: argparse.Namespace) -> Target:
 
 
 def config_option(arguments: argparse.Namespace) -> str | None:
-    """Return the option that names the same configuration: ``-c FILE``, or nothing for the default.
+    """Return the option that names the same configuration: ``-c FILE``, or "" for the default.
 
-    None: the instance was named or found running, so its configuration is unknown.
+    Return None if the configuration is unknown, because the instance was named or found running.
     """
     if getattr(arguments, "instance", None) is not None:
         return None
@@ -91,7 +93,7 @@ def option_for(file: Path) -> str:
 
 
 def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
-    """Return the supervisor's answer to a request; ControlError as soon as it appears dead."""
+    """Return the supervisor's answer to a request; raise ControlError once it appears dead."""
     try:
         return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
     except UnreachableError as error:
@@ -99,7 +101,7 @@ def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[st
 
 
 def _named_in(file: Path) -> str:
-    """Read only the name from a file: an invalid file must not prevent stopping its instance."""
+    """Read only the instance's name from a file, so that even an invalid file allows a stop."""
     tables = read_tables(file)
     try:
         name = tables["instance"]["name"]

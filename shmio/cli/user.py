@@ -27,7 +27,7 @@ SHELL_HELP = "Print the code with which a shell completes command lines: see doc
 
 
 class Verb(NamedTuple):
-    """A verb that acts on an instance: its help, what adds its arguments, and what carries it out."""
+    """A verb that acts on an instance: its help, its arguments, and the function that runs it."""
 
     help: str
     arguments: Callable[[argparse.ArgumentParser], None]
@@ -96,7 +96,7 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
         return
     if arguments.config is not None or arguments.instance is not None:
         raise ConfigError("--host names the instance already: leave out -c and --instance")
-    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # the errors that it raises say the same
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its errors say the same
     with ended_by_interrupt():  # gRPC crashes if an exception interrupts its import
         from shmio.client import connect  # noqa: PLC0415  only for --host
     if not arguments.host.startswith(UNIX):

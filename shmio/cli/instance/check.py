@@ -50,8 +50,8 @@ def check(arguments: argparse.Namespace) -> int:
 def _taken(file: Path, plan: Plan) -> list[str]:
     """Return a note for each address that another program uses.
 
-    There is none if the instance runs, or if its processes outlived the supervisor: they hold the
-    addresses, and ``up`` takes them over.
+    If the instance runs, or if its processes outlived the supervisor, there are no notes: these
+    processes use the addresses, and ``up`` takes them over.
     """
     with suppress(ShmioError), Segment.open(plan.instance, config=file) as segment:
         if segment.supervised or any(slot.alive() for slot in segment.processes):
@@ -60,7 +60,7 @@ def _taken(file: Path, plan: Plan) -> list[str]:
 
 
 def _unserved(prepared: Prepared) -> list[str]:
-    """Return a note for each S7 source that reads from this host where nothing listens.
+    """Return a note for each S7 source that reads from an address of this host without a listener.
 
     If the file has emulators, ``prepare`` warns instead.
     """

@@ -1,4 +1,4 @@
-"""``shmio-supervisor down``, ``reload`` and ``restart``: have the running supervisor do something."""
+"""``shmio-supervisor down``, ``reload`` and ``restart``: send requests to the running supervisor."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WHERE_S = 5.0
 
 
 def down(arguments: argparse.Namespace) -> int:
-    """Ask the supervisor to stop, and wait for its end; if it is dead, remove what it left."""
+    """Ask the supervisor to stop, and wait for its end. If it is dead, remove what it left."""
     wanted = target(arguments)
     name = wanted.name
     if name not in instances():
@@ -35,7 +35,7 @@ def down(arguments: argparse.Namespace) -> int:
             if segment.supervised:
                 _stop(segment)
                 return 0
-    except FormatError as error:  # the file that it was started from is unknown
+    except FormatError as error:  # the segment is unreadable, so its configuration file is unknown
         if wanted.file is not None:
             raise FormatError(
                 f"{error}; if its supervisor is dead, `shmio-supervisor down --instance {name}` clears the instance"
@@ -47,7 +47,7 @@ def down(arguments: argparse.Namespace) -> int:
 
 
 def _forget(path: str, name: str) -> None:
-    if path == socket_path(name):  # never a path from another user's segment
+    if path == socket_path(name):  # never use a path from another user's segment
         remove_socket(path)
 
 
@@ -66,14 +66,14 @@ def _stop(segment: Segment) -> None:
 
 
 def _pidfd(pid: int) -> int | None:
-    """Return a descriptor that signals the supervisor's end; None in another PID namespace."""
+    """Return a pidfd of the supervisor, or None if it is in another PID namespace."""
     with suppress(OSError):
         return os.pidfd_open(pid)
     return None
 
 
 def reload(arguments: argparse.Namespace) -> int:
-    """Have the configuration's changes applied; return 1 if a changed process does not run."""
+    """Apply the configuration's changes; return 1 if a changed process does not run."""
     with target(arguments).open_supervised() as segment:
         answer = ask(segment, control.Reload(), RELOAD_S)
     status = 1 if answer["problems"] else 0
@@ -93,7 +93,7 @@ def reload(arguments: argparse.Namespace) -> int:
 
 
 def restart(arguments: argparse.Namespace) -> int:
-    """Have one process stopped and started; return when it runs again."""
+    """Stop and start one process; return when it runs again."""
     with target(arguments).open_supervised() as segment:
         ask(segment, control.Restart(arguments.name), RESTART_S)
         print(f"{arguments.name} runs again")

@@ -25,20 +25,20 @@ from shmio.segment import PREFIX
 from shmio.supervisor.process import child_environment
 
 DETACH_S = 120.0
-"""Time-out of the start of a detached instance."""
+"""Time-out for the start of a detached instance, in s."""
 _OPTIONS: Final = ("from", "start", "end", "speed", "injections")
 _FLAGS: Final = ("loop", "paused", "record")
 
 
 class Configured(msgspec.Struct, tag=True):
-    """A detached supervisor has read its configuration."""
+    """Message: the detached supervisor has read its configuration."""
 
     log_file: str
     warnings: tuple[str, ...]
 
 
 class Started(msgspec.Struct, tag=True):
-    """The instance runs.
+    """Message: the instance runs.
 
     ``history`` says what an earlier supervisor left; ``processes`` has a line for each process.
     """
@@ -49,13 +49,13 @@ class Started(msgspec.Struct, tag=True):
 
 
 class Failed(msgspec.Struct, tag=True):
-    """The start has failed."""
+    """Message: the start has failed."""
 
     error: str
 
 
 StartMessage = Configured | Started | Failed
-"""A message is a line of JSON, of printable text."""
+"""A message about the start: one line of JSON without control characters."""
 
 
 def detach(arguments: argparse.Namespace) -> int:
@@ -68,7 +68,7 @@ def detach(arguments: argparse.Namespace) -> int:
         child = subprocess.Popen(
             [*command, "-c", str(file), "--mode", mode, "--report", str(writer), *words],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # it shares our standard error until it has its log file
+            stdout=subprocess.DEVNULL,  # it shares our standard error until it has opened its log file
             pass_fds=(writer,),
             env=child_environment(),
             start_new_session=True,
@@ -92,13 +92,13 @@ def detach(arguments: argparse.Namespace) -> int:
 
 
 def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path) -> str:
-    """Return the first line about an instance. ``segment_bytes``: None before a take-over."""
+    """Return the first line about an instance. ``segment_bytes`` is None before a take-over."""
     size = "" if segment_bytes is None else f" ({segment_bytes / 1e6:.1f} MB)"
     return f"{instance}: mode {mode}, segment {PREFIX}{instance}{size}, logs in {log_dir}"
 
 
 def replay_keys(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the options of the command line as keys of ``[replay]``; ConfigError in other modes."""
+    """Return the command line's keys of ``[replay]``; raise ConfigError in other modes."""
     found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}
     if found and arguments.mode != "replay":
         raise ConfigError(f"--{next(iter(found))} goes with --mode replay only")

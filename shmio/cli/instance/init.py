@@ -33,14 +33,14 @@ SOURCES = (".db", ".udt", ".scl", ".awl")
 GRPC_PORTS = range(8089, 8189)
 S7_PORTS = range(1102, 1202)
 MAX_SOURCES = 50
-"""Most sources of one configuration; of more data blocks the user chooses one."""
+"""Maximum number of sources of a new configuration; the user chooses one of more data blocks."""
 RESERVED = RESERVED_SOURCES | SECTION_PROCESSES | {"plc"}
 _DB_NUMBER = re.compile(r"[0-9]{1,5}", re.ASCII)
 _UMLAUTS: Final = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 _NAME = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_LENGTH: Final = 40
 MAX_FILES: Final = 500
-"""Most configurations nearby that are looked at."""
+"""Maximum number of nearby configurations whose instance names are read."""
 
 
 def init(arguments: argparse.Namespace) -> int:
@@ -83,7 +83,7 @@ def _refuse_present(path: Path) -> None:
 
 
 def _write(files: dict[Path, str]) -> None:
-    """Write all files or none; never change an existing file, but use a layout that is the same."""
+    """Write all files or none. Never change an existing file; an identical ``.db`` is kept."""
     for path, content in files.items():
         if not (path.is_file() and path.suffix == ".db" and path.read_bytes() == content.encode()):
             _refuse_present(path)
@@ -98,9 +98,9 @@ class NewConfig(NamedTuple):
 
     text: str
     missing: dict[Path, list[str]]
-    """The keys that are left to fill in, by file: the configuration or the properties file."""
+    """Keys that the user must still fill in, by file: the configuration or the properties file."""
     warnings: list[str]
-    """What the layout compiler warns of, and the data blocks that cannot be used."""
+    """Warnings of the layout compiler, and about data blocks that cannot be used."""
 
 
 def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, emulated: bool = False) -> NewConfig:
@@ -109,11 +109,11 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
     Args:
         file: Where the configuration will be.
         files: Sources of data blocks and tags, and at most one properties file.
-        name: The one data block that is wanted; None: by the properties file's number, else all.
-        emulated: Whether a process takes the controller's place and holds the blocks.
+        name: The data block to use. None: the one with the properties file's number, else all.
+        emulated: True to add an emulated controller with these blocks.
 
     Raises:
-        ConfigError: The files do not fit together, or are not of these kinds.
+        ConfigError: The files do not belong together, or are of other kinds.
         LayoutError: A source cannot be compiled.
 
     """
@@ -143,7 +143,7 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
         else:
             device = []
             for key, comment in _unknown(block, properties):
-                # The properties file is that of all blocks, and each block has a number of its own.
+                # All blocks share the properties file, so it cannot have the number of one of them.
                 place = others[0] if others and (key == "host" or len(blocks) == 1) else file
                 device += [comment] if place == file else []
                 left = missing.setdefault(place, [])
@@ -178,7 +178,7 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
 def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layout], list[str]]:
     """Return the data blocks to use as sources, and warnings.
 
-    The one of this name is used, else that of this number, else all that can be compiled.
+    If a name is given, use that block; else the block with this number; else all that compile.
     """
     held = ", ".join(block.name for block in program.blocks)
     if name is not None:
@@ -218,7 +218,7 @@ def _refuse_foreign(path: Path) -> None:
 
 
 def _source_names(blocks: Sequence[Layout]) -> list[str]:
-    """Return a name for each source: ``cell`` for the only one, else after their blocks."""
+    """Return a name for each source: ``cell`` if there is only one, else from its block's name."""
     if len(blocks) == 1:
         return ["cell"]
     names: list[str] = []
@@ -232,7 +232,7 @@ def _source_names(blocks: Sequence[Layout]) -> list[str]:
 
 
 def _unknown(block: Layout, properties: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Yield each key about the real controller that is not known, and a comment line for it."""
+    """Yield each key about the real controller that is still unknown, and a comment line for it."""
     if "host" not in properties:
         yield "host", '# host = ""                           # needed: the address of your controller'
     if block.number is None and "dbNumber" not in properties:
@@ -244,7 +244,7 @@ def _number(block: Layout, number: str) -> int:
 
 
 def _emulated(block: Layout, number: str, address: Address) -> list[str]:
-    """Return a source's lines about its emulated controller."""
+    """Return the lines of a source with the address of its emulated controller."""
     return [
         f"host = {_toml(address.host):<31}# the emulator below; for a real controller: its address",
         f"port = {address.port:<31}# for a real controller: without this line",
@@ -253,7 +253,7 @@ def _emulated(block: Layout, number: str, address: Address) -> list[str]:
 
 
 def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) -> tuple[list[Address], list[str]]:
-    """Return the address of each block's emulator, and the emulators' sections: one for all if possible."""
+    """Return each block's emulator address, and the sections: one for all blocks if possible."""
     together = len(blocks) == held > 1 and all(block.number is not None for block in blocks)
     ports = _free(S7_PORTS, 1 if together else len(blocks))
     if not together and len(ports) < len(blocks):
@@ -277,14 +277,14 @@ def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) ->
 
 
 def _instance(block: Layout) -> str:
-    """Return a name for the instance, after its block."""
+    """Return a name for the instance, made from its block's name."""
     plain = unicodedata.normalize("NFKD", unicodedata.normalize("NFC", block.name.lower()).translate(_UMLAUTS))
     letters = "".join(char for char in plain if not unicodedata.combining(char))
     return _NAME.sub("-", letters).strip("-_")[:40] or "cell"
 
 
 def _addresses(roles: list[str]) -> list[str]:
-    """Return the sections of the gRPC addresses, with the roles of everybody who reaches them."""
+    """Return the sections of the gRPC addresses, with the roles of unauthenticated clients."""
     others = "all that there are" if len(roles) > 1 else "there are write, inject and control, too"
     comment = f"# what every user of this host may do here; {others}"
     lines = []

@@ -29,12 +29,12 @@ SUPERVISOR = "supervisor"
 _LINE = re.compile(
     r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
 )
-"""As shmio.logs writes it."""
+"""A line as shmio.logs writes it."""
 
 MAX_LINE_BYTES: Final = 65536
 _STAMP = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z ")
 
-# inotify(7): events of a log file, as seen from its folder.
+# inotify(7): events of a folder that concern its log files.
 _IN_MODIFY: Final = 0x0002
 _IN_MOVED_TO: Final = 0x0080
 _IN_CREATE: Final = 0x0100
@@ -107,7 +107,7 @@ def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
 
 
 def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
-    """Return the last ``count`` lines of a file with time stamps, own or of an earlier line."""
+    """Return the last ``count`` lines of a file, each with its time stamp or an earlier line's."""
     try:
         with file.open("rb") as stream:
             return deque(_lines(stream), maxlen=count)
@@ -130,7 +130,7 @@ class Follower:
     """
 
     def __init__(self, files: Iterable[Path]) -> None:
-        """Begin to follow; OSError if a folder cannot be watched."""
+        """Begin to follow; raise OSError if a folder cannot be watched."""
         self._files: dict[Path, BinaryIO | None] = {}
         self._partial: dict[Path, bytes] = {}
         files = list(files)
@@ -192,7 +192,7 @@ def _replaced(file: Path, stream: BinaryIO | None) -> bool:
 
 
 def _watch(folders: Iterable[Path]) -> int:
-    """Return an inotify descriptor for the folders; Python's library has no binding."""
+    """Return an inotify descriptor for the folders. By ctypes: Python's library has no inotify."""
     libc = ctypes.CDLL(None, use_errno=True)
     fd: int = libc.inotify_init1(os.O_CLOEXEC)
     if fd < 0:

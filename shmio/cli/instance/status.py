@@ -97,7 +97,7 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
 
 
 def _said(process: ProcessStatus) -> bool:
-    """Return whether the note only repeats the source's reason, in full or shortened."""
+    """Return whether the process's note only repeats its source's reason, in full or shortened."""
     return isinstance(process, SourceStatus) and (
         process.reason.startswith(process.note) or bool(process.reason and process.note.startswith(process.reason))
     )
@@ -140,7 +140,7 @@ def list_instances(arguments: argparse.Namespace) -> int:
 
 
 def _look(name: str) -> Listed | None:
-    """Return what this user may know of an instance, or None if it has just ended."""
+    """Return what this user can find out about an instance, or None if it has just ended."""
     try:
         with Segment.open(name) as segment:
             status = status_of(segment, f"shmio-supervisor down --instance {name} stops them")
@@ -150,12 +150,12 @@ def _look(name: str) -> Listed | None:
             return listed
     except NotRunningError as error:
         return Listed(name, "unknown", note=str(error)) if name in instances() else None
-    except SegmentError as error:  # of another user or version
+    except SegmentError as error:  # the segment belongs to another user or version
         return Listed(name, "unknown", note=str(error))
 
 
 def _listening(segment: Segment, note: str) -> tuple[dict[str, list[str]], str]:
-    """Return the supervisor's addresses by process, and the note, or why there are none."""
+    """Return the listening addresses by process, and the note, which says why if there are none."""
     try:
         answer = control.request(segment.header.control, control.Where(), WHERE_S, lambda: supervisor_silence(segment))
         return answer.get("listen", {}), note

@@ -65,7 +65,7 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
         if told:
             return
         told = not isinstance(message, Configured)
-        with suppress(OSError):  # the waiting process gave up
+        with suppress(OSError):  # the waiting process has given up
             os.write(report, msgspec.json.encode(message) + b"\n")
         if told:
             os.close(report)
@@ -104,7 +104,7 @@ def _log_file(plan: Plan) -> Path:
 
 
 def _replan(plan: Plan, keys: Mapping[str, Any]) -> Callable[[], Plan]:
-    """Return a function that plans the same file again, for a reload."""
+    """Return the function that makes a new plan from the same file for a reload."""
     return lambda: prepare(plan.config_file, plan.mode, keys).plan
 
 
@@ -134,7 +134,7 @@ def _describe(job: Job, prepared: Prepared) -> str:
 
 
 class _Console(logging.Formatter):
-    """Formats a log record as its message alone."""
+    """Formats a log record as its bare message."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(record.getMessage())

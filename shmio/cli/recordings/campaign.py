@@ -44,5 +44,5 @@ def _table(keys: dict[str, Any]) -> str:
 
 
 def _text(value: Any) -> str:
-    """Return a value as TOML; texts without control characters, numbers and lists are as in JSON."""
+    """Return a value as TOML: numbers, lists and texts without control characters as in JSON."""
     return json.dumps(value, ensure_ascii=False)

@@ -35,14 +35,14 @@ from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.explain import ABOUT, Explained, Explainer, cells_of, kind_of, object_of
 
 MAX_PLACES: Final = 4
-"""The most registers of one event that are printed for people."""
+"""Maximum number of registers of one event in the text output."""
 
 
 def cat(arguments: argparse.Namespace) -> int:
     """Print a line for each frame in which a chosen value or the quality changed.
 
-    Events, gaps and steps have lines, too. Damage is reported where it occurs; then the exit status
-    is 1, and everything else is printed.
+    Also print a line for each event, gap and step. Damage is reported where it occurs; everything
+    else is printed, and the exit status is 1.
     """
     report = DamageReport()
     with (
@@ -100,7 +100,7 @@ def _nothing(found: Survey) -> str:
 def _views(
     reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], report: DamageReport
 ) -> dict[int, View]:
-    """Return the blocks to show by the channel of their frames, without those with damaged layouts.
+    """Return the blocks to show, by the channel of their frames; leave out damaged layouts.
 
     Raises:
         PathError: A pattern names nothing.
@@ -143,7 +143,7 @@ def _one_file(patterns: Sequence[str]) -> None:
 
 
 def _layout(reader: Reader, channel: Channel) -> Layout | None:
-    """Return the layout of a channel; None if it is damaged, which is reported with the frames."""
+    """Return the layout of a channel, or None if it is damaged; the frames' reader reports damage."""
     try:
         return reader.layout(channel)
     except RecordingError:
@@ -210,7 +210,7 @@ class Printer(Protocol):
 
 
 def _where(event: Event, explained: Explained, room: int | None) -> str:
-    """Return an event's registers with direction and values as text; bytes without a name as bytes."""
+    """Return an event's registers as text, with direction and values, or its bytes' offset."""
     if not explained.places:
         return f"{event.size} bytes at {event.offset}" if event.size and not event.data.startswith(b"{") else ""
     way = f"/{explained.direction}" if explained.direction else ""
@@ -223,7 +223,7 @@ def _where(event: Event, explained: Explained, room: int | None) -> str:
 
 
 def _laid(laid: dict[str, Any]) -> str:
-    """Return an injection's definition as text, without what the event already says."""
+    """Return an injection's definition as text, without the facts that the event already states."""
     return ", ".join(f"{key} = {dumps(value)}" for key, value in laid.items() if key not in ("name", "direction"))
 
 
@@ -231,7 +231,7 @@ class JsonLines:
     """Formats entries as one JSON object per line, with times in UTC."""
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """Format a frame with ``values`` by path; all are null if the source never had any."""
+        """Format a frame with ``values`` by path; all are null before the source's first value."""
         known = frame.source_ns != 0
         values = {
             register.path: json_value(decode.decode(frame.image), register.element) if known else None
@@ -269,7 +269,7 @@ class JsonLines:
         )
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """Format a step: ``step`` is its number, ``clock_ns`` the time after it; no source."""
+        """Format a step, without a source: ``step`` is its number, ``clock_ns`` the time after it."""
         return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
@@ -284,7 +284,7 @@ class Table:
     """Formats entries as lines with columns; prints headings when the block changes."""
 
     def __init__(self, room: int | None) -> None:
-        """Take the maximum number of characters of a value; None for no limit."""
+        """Set the maximum number of characters of a value; None: no limit."""
         self._room = room
         self._view: View | None = None
         self._widths: list[int] = []
@@ -318,7 +318,7 @@ class Table:
         return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}{laid}"
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """Format a gap: how many are missing, which, and why."""
+        """Format a gap: the number of missing frames or events, their range, and the reason."""
         source = printable(gap.source)
         return f"{local(time_ns)}  {source}  {gap.count} {gap.what} missed, {gap.first} to {gap.last}: {gap.reason}"
 
@@ -340,8 +340,8 @@ class Csv:
     """Formats entries as CSV rows (RFC 4180) under one heading, with times in UTC.
 
     Each register of any block has a column, named with its source if there are several sources or
-    another column has the same name. Arrays are JSON. A cell is empty if the source never had a
-    value, or the register belongs to another block.
+    another column has the same name. Arrays are JSON. A cell is empty if the source has had no
+    value yet, or if the register belongs to another block.
     """
 
     OWN = ("time", "source", "what", "number", "quality", "text", *ABOUT)
@@ -374,7 +374,7 @@ class Csv:
         return self._row(*row, about=cells_of(explained, dumps))
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """Format a gap: ``number`` is the first missing one."""
+        """Format a gap: ``number`` is that of the first missing frame or event."""
         return self._row(time_ns, gap.source, f"missed {gap.count} {gap.what}", gap.first, "", str(gap.reason))
 
     def step(self, time_ns: int, mark: StepMark) -> str:

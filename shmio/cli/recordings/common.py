@@ -18,9 +18,9 @@ from shmio.recording.reading.part import MAX_NS
 from shmio.recording.times import lost
 
 FIRST_S = 1.0
-"""Shorter work shows no progress."""
+"""Work that ends within this time shows no progress, in s."""
 EACH_S = 0.2
-"""Interval at which the progress changes."""
+"""Interval at which the progress is updated, in s."""
 
 
 class DamageReport:
@@ -31,11 +31,11 @@ class DamageReport:
 
     @property
     def any(self) -> bool:
-        """Whether anything was reported."""
+        """True if anything was reported."""
         return bool(self.texts)
 
     def open(self, files: Sequence[Path]) -> Dump:
-        """Open a recording and report its damage; OSError, RecordingError as ``open_dump``."""
+        """Open a recording and report its damage; raise the errors of ``open_dump``."""
         dump = open_dump(files, self.damage)
         for text in dump.damage:
             self.say(text)
@@ -64,15 +64,15 @@ class Progress:
     """
 
     def __init__(self, what: str, *, silent: bool = False) -> None:
-        """Begin; ``silent`` shows nothing, because the terminal has other output."""
+        """Begin. With ``silent`` nothing is shown, because the terminal has other output."""
         self.total = 0
-        """How much there is to do: bytes, or ns of a recording."""
+        """Total amount of work, in bytes or in ns of a recording."""
         self._what = what
         self._shown = False
         self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() and not silent else float("inf")
 
     def at(self, done: int) -> None:
-        """Show how much is done."""
+        """Show the share of the work that is done."""
         if time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + EACH_S
             share = f"{min(done / self.total, 1):4.0%}" if self.total else ""
@@ -95,7 +95,7 @@ class Progress:
 def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
     """Return the log times of ``--from`` and ``--to`` in ns; without them, everything.
 
-    They are seconds from the recording's start, or ISO 8601, in local time without an offset.
+    They are seconds from the recording's start, or ISO 8601; local time if it has no offset.
 
     Raises:
         RecordingError: A time is invalid, or the end is before the beginning.

@@ -16,7 +16,7 @@ from shmio.recording.dump import open_dump
 from shmio.recording.times import iso, local
 
 MAX_SHOWN = 50
-"""The most registers, and details of a first difference, that are printed; ``--json`` prints all."""
+"""Maximum number of registers, and of details, in the text output; ``--json`` prints all."""
 
 
 def diff(arguments: argparse.Namespace) -> int:

@@ -147,7 +147,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
 
 
 def _folded(lines: list[str]) -> Iterator[str]:
-    """Yield the lines; equal lines in a row become one line with their number."""
+    """Yield the lines; join equal neighbours to one line with their number."""
     for line, alike in groupby(lines):
         count = sum(1 for _ in alike)
         yield line if count == 1 else f"{line} ({count} of these)"
@@ -164,7 +164,12 @@ def verify(arguments: argparse.Namespace) -> int:
 
 
 def checked(file: Path) -> dict[str, Any]:
-    """Return the result of reading a file completely; OSError, RecordingError: not a recording."""
+    """Read a file completely and return the result.
+
+    Raises:
+        OSError: The file cannot be read.
+        RecordingError: The file is not a recording.
+    """
     with Progress(f"verifying {file}") as progress, Reader(file) as reader:
         progress.total = reader.records.size
         found = check(reader, progress.at)
@@ -223,5 +228,5 @@ def _each(
 
 
 def _ended(found: dict[str, Any]) -> str:
-    """Return how a file ends, as text: by its ``closed`` and ``end``."""
+    """Return how a file ends, as text, from its keys ``closed`` and ``end``."""
     return "closed" if found["closed"] else not_closed(found["end"])

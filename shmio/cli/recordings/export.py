@@ -22,7 +22,7 @@ SHEETS: Final = frozenset({"ods", "xls", "xlsx"})
 OTHERS: Final = frozenset(
     {"arrow", "db", "duckdb", "feather", "h5", "hdf5", "json", "jsonl", "mat", "mem", "tsv", "txt"}
 )
-"""Endings that ``export`` does not write; a name with one is not taken for a folder."""
+"""Endings of formats that ``export`` does not write; it refuses a name with one."""
 
 
 def export(arguments: argparse.Namespace) -> int:
@@ -81,7 +81,7 @@ def _print_result(
 
 
 def _form(output: Path, asked: str | None) -> tuple[bool, str]:
-    """Return whether the name is that of a file (else of a folder), and the format.
+    """Return True if the name is that of a file and False if of a folder, and the format.
 
     Raises:
         RecordingError: The name and the requested format contradict each other.

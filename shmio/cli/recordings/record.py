@@ -25,7 +25,7 @@ from shmio.supervisor import control
 BY = "shmio-dump"
 WHERE_S = 2.0
 LOOK_S = 0.5
-"""Interval at which the instance and the disk are checked."""
+"""Interval at which the instance and the disk are checked, in s."""
 
 
 def record(arguments: argparse.Namespace) -> int:
@@ -101,7 +101,7 @@ def _record(
 
 
 def _attachments(segment: Segment, news: Reporter) -> AttachedFiles:
-    """Return what attaches the configuration's files; if their place is unknown, report that and attach nothing."""
+    """Return a function that attaches the configuration's files; none if their place is unknown."""
     try:
         return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
     except (ControlError, KeyError) as error:

@@ -86,7 +86,7 @@ def _rewrite(dump: Dump, path: Path, made: str, entries: Iterable[Entry[Item]], 
 
 
 def _verified(path: Path) -> list[str]:
-    """Read a new file completely and return lines about it; RecordingError if it is damaged."""
+    """Read a new file completely, and return lines about it; raise RecordingError on damage."""
     found = checked(path)
     if found["damage"]:
         raise RecordingError(f"{path}: {found['damage'][0]}")
