@@ -10,7 +10,7 @@ request                                   answer                                
 anything else                             ``{"error": "…"}``                                 at once
 ========================================  =================================================  =======================
 
-The socket's path stands in the segment's header. Only the supervisor's own user and root are served.
+The segment's header contains the socket's path. Only the supervisor's own user and root are served.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ MAX_REQUEST_BYTES: Final = 4096
 MAX_ANSWER_BYTES: Final = 65536
 MAX_CLIENTS: Final = 8
 REQUEST_S: Final = 2.0
-"""Time in which a client must send its request."""
+"""Time in which a client must send its request, in s."""
 TURN_S: Final = 0.5
-"""How often a waiting client checks that the supervisor is alive."""
+"""Interval at which a waiting client checks that the supervisor is alive, in s."""
 CONNECT_S: Final = 0.05
-"""How often to retry while the supervisor has too many clients."""
+"""Interval of retries while the supervisor has too many clients, in s."""
 _TOO_MANY: Final = "too many control connections at once"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 LINE_CHARS: Final = 2000
@@ -51,8 +51,7 @@ _MORE: Final = {
 }
 """The line that replaces the lines left out, by key, in the order in which they are left out.
 
-``kept`` is not among them: 200 processes at most, with names of at most 40 characters, always have
-room.
+``kept`` is missing because it always fits: it has at most 200 names of at most 40 characters.
 """
 
 
@@ -84,7 +83,7 @@ def socket_path(instance: str) -> str:
 
 
 def _prepare(folder: Path, uid: int) -> str | None:
-    """Create a folder for this user alone, without following links; return why not, or None."""
+    """Create a folder for this user alone, without following links; return an error or None."""
     try:
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
@@ -101,7 +100,7 @@ def _prepare(folder: Path, uid: int) -> str | None:
 
 
 def remove_socket(path: str) -> None:
-    """Remove a socket. Anything else of that name stays, and bind reports it."""
+    """Remove a socket. Another file with this name stays, and makes bind fail."""
     with suppress(FileNotFoundError):
         if stat.S_ISSOCK(os.lstat(path).st_mode):
             Path(path).unlink()
@@ -122,7 +121,7 @@ class Restart(_Request, tag="restart"):
 
 
 class Reload(_Request, tag="reload"):
-    """Read the configuration again, and take over what has changed."""
+    """Read the configuration again, and apply its changes."""
 
 
 class Where(_Request, tag="where"):
@@ -133,7 +132,7 @@ Request = Stop | Restart | Reload | Where
 
 
 class Answer:
-    """Answers the client of one request. Without effect if the client is gone."""
+    """Answers the client of one request; has no effect if the client has disconnected."""
 
     def __init__(self, server: ControlServer, client: socket.socket) -> None:
         self._server = server
@@ -149,15 +148,16 @@ class Answer:
 
 
 class ControlServer:
-    """The supervisor's end of the control socket. No call waits for a client.
+    """The supervisor's side of the control socket. No method waits for a client.
 
-    The supervisor's selector drives it. The data of its selector keys are functions without arguments.
+    It uses the supervisor's selector. The data of each selector key is the function to call.
     """
 
     def __init__(self, path: str, selector: selectors.BaseSelector, handle: Callable[[Request, Answer], None]) -> None:
         """Bind the socket; raise ControlError if that fails.
 
-        The caller holds the instance, so an existing socket was left by a dead supervisor and is removed.
+        The caller must have locked the instance: an existing socket is then that of a dead
+        supervisor, and is removed.
         """
         self._path = path
         self._selector = selector
@@ -178,7 +178,7 @@ class ControlServer:
     def _accept(self) -> None:
         try:
             client, _ = self._listener.accept()
-        except OSError:  # gone again, or no descriptor is free
+        except OSError:  # the client has gone, or no descriptor is free
             return
         client.setblocking(False)
         if not _trusted(client):
@@ -192,7 +192,7 @@ class ControlServer:
             self._selector.register(client, selectors.EVENT_READ, lambda: self._receive(client))
 
     def _has_room(self) -> bool:
-        """Return whether one more client can be served; if necessary, drop the one that has been silent longest."""
+        """Return whether there is room for a client; if needed, drop the one silent longest."""
         silent = (client for client, (_, deadline) in self._clients.items() if deadline is not None)
         if len(self._clients) >= MAX_CLIENTS and (longest := next(silent, None)):
             self.answer(longest, {"error": _TOO_MANY})
@@ -208,7 +208,7 @@ class ControlServer:
             return
         except OSError:
             received = b""
-        if not received or deadline is None:  # gone, or more than one request
+        if not received or deadline is None:  # the client has gone, or sent more than one request
             self._drop(client)
             return
         data += received
@@ -225,13 +225,13 @@ class ControlServer:
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self.answer(client, {"error": f"not a request: {error}"})
         else:
-            if _hung_up(client):  # it gave up while the supervisor was delayed, and told its user so
+            if _hung_up(client):  # it gave up while the supervisor was delayed
                 self._drop(client)
                 return
             self._handle(request, Answer(self, client))
 
     def answer(self, client: socket.socket, message: dict[str, object]) -> None:
-        """Send the answer and close. Bytes that do not fit into the socket's buffer are lost."""
+        """Send the answer and close the connection. Bytes beyond the socket's buffer are lost."""
         if client in self._clients:
             _send(client, message)
             self._drop(client)
@@ -249,17 +249,17 @@ class ControlServer:
         client.close()
 
     def retire(self) -> None:
-        """Remove the socket, so that a successor can create it. Waiting clients can still be answered."""
+        """Remove the socket, so that a new supervisor can create it. Clients still get answers."""
         if self._listener.fileno() < 0:
             return
         self._selector.unregister(self._listener)
         with suppress(OSError):
             if os.lstat(self._path).st_ino == self._inode:  # not a successor's
                 remove_socket(self._path)
-        self._listener.close()  # only now may the inode's number be given to another
+        self._listener.close()  # closed last: until then no other file can get its inode number
 
     def close(self) -> None:
-        """Retire, and drop all clients."""
+        """Remove the socket, and drop all clients."""
         self.retire()
         for client in list(self._clients):
             self._drop(client)
@@ -274,7 +274,7 @@ def request(
         path: The control socket.
         message: The request.
         timeout_s: Longest time to wait.
-        lost: Called from time to time; returns why waiting is useless, or None.
+        lost: Called from time to time; returns the reason to stop waiting, or None.
 
     Raises:
         ControlError: There is no such socket, no answer within ``timeout_s``, or the supervisor
@@ -308,15 +308,17 @@ def request(
 
 
 def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[], str | None]) -> None:
-    """Connect, as soon as there is room among those that wait for the supervisor.
+    """Connect, as soon as the supervisor's backlog has room.
 
-    TimeoutError, ControlError.
+    Raises:
+        TimeoutError: There was no room until the deadline.
+        ControlError: ``lost`` returned a reason.
     """
     while True:
         client.settimeout(max(0.001, deadline - time.monotonic()))
         try:
             client.connect(path)
-        except BlockingIOError:  # no room: a UNIX socket does not wait for it
+        except BlockingIOError:  # the backlog is full, and a UNIX socket does not wait
             if reason := lost():
                 raise ControlError(reason) from None
             if time.monotonic() >= deadline:
@@ -327,7 +329,7 @@ def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[
 
 
 def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]) -> bytes:
-    """Return the next bytes of the answer; TimeoutError, ControlError."""
+    """Return the next bytes of the answer, or raise TimeoutError or ControlError."""
     while True:
         client.settimeout(max(0.001, min(TURN_S, deadline - time.monotonic())))
         try:
@@ -345,7 +347,7 @@ def _trusted(client: socket.socket) -> bool:
 
 
 def _hung_up(client: socket.socket) -> bool:
-    """Whether the other end is closed."""
+    """Return whether the client has closed its end."""
     poll = select.poll()
     poll.register(client, select.POLLIN)
     return any(events & select.POLLHUP for _, events in poll.poll(0))

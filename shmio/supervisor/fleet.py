@@ -22,13 +22,13 @@ from shmio.supervisor.policy import PHASES, Action, Event, Life, Limits, State
 from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 
 TICK_S: Final = 0.1
-"""How often heartbeats are checked."""
+"""Interval at which heartbeats are checked, in s."""
 
 log = logging.getLogger("shmio.supervisor")
 
 
 class ManagedProcess:
-    """A slot with its job, its life, and its process while there is one."""
+    """A process slot with its job, its state (``life``), and its process while one exists."""
 
     def __init__(self, slot: ProcessSlot) -> None:
         self.slot = slot
@@ -36,9 +36,9 @@ class ManagedProcess:
         self.child: ChildProcess | AdoptedProcess | None = None
         self.waiting: list[Answer] = []
         self.evicted_pid = 0
-        """The process last killed because it held this role."""
+        """Pid of the last foreign process that was killed because it held this role."""
         self.complaint = ""
-        """The problem that the running process reports, as of :meth:`listen`; empty: none."""
+        """Problem that the running process reported at the last :meth:`listen`; "" if none."""
         self._missed = 0
         self._job: Job | None = None
         self._beat_ns = 0
@@ -51,28 +51,28 @@ class ManagedProcess:
 
     @property
     def rank(self) -> int:
-        """Place in the order of start. Unknown kinds stop last."""
+        """Rank in the order of start; a process of an unknown kind stops last."""
         return rank(self.slot.name, self.slot.kind)
 
     @property
     def job(self) -> Job:
-        """The job it runs; LookupError for a process of a dead supervisor that must stop."""
+        """The process's job; LookupError if it was adopted only to be stopped."""
         if self._job is None:
             raise LookupError(f"{self.name} has no job")
         return self._job
 
     def renew(self, job: Job) -> None:
-        """Begin a new life with another job."""
+        """Take another job, and reset the state."""
         self._job = job
         self.life = Life()
 
     def keep(self, job: Job) -> bool:
         """Continue with a job from a new plan.
 
-        A process that another supervisor started may have had rules, so it is signalled in any case.
+        An adopted process is always signalled, because its former rules are unknown.
 
         Returns:
-            Whether the process was signalled to read its rules again.
+            True if the process was signalled because it has, or had, rules.
 
         """
         before, self._job = self._job, job
@@ -90,27 +90,27 @@ class ManagedProcess:
 
     @property
     def well(self) -> bool:
-        """Whether it works, or is being restarted."""
+        """True if the process works, or is being restarted."""
         return self.life.state not in (State.STOPPED, State.FATAL)
 
     @property
     def ready(self) -> bool:
-        """Whether the present process itself has reported that it runs."""
+        """True if the present process, not its predecessor, has reported that it runs."""
         report = self.slot.report
         return self.child is not None and report.pid == self.child.pid and report.activity is Activity.RUNNING
 
     @property
     def advice(self) -> str:
-        """The end of a message about a failed start: what to do if the process was too late; else empty."""
+        """Advice to append to the message about a start that timed out; "" for other failures."""
         late = self.life.hang and self.life.hang in self.life.note
         return f"; see its log, {self.job.log_file}; the host may be overloaded" if late else ""
 
     def listen(self) -> None:
-        """Read the problem that the process reports; log its end and what was lost."""
+        """Read the problem that the process reports; when it ends, log that and the losses."""
         running = self.life.state is State.RUNNING
         complaint = complaint_of(self.slot.kind, self.slot.report.note) if running else ""
         lost = ("dropped", "changes") if self.slot.kind == "mqtt" else ("missed", "frames and events")
-        missed = self.slot.counters.get(lost[0], 0) if running else 0  # a process counts from its start
+        missed = self.slot.counters.get(lost[0], 0) if running else 0  # the process counts from its start
         if self.complaint and running and not complaint:
             log.info("%s has recovered; %d %s were lost", self.name, max(0, missed - self._missed), lost[1])
         if not complaint:
@@ -120,7 +120,7 @@ class ManagedProcess:
     def quiet_ns(self, elapsed_ns: int) -> int:
         """Return the time without a heartbeat, not counting pauses of the supervisor, in ns."""
         beat_ns = self.slot.heartbeat_ns
-        # The first look at a running process starts the count, too.
+        # The first look at a running process also starts the count.
         fresh = beat_ns != self._beat_ns or self.life.state is not State.RUNNING
         self._beat_ns = beat_ns
         self._quiet_ns = 0 if fresh else self._quiet_ns + elapsed_ns
@@ -137,7 +137,7 @@ class ManagedProcess:
         return f"{words} ({end})" if words else end
 
     def answer(self) -> None:
-        """Answer the clients that wait for a restart, if it is over."""
+        """Answer the clients that wait for a restart, if the restart is over."""
         state = self.life.state
         if self.life.stuck:
             for answer in self.waiting:
@@ -176,12 +176,12 @@ def _log_step(managed: ManagedProcess, before: Life, action: Action | None, limi
 
 
 def brief(error: Exception) -> str:
-    """Return an unexpected error in one line. Its traceback belongs in the log."""
+    """Return an unexpected error as one line; the log has its traceback."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
 class Fleet:
-    """All processes of a segment, by name. The data of its selector keys are functions without arguments."""
+    """All processes of a segment by name. The data of each selector key is the function to call."""
 
     def __init__(
         self, segment: Segment, selector: selectors.BaseSelector, limits: Limits, modules: Mapping[str, str]
@@ -204,7 +204,7 @@ class Fleet:
         return list(self._managed)
 
     def named(self, name: str) -> ManagedProcess:
-        """Return the process of this name; KeyError if there is none."""
+        """Return the process with this name; raise KeyError if there is none."""
         return self._managed[name]
 
     @property
@@ -213,7 +213,7 @@ class Fleet:
         return [(managed.rank, managed.life) for managed in self]
 
     def assign(self, job: Job) -> None:
-        """Give a job to a process that does not run; a new process gets a slot."""
+        """Assign a job to a process that does not run; add a slot for a new name."""
         managed = self._managed.get(job.name)
         if managed is None:
             slot = self._segment.processes.add(ProcessSpec(job.name, job.kind))
@@ -245,8 +245,8 @@ class Fleet:
 
     def look(self, now_ns: int) -> None:
         """Check all heartbeats and time limits."""
-        # If the supervisor itself was paused (host suspended, container paused), so were the others: that time does
-        # not count against them.
+        # A pause of the supervisor (host suspended, container paused) is one of all processes: it does
+        # not count.
         elapsed_ns = min(now_ns - self._ticked_ns, round(2 * TICK_S * 1e9))
         self._ticked_ns = now_ns
         for managed in self:
@@ -270,7 +270,7 @@ class Fleet:
     def _evict(self, managed: ManagedProcess) -> None:
         """Kill a process that holds the role but is not ours.
 
-        A dead supervisor started it too late to be seen at the take-over. The loop does not wait
+        A dead supervisor started it just before its end, so the take-over missed it. Do not wait
         for its end.
         """
         if managed.child is None:
@@ -281,7 +281,7 @@ class Fleet:
         worker = stale_segment.holder(managed.slot, self._segment.shared)
         if worker is None:
             return
-        if worker.pid not in spared:  # the child may have taken the slot since the first look
+        if worker.pid not in spared:  # the child may have taken the role since the check above
             log.warning("%s is held by pid %d, which no supervisor knows: killed", managed.name, worker.pid)
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(worker.pidfd, signal.SIGKILL)

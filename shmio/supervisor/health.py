@@ -1,4 +1,4 @@
-"""The state of the instance: assessed, and published to the segment, the service manager and the log."""
+"""Assess the state of the instance; publish it to the segment, the service manager and the log."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from shmio.supervisor.policy import State
 from shmio.supervisor.process import NOTIFY_VARIABLES
 
 QUALITY_S: Final = 0.5
-"""How often the sources' quality is checked after the start."""
+"""Interval at which the sources' quality is checked after the start, in s."""
 LOOK_S: Final = 5.0
-"""How often the folder of the log files is checked."""
+"""Interval at which the folder of the log files is checked, in s."""
 SILENT_S: Final = 15.0
-"""A disk that does not answer for this long is a problem."""
+"""Time without an answer from the disk that counts as a problem, in s."""
 
 _SOCKET, _WATCHDOG_USEC, _WATCHDOG_PID = NOTIFY_VARIABLES
 
 
 class LogFolder:
-    """Checks from time to time whether the folder of the log files is writable, in a thread because a disk may hang."""
+    """Checks in a thread whether the log folder is writable, because a disk may hang."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -40,14 +40,14 @@ class LogFolder:
         self._found = ""
 
     def problem(self, now_ns: int) -> str:
-        """Return the problem found last; empty if there is none."""
+        """Return the last problem found, or "". Start a new check if one is due."""
         waited_s = 0.0 if self._begun_ns is None else (now_ns - self._begun_ns) / 1e9
         if self._looking is not None and self._looking.is_alive():
             return f"log_dir: {self._folder}: the disk does not answer" if waited_s > SILENT_S else self._found
         if self._begun_ns is None or waited_s >= LOOK_S:
             self._begun_ns = now_ns
             self._looking = threading.Thread(target=self._look, name="log folder", daemon=True)
-            with suppress(RuntimeError):  # the host cannot start a thread now: try again later
+            with suppress(RuntimeError):  # no thread can be started now: try again later
                 self._looking.start()
         return self._found
 
@@ -59,12 +59,12 @@ class LogFolder:
 class Notifier:
     """Notifies the service manager that the environment names, if any (sd_notify(3)).
 
-    Nothing here fails or blocks: an instance runs with or without a service manager.
+    No method fails or blocks, with or without a service manager.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._path = _socket_address(environment.get(_SOCKET, ""))
-        self._period_ns = _watchdog_ns(environment) // 2  # twice as often as is asked for
+        self._period_ns = _watchdog_ns(environment) // 2  # twice as often as required
         self._beat_ns = 0
 
     def ready(self) -> None:
@@ -80,11 +80,11 @@ class Notifier:
         self._send("STOPPING=1")
 
     def status(self, text: str) -> None:
-        """Report a line of text for people."""
+        """Report a line of text, which the service manager shows to people."""
         self._send("STATUS=" + text.replace("\n", " "))
 
     def beat(self, now_ns: int) -> None:
-        """Trigger the watchdog, as often as the service manager asks."""
+        """Trigger the watchdog if that is due."""
         if self._period_ns and now_ns - self._beat_ns >= self._period_ns:
             self._beat_ns = now_ns
             self._send("WATCHDOG=1")
@@ -98,7 +98,7 @@ class Notifier:
 
 
 def _socket_address(name: str) -> str:
-    """Return the address of the socket: a path, or an abstract name after ``@``; empty for others."""
+    """Return the address of the socket: a path or an abstract name (``@…``), otherwise ""."""
     if name.startswith("@"):
         return "\0" + name[1:]
     return name if name.startswith("/") else ""
@@ -134,7 +134,7 @@ class Health:
         self._qualities_ns = 0
 
     def look(self) -> list[Quality | None]:
-        """Return the present quality of each source; None for a source without a frame."""
+        """Return the present quality of each source; None for a source that has no frame."""
         qualities: list[Quality | None] = []
         for block in self._segment.blocks.values():
             try:
@@ -146,7 +146,7 @@ class Health:
         return qualities
 
     def publish(self, now_ns: int, *, started: bool, stopping: bool) -> None:
-        """Publish the state of the instance. This is the supervisor's heartbeat too."""
+        """Publish the state of the instance, which is also the supervisor's heartbeat."""
         note = self._logs.problem(now_ns)
         state = self._assess(now_ns, note) if started and not stopping else InstanceState.STARTING
         if stopping:

@@ -1,6 +1,6 @@
 """The supervisor: one thread, one selector.
 
-``fleet`` has the processes, ``reload`` changes them to match a plan.
+``fleet`` manages the processes, and ``reload`` changes them to match a plan.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from shmio.supervisor.reload import Reloader
 from shmio.supervisor.takeover import take_over
 
 START_TICK_S: Final = 0.01
-"""How often processes are checked while one starts: its report cannot wake the supervisor."""
+"""Interval of checks while a process starts, in s: its report cannot wake the supervisor."""
 MAX_ADDRESSES: Final = 16
 """Limit on the listening addresses of a process in an answer."""
 NAME_S: Final = 1.0
-"""How often to check that the segment can still be found."""
+"""Interval at which to check that the segment's name still exists, in s."""
 
 
 class Supervisor:
@@ -54,7 +54,7 @@ class Supervisor:
             plan: The instance to run. The folder of the log files must exist.
             replan: Makes a new plan from the present configuration for a reload; it raises
                 ShmioError.
-            limits: Times and counts by which processes are judged.
+            limits: Time-outs and counts for the processes.
             modules: The Python module of each kind of process.
             on_state: Called with each new state of the instance.
 
@@ -73,15 +73,15 @@ class Supervisor:
         self._found_ns = 0
         self._adopted: dict[str, int] = {}
         self.history: list[str] = []
-        """What an earlier supervisor left and what was done about it, one line each."""
+        """Lines about what an earlier supervisor left, and what was done about it."""
 
     def run(self) -> None:
         """Start everything, or take over what a dead supervisor left; return after a stop.
 
         Raises:
-            AlreadyRunningError: Another supervisor has the instance.
-            SegmentError: There is no room for the segment.
-            ControlError: There is no place for the control socket.
+            AlreadyRunningError: Another supervisor runs the instance.
+            SegmentError: There is no memory for the segment.
+            ControlError: The control socket cannot be created.
             ShmioError: A process could not be started, or the segment was removed, and all is
                 stopped. Or the supervisor itself failed, and its processes continue for the next
                 one.
@@ -95,7 +95,7 @@ class Supervisor:
             for line in self.history:
                 log.warning("%s", line)
             self._segment = stack.enter_context(found.segment if found else self._create(path))
-            fresh = stack.enter_context(ExitStack())  # undone by a failure before anything runs
+            fresh = stack.enter_context(ExitStack())  # undone if the start fails early
             if not found:
                 fresh.callback(self._segment.unlink)
             self._control = ControlServer(path, self._selector, self._handle)
@@ -106,7 +106,7 @@ class Supervisor:
             self._reloader = Reloader(
                 self._fleet, self._segment, self._notifier, self._plan, self._replan, self._limits
             )
-            if found:  # until all is adopted, a failure leaves it for the next attempt
+            if found:  # if this fails, the segment stays for the next attempt
                 for slot, child in found.children:
                     self._fleet.adopt(self._fleet.named(slot.name), child)
                     self._adopted[slot.name] = child.pid
@@ -119,7 +119,7 @@ class Supervisor:
             self._loop()
             self._segment.set_state(os.getpid(), InstanceState.STOPPED)
             self._control.retire()
-            self._segment.unlink()  # before the answers: the client may restart the instance at once
+            self._segment.unlink()  # before answering: the client may start it again at once
             for answer in self._stop_answers:
                 answer.ok()
             log.info("stopped")
@@ -152,7 +152,7 @@ class Supervisor:
 
     def _on_signal(self, number: int) -> None:
         log.info("%s", signal.Signals(number).name)
-        if self._stopping and number != signal.SIGHUP:  # shell and kernel may send one each
+        if self._stopping and number != signal.SIGHUP:  # shell and kernel may each send a SIGHUP
             self._hasten()
         self._stop()
 
@@ -163,7 +163,7 @@ class Supervisor:
         self._reloader.drop()
 
     def _hasten(self) -> None:
-        """Kill what has not stopped, after a second request."""
+        """Kill the processes that have not stopped, after a second request to stop."""
         log.warning("killing the processes that have not stopped yet")
         for managed in self._fleet:
             self._fleet.apply(managed, Event.HASTEN)
@@ -183,7 +183,7 @@ class Supervisor:
             answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
 
     def _busy(self) -> str | None:
-        """Return why no request that changes something can be taken at present; None if it can."""
+        """Return why requests for changes are refused at present, or None if they are accepted."""
         return "the instance is stopping" if self._stopping else self._reloader.busy()
 
     def _restart(self, name: str, answer: Answer) -> None:
@@ -207,7 +207,7 @@ class Supervisor:
             self._reloader.reload(answer)
 
     def _replaced(self) -> list[str]:
-        """Return which adopted processes were replaced or stopped at once, one line each."""
+        """Return a line about each adopted process that was replaced or stopped at once."""
         lines = []
         for name, pid in self._adopted.items():
             managed = self._fleet.named(name) if name in self._fleet.names else None
@@ -222,7 +222,7 @@ class Supervisor:
         return START_TICK_S if starting else TICK_S
 
     def _tick(self) -> bool:
-        """Check everything once; return True when all is stopped."""
+        """Check everything once; return True when all processes have stopped."""
         now_ns = time.monotonic_ns()
         self._fleet.look(now_ns)
         self._control.expire()
@@ -277,7 +277,7 @@ class Supervisor:
 def _wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int], None]) -> Iterator[None]:
     """Call ``on_signal`` from the selector's loop for SIGINT, SIGTERM and SIGHUP.
 
-    SIGHUP counts unless it is ignored, as by nohup.
+    SIGHUP is included unless it is ignored, as under nohup.
     """
     receiver, sender = socket.socketpair()
     with receiver, sender:
@@ -304,4 +304,4 @@ def _wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int]
 
 
 def _wake(_number: int, _frame: FrameType | None) -> None:
-    """A handler must exist for the wake-up descriptor to be written."""
+    """Do nothing: Python writes the wake-up descriptor only for signals with a handler."""

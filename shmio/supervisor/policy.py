@@ -1,4 +1,4 @@
-"""The states of a supervised process, and all decisions about it, as pure functions of its life and the time.
+"""States of a supervised process, and all decisions about it, as functions of state and time.
 
 No I/O, no clock. The graph of states is in docs/reference/process-states.md.
 """
@@ -28,7 +28,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """The events of a process. ELAPSED: the time limit of its state is over."""
+    """Events that change a process's state. ELAPSED: the time limit of its state has passed."""
 
     START = "start"
     READY = "ready"
@@ -118,37 +118,37 @@ PHASES: Final[Mapping[State, Phase]] = {
     State.BACKOFF: Phase.BACKOFF,
     State.FATAL: Phase.FATAL,
 }
-"""The published phase of each state. A process in transition has the phase it is heading for."""
+"""The published phase of each state. A process in transition has the phase that it will reach."""
 
 LIVING: Final = frozenset({State.STARTING, State.RUNNING, State.STOPPING, State.RESTARTING, State.HUNG})
-"""The states in which an operating-system process exists."""
+"""States in which an operating-system process exists."""
 
 
 REFUSED_STATUS = 2
 """Exit status of a worker that can never work as configured."""
 RESTART: Final = Backoff(0.5, 10.0)
-"""Waits before the next start of a process, from its second crash on."""
+"""Back-off between starts of a process, from its second crash on."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Times and counts by which processes are judged; times in s."""
+    """Time-outs and counts for the processes; all times in s."""
 
     start_s: float = 20.0
-    """From the start of a process until it must report that it runs."""
+    """Time-out from the start of a process until it reports that it runs."""
     start_most_s: float = 60.0
-    """The same for a process that has waited for a processor most of the time."""
+    """The same time-out, for a process that has waited for a processor most of the time."""
     hang_s: float = 5.0
     """Longest time without a heartbeat while running."""
     grace_s: float = 5.0
-    """From SIGTERM to SIGKILL."""
+    """Time from SIGTERM to SIGKILL."""
     kill_s: float = 5.0
-    """From SIGKILL until a process that still exists counts as stuck."""
+    """Time from SIGKILL until a process that still exists counts as stuck."""
     stable_s: float = 5.0
-    """A process that runs this long is stable: its crashes no longer count."""
+    """Time after which a running process is stable: its earlier crashes no longer count."""
     backoff: Backoff = RESTART
     start_attempts: int = 3
-    """Crashes of a process that never ran after which the start of the instance has failed."""
+    """Number of crashes of a process that never ran after which the instance's start has failed."""
     settle_s: float = 3.0
     """Longest wait for the sources' first frames before the start of the instance is over."""
     plan_s: float = 60.0
@@ -157,36 +157,36 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Life:
-    """All that is remembered about a process. Times are CLOCK_MONOTONIC ns."""
+    """The recorded state and history of a process. Times are CLOCK_MONOTONIC, in ns."""
 
     state: State = State.STOPPED
     due_ns: int | None = None
-    """When the time limit of the state ends."""
+    """End of the state's time limit; None if it has none."""
     spawned_ns: int = 0
     ready_ns: int | None = None
-    """Since when it has been running; None until it runs after a start."""
+    """Time at which it reported that it runs; None from a start until then."""
     starts: int = 0
     crashes: int = 0
-    """Consecutive crashes; reset once it runs stably."""
+    """Number of consecutive crashes; a stable run resets it."""
     ran: bool = False
-    """Whether it has ever been running."""
+    """True if it has ever run."""
     note: str = ""
-    """Why it is not running."""
+    """Reason why it is not running."""
     hang: str = ""
-    """Why it was last killed as hung. The note about its end includes this."""
+    """Reason why it was last killed as hung; the note about its end includes this text."""
     killed: bool = False
-    """Whether it was sent SIGKILL and has not ended yet."""
+    """True if it was sent SIGKILL and has not ended yet."""
     stuck: bool = False
-    """Whether it should have ended after SIGKILL but has not: it waits in the kernel."""
+    """True if it has not ended in time after SIGKILL: it waits in the kernel."""
 
     @property
     def restarts(self) -> int:
-        """How often it was started again, for any reason."""
+        """Number of starts after the first, for any reason."""
         return max(0, self.starts - 1)
 
 
 def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") -> tuple[Life, Action | None]:
-    """Apply an event: return the new life and the action. ``note`` says how a process ended."""
+    """Return the life after an event, and the action to take. ``note`` says how a process ended."""
     edge = GRAPH[life.state].get(event)
     if edge is None:
         return life, None
@@ -250,12 +250,12 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
     """Return the event that the time or the worker's report causes, if any.
 
     Args:
-        life: The life of the process.
+        life: The state of the process.
         now_ns: The time now.
-        ready: Whether it has reported that it runs.
-        quiet_ns: Time without a heartbeat.
+        ready: True if it has reported that it runs.
+        quiet_ns: Time without a heartbeat, in ns.
         limits: The limits that apply.
-        waited_ns: How long it has been ready to compute, but without a processor, since its start.
+        waited_ns: Time since its start in which it waited for a processor, in ns.
 
     """
     if life.state is State.STARTING:
@@ -272,7 +272,7 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
 
 
 def adopted(spawned_ns: int, restarts: int) -> Life:
-    """Return the life of an adopted process, from its former supervisor's records."""
+    """Return the state of an adopted process, from its former supervisor's records."""
     return Life(State.RUNNING, spawned_ns=spawned_ns, ready_ns=spawned_ns, starts=restarts + 1, ran=True)
 
 
@@ -282,13 +282,13 @@ def ended(returncode: int | None) -> Event:
 
 
 Ranked = Sequence[tuple[int, Life]]
-"""Rank and life of each process. A rank starts after the lower ones and stops before them."""
+"""Rank and state of each process. A rank starts after the lower ranks, and stops before them."""
 
 
 def to_start(processes: Ranked) -> list[int]:
     """Return the indices of the processes to start: the lowest rank not started yet.
 
-    A process at its first start holds up higher ranks; one that has failed does not.
+    Higher ranks wait for a process at its first start, but not for one that has failed.
     """
     ranks = {rank for rank, life in processes if not life.starts}
     if not ranks or any(life.starts == 1 and life.state is State.STARTING for _, life in processes):
@@ -300,7 +300,7 @@ def to_start(processes: Ranked) -> list[int]:
 def to_stop(processes: Ranked) -> list[int]:
     """Return the indices of the processes to stop: those of the highest rank that has not stopped.
 
-    Stuck processes are not waited for.
+    A stop does not wait for stuck processes.
     """
     there = [rank for rank, life in processes if not (life.state is State.STOPPED or _past_stopping(life))]
     turn = max(there, default=None)
@@ -318,7 +318,7 @@ def all_gone(processes: Ranked) -> bool:
 
 
 def start_failure(life: Life, limits: Limits) -> str | None:
-    """Return why this process makes the start of the instance fail; None if it does not."""
+    """Return the reason if this process makes the instance's start fail, or None."""
     if life.ran:
         return None
     if life.state is State.FATAL or life.stuck:
@@ -336,7 +336,7 @@ def start_over(
     Args:
         processes: Rank and life of each process.
         qualities: The quality of each source; None for one without a frame.
-        since_ns: When the last process became ready; sources have ``settle_s`` from then.
+        since_ns: Time at which the last process became ready; sources get ``settle_s`` from then.
         now_ns: The time now.
         limits: The limits that apply.
 

@@ -1,4 +1,4 @@
-"""One process, spawned or adopted: watched through its pidfd, its end described in words."""
+"""One process, spawned or adopted: signals it, watches it by its pidfd, and describes its end."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ NOTIFY_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 """Variables of the service manager: sd_notify(3), sd_watchdog_enabled(3)."""
 _PACKAGED = ("site-packages", "dist-packages")
 _TAIL_BYTES = 4096
-_STAMP = re.compile(r"^\S+Z [A-Z]+ +\S+\[\d+\] ")  # what begins a line of shmio.logs
+_STAMP = re.compile(r"^\S+Z [A-Z]+ +\S+\[\d+\] ")  # beginning of a line of shmio.logs
 
 
 class ChildProcess:
-    """A running child process in its own session, which Ctrl-C in the terminal does not reach."""
+    """A running child process, in a session of its own so that Ctrl-C in the terminal misses it."""
 
     def __init__(self, popen: subprocess.Popen[bytes], log_file: Path, log_size: int) -> None:
         self._popen = popen
@@ -34,7 +34,7 @@ class ChildProcess:
     def spawn(cls, module: str, description: bytes, log_file: Path) -> ChildProcess:
         """Start ``python -m module`` with ``description`` on its standard input.
 
-        What it prints, such as the traceback of a dying interpreter, is appended to its log file.
+        Its output, such as the traceback of a crash, is appended to its log file.
 
         Raises:
             OSError: The process cannot be started.
@@ -43,7 +43,7 @@ class ChildProcess:
         log = _open_log(log_file)
         try:
             log_size = os.fstat(log).st_size
-            # A file in memory, not a pipe: a child that never reads cannot block its supervisor.
+            # A file in memory, not a pipe: a child that does not read cannot block the supervisor.
             stdin = os.memfd_create("description")
             try:
                 os.write(stdin, description)
@@ -81,7 +81,7 @@ class ChildProcess:
         return code
 
     def waited_ns(self) -> int:
-        """Return how long its main thread has waited for a processor since its start, in ns; 0 if unknown."""
+        """Return the time that its main thread has waited for a processor, in ns; 0 if unknown."""
         with suppress(OSError, IndexError, ValueError):  # proc(5): a kernel may lack the file
             return int(Path(f"/proc/{self.pid}/schedstat").read_text().split()[1])
         return 0
@@ -100,7 +100,7 @@ class AdoptedProcess:
     """A running process of another supervisor. It is not a child, so its exit status is unknown."""
 
     def __init__(self, pid: int, pidfd: int) -> None:
-        """``pidfd`` is closed by :meth:`reap`."""
+        """Take the process's descriptors; :meth:`reap` closes ``pidfd``."""
         self.pid = pid
         self.pidfd = pidfd
 
@@ -126,16 +126,16 @@ class AdoptedProcess:
         os.close(self.pidfd)
 
     def waited_ns(self) -> int:
-        """Return 0: it has been running, and its start is not waited for."""
+        """Return 0, because an adopted process has already started."""
         return 0
 
     def last_words(self) -> str:
-        """Return "": where its lines begin in the log file is unknown."""
+        """Return "", because it is unknown which lines of the log file are its own."""
         return ""
 
 
 def _open_log(file: Path) -> int:
-    """Open a log file for appending. The process runs without a log if that fails."""
+    """Open a log file for appending, or /dev/null if that fails."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         return os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -164,7 +164,7 @@ def child_environment() -> dict[str, str]:
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
     # gRPC prints a line for each bad handshake, which any client may send, into a log that would not even rotate then.
     environment.setdefault("GRPC_VERBOSITY", "NONE")
-    for name in NOTIFY_VARIABLES:  # a child must not speak to the service manager in the supervisor's name
+    for name in NOTIFY_VARIABLES:  # a child must not notify the service manager
         environment.pop(name, None)
     root = Path(shmio.__file__).parents[1]
     if root.name not in _PACKAGED:

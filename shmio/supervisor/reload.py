@@ -1,7 +1,7 @@
-"""Reloads and take-overs: compares an instance with its plan, and changes it to match.
+"""Reload and take-over: compare an instance with its plan, and change it to match.
 
-Whatever matches the plan already is left alone. A thread makes the plan of a reload, so that supervision continues; the
-supervisor's loop applies it.
+Processes and blocks that already match are left alone. A thread makes the plan of a reload, so that
+supervision continues meanwhile; the supervisor's loop applies the plan.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) ->
         there = processes.get(job.name)
         if there is None:
             started.append(job.name)
-        elif there.slot.kind != job.kind:  # another process of the same name
+        elif there.slot.kind != job.kind:  # the name now belongs to a process of another kind
             stopped.append(job.name)
             started.append(job.name)
         elif (
@@ -76,7 +76,7 @@ def _same(spec: BlockSpec, block: Block) -> bool:
 
 
 def _refusal(plan: Plan, running: Plan) -> str | None:
-    """Return why a running instance cannot adopt the plan; None if it can."""
+    """Return why a running instance cannot change to the plan, or None if it can."""
     fixed = {
         "instance.name": (running.instance, plan.instance),
         "instance.group": (running.group, plan.group),
@@ -104,13 +104,13 @@ _SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
 class InstanceChange:
-    """Changes an instance to match a plan, in steps: stops processes, changes the blocks, starts processes."""
+    """Changes an instance to match a plan: stops processes, changes blocks, starts processes."""
 
     def __init__(self, fleet: Fleet, segment: Segment, plan: Plan) -> None:
         """Begin the change.
 
         Raises:
-            SegmentError: There is no room for new processes or blocks. Nothing has changed then.
+            SegmentError: There is no room for new processes or blocks; nothing has changed.
 
         """
         self.plan = plan
@@ -135,7 +135,7 @@ class InstanceChange:
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
-        """Continue as far as possible now; return whether each new process runs or has failed once."""
+        """Continue as far as possible; return True once each new process runs or has failed once."""
         if not self._stopped:
             self._stopped = self._stop()
             if self._stopped:
@@ -150,15 +150,15 @@ class InstanceChange:
 
     @property
     def stuck(self) -> str:
-        """The processes that should have ended but do not, if the change waits for them."""
+        """Text about processes that do not end although the change waits for them; "" if none."""
         leaving = [] if self._stopped else [self._fleet.named(name) for name in self._leaving]
         return "; ".join(f"{managed.name}: {managed.life.note}" for managed in leaving if managed.life.stuck)
 
     def _stop(self) -> bool:
-        """Stop the leaving processes by rank, so that a recorder gets a source's last data.
+        """Stop the processes to remove or replace, by rank: the recorder must get the last data.
 
         Returns:
-            Whether all have ended.
+            True if all have ended.
 
         """
         leaving = [self._fleet.named(name) for name in self._leaving]
@@ -167,10 +167,10 @@ class InstanceChange:
         return policy.all_gone([(managed.rank, managed.life) for managed in leaving])
 
     def _turn(self) -> None:
-        """Change the blocks and jobs, after the old processes have ended."""
+        """Change blocks and jobs, after the old processes have ended."""
         if self.changes.add or self.changes.retire:
             self._segment.change(self.changes.add, self.changes.retire)
-        for spec in self.plan.blocks:  # running processes follow without a restart
+        for spec in self.plan.blocks:  # running processes follow this change without a restart
             self._declare(self._segment.blocks[spec.source], spec.declared)
         for name in self.changes.stopped:
             self._fleet.drop(name)
@@ -188,7 +188,7 @@ class InstanceChange:
                 self._injections.append(f"injection {name}: {what} at {block.source}")
 
     def outcome(self) -> tuple[list[str], list[str]]:
-        """Return what was done and which problems there are, one line each."""
+        """Return two lists of lines: what was done, and which problems there are."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
         done += [f"{name}: asked to reload its tokens and roles" for name in self._signalled]
         problems = []
@@ -206,7 +206,7 @@ class InstanceChange:
 
 
 class _PendingPlan:
-    """Makes a plan in a thread: compiling takes seconds, and a file system may hang."""
+    """Makes a plan in a thread, because compiling takes seconds and a file system may hang."""
 
     def __init__(self, replan: Callable[[], Plan], limit_s: float) -> None:
         self.read_ns = time.time_ns()
@@ -229,11 +229,11 @@ class _PendingPlan:
 
     @property
     def late(self) -> bool:
-        """Whether its time is over. A late result is ignored, because a thread cannot be ended."""
+        """True if the time limit has passed. A late result is ignored."""
         return not self.over and time.monotonic() >= self._deadline
 
     def result(self) -> Plan:
-        """Return the plan; raise the error that prevented it."""
+        """Return the plan, or raise the error that occurred while it was made."""
         if not self.over:
             raise ShmioError(
                 f"the files that the configuration names could not be read within {self.limit_s:g} s; nothing has "
@@ -245,7 +245,7 @@ class _PendingPlan:
 
 
 class Reloader:
-    """Has the plan in force, and carries out one change of the instance at a time."""
+    """Keeps the plan in force, and carries out one change of the instance at a time."""
 
     def __init__(
         self,
@@ -258,7 +258,7 @@ class Reloader:
     ) -> None:
         self.plan = plan
         self.read_ns = time.time_ns()
-        """When the configuration was read, ns since 1970."""
+        """Time at which the configuration was read, in ns since 1970."""
         self._fleet = fleet
         self._segment = segment
         self._notifier = notifier
@@ -270,11 +270,11 @@ class Reloader:
 
     @property
     def under_way(self) -> bool:
-        """Whether processes and blocks are being changed."""
+        """True while processes and blocks are being changed."""
         return self._change is not None
 
     def busy(self) -> str | None:
-        """Return why nothing else can be changed at present; None if it can."""
+        """Return why another change cannot begin at present, or None if it can."""
         if self._change is None:
             return None
         if stuck := self._change.stuck:
@@ -282,11 +282,11 @@ class Reloader:
         return "another change of the instance is in progress: try again when it is done"
 
     def follow(self) -> None:
-        """Change a taken-over instance to match the plan; SegmentError if there is no room."""
+        """Change a taken-over instance to match the plan, or raise SegmentError: no room."""
         self._change = InstanceChange(self._fleet, self._segment, self.plan)
 
     def reload(self, answer: Answer) -> None:
-        """Make a new plan and apply it; refused while another reload is in progress."""
+        """Make a new plan and apply it; refuse while another reload is in progress."""
         reason = self.busy() or (self._planning and "another reload is being prepared: try again when it is done")
         if reason:
             answer.error(reason)
@@ -295,7 +295,7 @@ class Reloader:
         self._planning, self._answer = _PendingPlan(self._replan, self._limits.plan_s), answer
 
     def drop(self) -> None:
-        """Cancel the change, because everything is to stop."""
+        """Cancel the change, because the instance is stopping."""
         if self._answer is not None:
             self._answer.error("the instance is stopping")
         self._planning = self._change = self._answer = None

@@ -19,7 +19,7 @@ LOCK_NAME: Final = ".instance"
 
 
 def check_startable(plan: Plan) -> None:
-    """Check that an instance can start. Ports that processes of a dead supervisor hold count as free.
+    """Check that an instance can start. Ports of a dead supervisor's processes count as free.
 
     Raises:
         AlreadyRunningError: The instance is running; the message says how to stop it.
@@ -31,7 +31,7 @@ def check_startable(plan: Plan) -> None:
         try:
             check_ports(plan)
         except EndpointError:
-            _refuse_second(plan)  # an instance that started in between may hold them
+            _refuse_second(plan)  # an instance that has just started may use them
             raise
 
 
@@ -43,7 +43,7 @@ def _refuse_second(plan: Plan) -> None:
 
 
 def _whose(plan: Plan) -> str:
-    """Return the end of a message: from which file the running instance was started, and what to do."""
+    """Return the end of a message: the running instance's configuration file, and what to do."""
     down = f"shmio-supervisor down --instance {plan.instance} stops it"
     with suppress(ShmioError), Segment.open(plan.instance) as segment:
         if segment.config not in (None, plan.config_file):
@@ -53,18 +53,18 @@ def _whose(plan: Plan) -> str:
 
 @contextmanager
 def hold_log_folder(folder: Path, instance: str) -> Iterator[None]:
-    """Create an instance's folder for log files, and hold it.
+    """Create an instance's folder for log files, and lock it for the length of a ``with`` block.
 
-    A folder belongs to one instance, because the files of another would have the same names.
+    Only one instance may use a folder, because log files of two would have the same names.
 
     Raises:
-        ConfigError: Another instance holds the folder, or it cannot be written.
-        AlreadyRunningError: The instance itself holds it.
+        ConfigError: Another instance uses the folder, or it cannot be written.
+        AlreadyRunningError: This instance already runs, and uses it.
 
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # No link is followed, because the file is truncated below.
+        # Do not follow links, because the file is truncated below.
         fd = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
     except OSError as error:
         raise ConfigError(f"instance.log_dir: cannot write {folder / LOCK_NAME}: {error.strerror}") from None
@@ -79,6 +79,6 @@ def hold_log_folder(folder: Path, instance: str) -> Iterator[None]:
                 "its own"
             ) from None
         line = f"{instance}\n".encode()
-        os.pwrite(fd, line, 0)  # before truncating, so that a reader always finds a name
+        os.pwrite(fd, line, 0)  # written before truncating, so that a reader always finds a name
         os.ftruncate(fd, len(line))
         yield

@@ -1,4 +1,4 @@
-"""Takes over what a dead supervisor left: its segment, and its processes as they run."""
+"""Take over the segment and the running processes of a dead supervisor."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from shmio.supervisor.process import AdoptedProcess
 
 @dataclass
 class TakenOver:
-    """The segment of a dead supervisor, now locked by this one, and its processes that continue."""
+    """A dead supervisor's segment, now locked by this one, and its processes that continue."""
 
     segment: Segment
     children: list[tuple[ProcessSlot, AdoptedProcess]] = field(default_factory=list)
 
 
 def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | None, list[str]]:
-    """Take over what suits the plan; stop and remove the rest.
+    """Take over the segment and the processes that match the plan; stop and remove the rest.
 
     Args:
         plan: The plan of the instance.
-        control: The path of the new control socket, which the segment names from now on.
-        limits: The times by which processes are judged.
+        control: The path of the new control socket, which is written into the segment.
+        limits: Time-outs for the processes.
 
     Returns:
-        What was taken over, if anything, and what was done, one line each.
+        What was taken over, or None, and a line about each thing that was done.
 
     Raises:
         AlreadyRunningError: A supervisor is alive.
@@ -63,10 +63,10 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | Non
 
 
 def _usable_segment(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str]]:
-    """Return the segment if the planned instance can continue in it, else why not."""
+    """Return the segment, or None if the plan cannot continue in it, and lines about it."""
     try:
         segment = stale_segment.read(shared, plan.instance)
-    except (FormatError, UnfinishedError):  # reported when it is cleared
+    except (FormatError, UnfinishedError):  # reported when the segment is cleared
         return None, []
     if not any(slot.alive() for slot in segment.processes):
         return None, []
@@ -133,7 +133,7 @@ def _adopt_or_end(
 
 
 def _unfit_reason(slot: ProcessSlot, limits: Limits) -> str | None:
-    """Return why a living process cannot be adopted; None if it can."""
+    """Return why a living process cannot be adopted, or None if it can."""
     if slot.report.activity is not Activity.RUNNING:
         return f"was {slot.report.activity.name.lower()}"
     quiet_s = (time.monotonic_ns() - slot.heartbeat_ns) / 1e9
