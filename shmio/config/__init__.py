@@ -1,4 +1,4 @@
-"""Read, check and resolve ``supervisor.toml`` (architecture: *Config*)."""
+"""Read, check and resolve ``supervisor.toml``."""
 
 from shmio.config.address import Address, UnixAddress, parse_address
 from shmio.config.model import (

@@ -11,7 +11,7 @@ from shmio.errors import ConfigError
 
 UNIX: Final = "unix:"
 MAX_PATH_BYTES: Final = 107
-"""Longest path of a UNIX socket: sun_path holds 108 bytes with the final zero, unix(7)."""
+"""Maximum length of a UNIX socket's path: sun_path has 108 bytes with the final zero, unix(7)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Parse ``127.0.0.1:8089``, ``localhost:0`` or ``[::1]:8089``; ConfigError otherwise."""
+        """Parse ``127.0.0.1:8089``, ``localhost:0`` or ``[::1]:8089``, or raise ConfigError."""
         host, colon, port = text.rpartition(":")
         if host.startswith("[") and host.endswith("]"):
             host = host[1:-1]
@@ -38,7 +38,7 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine can reach the address; of names, only ``localhost`` counts."""
+        """True if only this host can reach the address; the only such name is ``localhost``."""
         if self.host == "localhost":
             return True
         try:
@@ -55,7 +55,7 @@ class UnixAddress:
 
     @classmethod
     def parse(cls, text: str) -> UnixAddress:
-        """Parse ``unix:PATH``, or ``unix:///PATH`` as gRPC writes it; ConfigError otherwise."""
+        """Parse ``unix:PATH``, or ``unix:///PATH`` as gRPC writes it, or raise ConfigError."""
         path = text.removeprefix(UNIX)
         if path.startswith("//"):
             path = path[2:]
@@ -70,10 +70,10 @@ class UnixAddress:
 
     @property
     def loopback(self) -> bool:
-        """Always True: only this machine can reach a UNIX socket."""
+        """Always True: only this host can reach a UNIX socket."""
         return True
 
 
 def parse_address(text: str) -> Address | UnixAddress:
-    """Parse ``host:port`` or ``unix:PATH``; ConfigError otherwise."""
+    """Parse ``host:port`` or ``unix:PATH``, or raise ConfigError."""
     return UnixAddress.parse(text) if text.startswith(UNIX) else Address.parse(text)

@@ -33,7 +33,12 @@ def read_campaign(file: Path) -> list[Declaration]:
 
 
 def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
-    """Check the tables of a campaign, such as ``{"injection": [{"name": …}]}``; ConfigError."""
+    """Return the declarations in a campaign's tables, such as ``{"injection": [{"name": …}]}``.
+
+    Raises:
+        ConfigError: A table is invalid; the message begins with its key.
+
+    """
     if isinstance(tables.get("injection"), dict):
         raise ConfigError("injection: write [[injection]], in two brackets: there can be several")
     check_text(tables, "")

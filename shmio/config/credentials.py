@@ -31,7 +31,7 @@ _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 class Secret(NamedTuple):
     """A bearer token's name, roles and SHA-256 digest; the token itself is not kept.
 
-    A random text needs no salt, and each check must be cheap.
+    The digest has no salt, because a token is random, and one round, because checks must be fast.
     """
 
     name: str
@@ -40,11 +40,14 @@ class Secret(NamedTuple):
 
 
 def read_tokens(tokens: Sequence[Token], section: str = "grpc.token") -> tuple[Secret, ...]:
-    """Read all tokens; ConfigError names the key of an invalid token and never quotes it.
+    """Read all tokens.
 
     Args:
-        tokens: The tokens.
-        section: Name of their section, for messages.
+        tokens: The sections of the tokens.
+        section: Name of these sections, for messages.
+
+    Raises:
+        ConfigError: A token is invalid; the message names its key and never quotes the token.
 
     """
     found: dict[bytes, Secret] = {}
@@ -77,7 +80,7 @@ def read_password(name: str) -> str:
     """Return shmio's password at an external broker: the file's first line.
 
     Raises:
-        ConfigError: The file is unusable or its first line is empty; never quotes its contents.
+        ConfigError: The file is unusable or its first line is empty; the message never quotes it.
 
     """
     password = _read_passwords(name).split("\n", 1)[0].rstrip("\r")
@@ -95,7 +98,7 @@ def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str
         roles: Accounts that must have a line.
 
     Raises:
-        ConfigError: A line is invalid or missing; names the line and never quotes it.
+        ConfigError: A line is invalid or missing; the message has its number and never quotes it.
 
     """
     accounts: dict[str, str] = {}
@@ -134,7 +137,7 @@ def hashed(password: str) -> str:
 
 
 def _is_hash(secret: str) -> bool:
-    """Return whether mosquitto knows a hash: ``$7$ROUNDS$SALT$DIGEST`` or ``$6$SALT$DIGEST``."""
+    """Return whether mosquitto accepts a hash: ``$7$ROUNDS$SALT$DIGEST`` or ``$6$SALT$DIGEST``."""
     fields = secret.split("$")
     try:
         pbkdf2 = fields[:2] == ["", "7"] and len(fields) == 5 and 0 < int(fields[2]) <= 10_000_000
@@ -162,13 +165,13 @@ def _read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes
     """Return the first ``most_bytes`` bytes of a secret's file.
 
     Args:
-        key: The configuration key, with which messages begin.
+        key: Configuration key at the beginning of messages.
         name: Path of the file.
         most_bytes: Maximum number of bytes to read.
-        instead: The replacement to make if others could have read the secret, for the message.
+        instead: What to do if others could have read the secret, for the message.
 
     Raises:
-        ConfigError: The file cannot be read, or others may access it; never quotes its contents.
+        ConfigError: The file cannot be read, or others may access it; the message never quotes it.
 
     """
     try:

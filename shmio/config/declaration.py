@@ -11,8 +11,8 @@ from shmio.config.model import Declaration
 from shmio.errors import ConfigError
 
 MAX_DECLARATIONS: Final = 256
-"""Limit for one file."""
-MAX_DIMENSIONS: Final = 6  # of an array; the same as in layout/model.py, which imports shmio.config
+"""Maximum number of declarations in one file."""
+MAX_DIMENSIONS: Final = 6  # of an array; as in layout/model.py, which cannot be imported here
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ _OPERANDS: Final = tuple(dict.fromkeys(key for keys in KEYS.values() for key in 
 
 
 def check_declarations(declarations: Sequence[Declaration]) -> None:
-    """Raise ConfigError, with its key ``injection[…]…``, for the first fault no layout can cure."""
+    """Raise ConfigError, beginning with the key, for the first fault found without a layout."""
     for fault in declaration_faults(declarations):
         raise ConfigError(fault)
 
@@ -72,7 +72,7 @@ def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
 
 
 def contradictions(declaration: Declaration) -> Iterator[str]:
-    """Yield each contradiction within a declaration, beginning with the key."""
+    """Yield a message about each contradiction within a declaration; it begins with the key."""
     operation = declaration.operation
     keys = KEYS[operation]
     given = {key for key in _OPERANDS if getattr(declaration, key) is not None}
@@ -100,7 +100,7 @@ def contradictions(declaration: Declaration) -> Iterator[str]:
 
 
 def _fault(value: Any, depth: int = 0) -> str:
-    """Return why a value cannot be sent or compared, or an empty string."""
+    """Return why a value cannot be sent or compared, or "" if it can."""
     if isinstance(value, list):
         if depth > MAX_DIMENSIONS:
             return f"lists within more than {MAX_DIMENSIONS} others"

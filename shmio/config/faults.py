@@ -1,4 +1,4 @@
-"""Faults of a configuration: finds their lines, words them for its author, and collects a bounded number."""
+"""Collect the faults of a configuration, up to a limit, as messages with their lines."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from shmio.config.model import (
 from shmio.errors import ConfigError, LayoutError
 
 MAX_KEY: Final = 1_000
-"""Maximum characters of a key, all dotted parts together."""
+"""Maximum number of characters of a key, with all its dotted parts."""
 MAX_PARTS: Final = 64
-"""Maximum dotted parts of a key: the parser's time grows with their square."""
+"""Maximum number of dotted parts of a key, because the parser's time grows with their square."""
 MAX_LINE: Final = 80
 MAX_HINTED: Final = 100
 """Longest word, in characters, for which a similar one is suggested."""
 MAX_SHOWN: Final = 1_000
 MAX_CHARACTERS: Final = 500
-"""Limit for one fault, which may quote text as long as the file."""
+"""Maximum number of characters of a message, which may quote a text as long as the file."""
 _TOKEN: Final = re.compile(
     r"""\#[^\n]*|\"\"\"(?:\\.|[^\\])*?(?:\"{3,5}|\Z)|'''.*?(?:'{3,5}|\Z)|"(?:\\.|[^"\\\n])*"?|'[^'\n]*'?"""
     r"""|\[\[|\]\]|[\[\]{}=.,\n]|[^\s"'\#\[\]{}=.,]+""",
@@ -49,7 +49,7 @@ _DOUBLE: Final = ("Cannot overwrite", "Cannot declare", "Duplicate inline table 
 _ESCAPE: Final = ("Unescaped", "Invalid hex", "Escaped character", "Illegal character")
 _POSITION: Final = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
 _BARE: Final = re.compile(r"[^\s,=#\[\]{}\"']+")
-_TEXT: Final = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path, an address
+_TEXT: Final = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path or an address
 _WORDS: Final = {
     "broker": BrokerName,
     "clock": ClockName,
@@ -58,7 +58,7 @@ _WORDS: Final = {
     "operation": OperationName,
     "payload": PayloadName,
 }
-"""Keys whose value is one of a few words."""
+"""Keys that take one of a few words, with these words."""
 _TYPES: Final = {
     "int": "a whole number",
     "float": "a number",
@@ -77,7 +77,7 @@ def too_long(text: str, most: int = MAX_KEY) -> int:
 
 
 class Lines:
-    """The line of each key by its name in messages, such as ``source[0].host``.
+    """Finds the line of each key by its name in messages, such as ``source[0].host``.
 
     One pass over the text finds all keys.
     """
@@ -87,13 +87,13 @@ class Lines:
         self._lines: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self.double: tuple[str, int, int] | None = None
-        """The first duplicate key, and the lines of both occurrences."""
+        """The first duplicate key with the lines of both occurrences; None if there is none."""
         self.too_long = 0
-        """The line of the first key that is too long, where reading ends; 0 if there is none."""
+        """Line of the first key that is too long, at which reading ends; 0 if none."""
         self._read(text)
 
     def of(self, key: str) -> int:
-        """Return the line of a key, or of the innermost table around it that is found, or 0."""
+        """Return the line of a key, else of the innermost known table around it, else 0."""
         while key:
             if key in self._lines:
                 return self._lines[key]
@@ -156,7 +156,7 @@ class Lines:
         return table
 
     def _resolve(self, parts: list[str], table: str, last: str | None = None) -> str:
-        """Return the key of these parts; of several tables with one name, the last one."""
+        """Return the full key of these parts; a name of several tables means the last one."""
         key = table
         for part in parts:
             key = f"{key}.{part}" if key else part
@@ -179,7 +179,7 @@ def _bare(token: str) -> str:
 
 
 def explain(error: ValidationError, key: str = "") -> str:
-    """Return ``key: what is wrong``; give ``key`` if the converted value is not a whole table."""
+    """Return msgspec's error as ``key: what is wrong``; ``key`` is that of the converted value."""
     text, _, at = str(error).partition(" - at `$")
     path = f"{key}{at.rstrip('`')}".lstrip(".")
     missing = re.search(r"missing required field `([^`]*)`", text)
@@ -202,7 +202,7 @@ def _types(match: re.Match[str]) -> str:
 
 
 def decode(data: bytes, place: str) -> str:
-    """Return the text of a file; ``place`` names it. ConfigError unless it is UTF-8."""
+    """Return the text of the file named ``place``; raise ConfigError if it is not UTF-8."""
     try:
         text = data.decode("utf-8-sig")  # some editors write a byte order mark
     except UnicodeDecodeError as error:
@@ -231,8 +231,8 @@ def meant(word: str, names: Iterable[str]) -> str:
 
 
 def explain_toml(error: Exception, text: str) -> str:
-    """Return the parser's message with the line and, for frequent slips, the correction."""
-    if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() takes no more of them
+    """Return the parser's message with the line and, for frequent mistakes, the correction."""
+    if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() refuses so many digits
         return "a number in it has too many digits"
     place = _POSITION.search(str(error))
     if place is None:
@@ -261,7 +261,7 @@ def _slip(message: str, line: str, column: int) -> str:
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:
-    """Append the name of the source, emulator or injection that a message's key gives by number."""
+    """Append the name of the source, emulator or injection to a message that has its number."""
     key = re.match(r"(source|emulator|injection)\[(\d+)\](?!\.name:)", message)
     if key is None:
         return message
@@ -285,7 +285,7 @@ class Faults:
         self._layout: LayoutError | None = None
         self.count = 0
         self.places: Mapping[str, Sequence[int]] = {}
-        """For each kind of section, the indices in the file of those that are kept."""
+        """Indices in the file of the sections that are kept, by kind of section."""
 
     @cached_property
     def _lines(self) -> Lines:
@@ -296,7 +296,7 @@ class Faults:
 
     @property
     def full(self) -> bool:
-        """Whether further faults are only counted, so callers can skip costly checks."""
+        """True if further faults are only counted, so that callers can skip costly checks."""
         return self.count >= MAX_SHOWN
 
     def add(self, message: str) -> None:
@@ -315,18 +315,18 @@ class Faults:
             self._note(f"{self._file}{f':{line}' if line else ''}: {text}", line)
 
     def lies_in(self, file: str, table: str, lines: Mapping[str, int]) -> None:
-        """Note that these keys of a table are in another file, named relative to this one."""
+        """Record that these keys of a table are in another file, named relative to this one."""
         for name, line in lines.items():
             self._elsewhere[f"{table}.{name}"] = f"{self._file.parent / file}:{line}"
 
     def _note(self, message: str, line: float) -> None:
-        """Note a fault for this line of the file."""
+        """Record a fault for this line of the file."""
         if message not in self._found:
             self._found[message] = line
             self.count += 1
 
     def warn(self, message: str) -> None:
-        """Add a warning, ``key: what is odd``, which is shown after the faults."""
+        """Add a warning, ``key: what is unusual``, which is shown after the faults."""
         self._warnings.append(f"{self._file}: warning: {_shortened(_PLACE.sub(self._place, message))}")
 
     def _place(self, match: re.Match[str]) -> str:
@@ -343,10 +343,10 @@ class Faults:
         except LayoutError as error:
             self._layout = error
             for line in str(error).splitlines():
-                self._note(line, math.inf)  # of another file: after those of this one
+                self._note(line, math.inf)  # of another file: shown after those of this one
 
     def raise_any(self) -> None:
-        """Raise ConfigError with a line for each fault, then the warnings; LayoutError if all are of one layout."""
+        """Raise ConfigError with a line for each fault and warning; LayoutError if all are of one layout."""
         if not self.count:
             return
         if self._layout is not None and not self._warnings and [*self._found] == str(self._layout).splitlines():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-_PROBE: Final = bytes(4096)  # a file without data fits on a full disk, too
+_PROBE: Final = bytes(4096)  # an empty file fits even on a full disk
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _NO_UNNAMED: Final = (errno.EOPNOTSUPP, errno.EISDIR)
 _MEANING: Final = {
@@ -27,9 +27,9 @@ _MEANING: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """Why a folder cannot be written, and what to do.
+    """The reason why a folder cannot be written, with the remedy.
 
-    ``full`` means that the disk has no room, which may change at any time.
+    ``full`` is True if the disk is full, which may change at any time.
     """
 
     reason: str
@@ -44,7 +44,7 @@ def unwritable(folder: Path) -> Obstacle | None:
     """
     try:
         place = next(path for path in (folder, *folder.parents) if path.exists())
-    except OSError as error:  # a name too long, a folder above that cannot be searched
+    except OSError as error:  # such as a name that is too long, or a parent without permission
         return Obstacle(f"{folder}: {error.strerror}")
     if not place.is_dir():
         return Obstacle(f"{place} is not a directory")

@@ -50,7 +50,7 @@ class Source(Section):
     """``[[source]]``: a producer of registers.
 
     ``options`` are the connector's own keys. ``texts`` are the keys of the ``properties`` file that
-    no key overrides, as text whatever their type. The connector knows the types and checks both.
+    no key overrides, as text whatever their type. The connector knows the types, and checks both.
     """
 
     name: Name
@@ -75,7 +75,7 @@ class Source(Section):
 
     @property
     def stale_ns(self) -> int:
-        """Age in ns from which a frame is bad: as configured, or 5 periods, at least 500 ms."""
+        """Age at which a frame becomes bad, in ns: as configured, or 5 periods, at least 500 ms."""
         return round(1_000_000 * (self.stale_ms or max(5 * self.period_ms, 500.0)))
 
 
@@ -146,7 +146,7 @@ class Grpc(Section):
 
     @property
     def guarded(self) -> bool:
-        """Whether the addresses of ``listen`` require a token or a client certificate."""
+        """True if the addresses of ``listen`` require a token or a client certificate."""
         return bool(self.token or self.client)
 
     @property
@@ -190,7 +190,7 @@ class Recorder(Section):
 
     @property
     def buffer_bytes(self) -> int:
-        """Maximum bytes that wait in memory for a slow or full disk."""
+        """Maximum number of bytes that wait in memory for a slow or full disk."""
         return round(self.buffer_mb * 1e6)
 
 
@@ -210,7 +210,7 @@ class Replay(Section):
 class Declaration(Section, omit_defaults=True):
     """``[[injection]]``: an injection that the source's process runs; docs/reference/injections.md.
 
-    The module ``declaration`` has the rules for the keys of each operation.
+    ``declaration.py`` has the rules for the keys of each operation.
     """
 
     name: Name
@@ -249,7 +249,7 @@ class MqttTls(Section):
 
 
 class MqttTopic(Section):
-    """``[[mqtt.topic]]``: how matching registers are published; the first matching rule counts."""
+    """``[[mqtt.topic]]``: how matching registers are published; the first matching rule applies."""
 
     match: Text | Texts
     publish: bool = True
@@ -267,7 +267,7 @@ class MqttTopic(Section):
 
 
 class Sparkplug(Section):
-    """``[mqtt.sparkplug]``: the instance as a Sparkplug B edge node, by default of its own name."""
+    """``[mqtt.sparkplug]``: the instance as a Sparkplug B edge node, by default with its name."""
 
     group: Text
     node: Text | None = None
@@ -286,8 +286,8 @@ class Sparkplug(Section):
 class MqttAccount(Section):
     """``[[mqtt.account]]``: the roles of an account of shmio's own broker.
 
-    Without ``name`` it holds for clients without an account. ``publish`` has filters of the topics
-    that the role ``write`` allows besides commands.
+    Without ``name`` it applies to clients without an account. ``publish`` has filters of topics
+    to which the role ``write`` may publish besides commands.
     """
 
     roles: Texts
@@ -296,7 +296,7 @@ class MqttAccount(Section):
 
 
 class Mqtt(Section):
-    """``[mqtt]``: the bridge to a broker, and the broker itself unless that is ``external``."""
+    """``[mqtt]``: the bridge to a broker, and the broker itself unless it is ``external``."""
 
     broker: BrokerName = "embedded"
     listen: Text | None = None

@@ -15,13 +15,13 @@ PORT: Final = 1883
 TLS_PORT: Final = 8883
 MAX_PREFIX: Final = 256
 ROLES: Final = ("read", "write")
-"""Roles of accounts of shmio's own broker: to subscribe, and to publish commands."""
+"""Roles of accounts of shmio's own broker: ``read`` subscribes, ``write`` publishes commands."""
 _ELSEWHERE: Final = ("host", "port", "username")
 """Keys with the address of an external broker, and shmio's user name there."""
 
 
 def check_mqtt(config: Config) -> None:
-    """Check addresses, plain-text access, and which keys go together; ConfigError."""
+    """Check addresses, plain-text access and combinations of keys, or raise ConfigError."""
     mqtt = config.mqtt
     if mqtt is None:
         return
@@ -41,7 +41,7 @@ def check_mqtt(config: Config) -> None:
 
 
 def own_topics(mqtt: Mqtt, instance: str) -> list[str]:
-    """Return filters of all the instance's own topics, which it publishes or reads commands from."""
+    """Return topic filters for everything that the instance publishes, and for its commands."""
     found = [f"{mqtt.prefix or f'shmio/{instance}'}/#"]
     if mqtt.sparkplug is not None:
         found.append(f"spBv1.0/{mqtt.sparkplug.group}/+/{mqtt.sparkplug.node or instance}/#")
@@ -60,7 +60,7 @@ def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
 
 
 def brokers(mqtt: Mqtt) -> list[Address]:
-    """Return the external brokers' addresses in the order of attempts; ConfigError."""
+    """Return the external brokers' addresses in the order of attempts, or raise ConfigError."""
     port = mqtt.port or (PORT if mqtt.tls is None else TLS_PORT)
     hosts = [mqtt.host] if isinstance(mqtt.host, str) else mqtt.host or []
     found = []
@@ -80,7 +80,7 @@ def _has_port(host: str) -> bool:
 
 
 def _is_no_text(part: str) -> bool:
-    """Return whether text has control or non-characters, which brokers refuse (MQTT 5.0, 1.5.4)."""
+    """Return whether a text has control or non-characters, which brokers refuse (MQTT 5.0, 1.5.4)."""
     return any(category(one) == "Cc" or 0xFDD0 <= ord(one) <= 0xFDEF or ord(one) & 0xFFFE == 0xFFFE for one in part)
 
 

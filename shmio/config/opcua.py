@@ -14,7 +14,7 @@ EXTRA: Final = "opcua: the OPC UA endpoint needs another library: pip install 's
 
 
 def check_opcua(config: Config) -> None:
-    """Check the address, plain-text access, and which keys go together; ConfigError."""
+    """Check the address, plain-text access and combinations of keys, or raise ConfigError."""
     opcua = config.opcua
     if opcua is None:
         return

@@ -1,4 +1,4 @@
-"""Read ``supervisor.toml`` into a checked :class:`Config`; each message names file, full key and remedy."""
+"""Read ``supervisor.toml`` into a checked :class:`Config`; messages name file, key and remedy."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ MAX_FILE_BYTES = 1 << 20
 MAX_PROPERTIES_BYTES = 64 << 10
 MAX_DEPTH = 64
 MAX_SECTIONS = 1_000
-"""Maximum sections of one name that are checked."""
+"""Maximum number of sections of one name that are checked."""
 MAX_SOURCES = 200
-"""Maximum sources of an instance."""
+"""Maximum number of sources of an instance."""
 
 _TABLES: dict[str, type[Section]] = {
     "instance": Instance,
@@ -85,7 +85,7 @@ _SEVERAL = {
     "opcua.client",
 }
 _SLIPPED = re.compile(r"[A-Za-z]:[\x00-\x1f\\]")  # a Windows path in double quotes, \t being a tab
-_DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file
+_DERIVED = ("folder", "options", "texts")  # fields that are not keys of the file
 _Table = TypeVar("_Table", bound=Section)
 
 
@@ -108,23 +108,23 @@ class Examined(NamedTuple):
     config: Config
     faults: Faults
     broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
-    """The omitted sources by index: connector, its own keys, and those of the properties file."""
+    """Connector, its keys, and those of the properties file, of each faulty source, by index."""
 
 
 def examine(file: Path) -> Examined:
-    """Read a ``supervisor.toml`` and collect all its faults; ConfigError if it cannot be parsed."""
+    """Read a ``supervisor.toml`` and collect its faults; raise ConfigError if it is not TOML."""
     text = _read_text(file)
     tables = _parse(file, text)
     return _examine(tables, file.resolve().parent, Faults(file, tables, text))
 
 
 def read_tables(file: Path) -> dict[str, Any]:
-    """Parse a TOML file without checking its keys; ConfigError."""
+    """Parse a TOML file without checking its keys, or raise ConfigError."""
     return _parse(file, _read_text(file))
 
 
 def _read_text(file: Path) -> str:
-    """Return a file's text; ConfigError if it is unreadable, too large, or not UTF-8."""
+    """Return a file's text; raise ConfigError if it is unreadable, too large, or not UTF-8."""
     try:
         with file.open("rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
@@ -140,7 +140,7 @@ def _read_text(file: Path) -> str:
 
 
 def _parse(file: Path, text: str) -> dict[str, Any]:
-    """Parse TOML text; ConfigError if it is not TOML, or its keys or nesting are excessive."""
+    """Parse TOML text; raise ConfigError if it is not TOML, has too long keys, or is too deep."""
     if line := too_long(text):
         raise ConfigError(f"{file}:{line}: a key is longer than {MAX_KEY} characters or {MAX_PARTS} parts")
     try:
@@ -155,7 +155,7 @@ def _parse(file: Path, text: str) -> dict[str, Any]:
 
 
 def _depth(value: Any) -> int:
-    """Return how deep tables and lists are nested, without recursion, which depth could exhaust."""
+    """Return the nesting depth of tables and lists. Without recursion, because it is unlimited."""
     depth, level = 0, [value]
     while level and depth <= MAX_DEPTH:
         depth += 1
@@ -172,7 +172,7 @@ def read_properties(file: Path, key: str) -> dict[str, tuple[str, int]]:
     """Read the text and line of each key of a properties file, such as ``plc.ini``.
 
     It has lines ``key=value``. Blank lines, ``[section]`` lines and lines that begin with ``#``,
-    ``;`` or ``!`` are skipped. ``key`` is the section that names the file, for messages.
+    ``;`` or ``!`` are skipped. ``key`` is that of the section with the file's name, for messages.
 
     Raises:
         ConfigError: The file cannot be read, is too large or not UTF-8, or has an invalid line or
@@ -217,7 +217,7 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     config = convert({**sound, "folder": str(folder)}, Config)
     for fault in _name_faults(config):
         faults.add(fault)
-    if not faults:  # otherwise, references to other sections may point to one that was omitted
+    if not faults:  # otherwise, a reference may be to a section that was left out
         for fault in _reference_faults(config):
             faults.add(fault)
     for fault in (*_time_faults(config), *_rotation_faults(config), *declaration_faults(config.injection)):
@@ -244,7 +244,7 @@ def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
 
 
 class _Structure:
-    """Checks each key of each section on its own: whether it is known, present, and of its type."""
+    """Checks each key of each section by itself: is it known, present, and of the right type?"""
 
     def __init__(
         self, faults: Faults, folder: Path, broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
@@ -254,7 +254,7 @@ class _Structure:
         self._broken = broken
 
     def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
-        """Return the faultless sections, and for repeatable sections their indices in the file."""
+        """Return the faultless sections and, for repeatable ones, their indices in the file."""
         sound: dict[str, Any] = {}
         places: dict[str, list[int]] = {}
         hinted = self._unknown(tables, "", Config)
@@ -308,7 +308,7 @@ class _Structure:
             self._faults.add(f"{key}: expected tables [[{key}]]")
 
     def table(self, value: Any, key: str, name: str) -> tuple[bool, dict[str, Any]]:
-        """Return whether a table has no fault, and its faultless keys."""
+        """Return whether a table has no faults, and its keys without faults."""
         if not isinstance(value, dict):
             self._faults.add(f"{key}: expected a table [{name}]")
             return False, {}
@@ -353,7 +353,7 @@ class _Structure:
         return True
 
     def _unknown(self, table: dict[str, Any], key: str, kind: type[Section]) -> set[str]:
-        """Add a fault for each unknown key; return the known keys that may have been meant."""
+        """Add a fault for each unknown key; return the similar known keys."""
         known = [name for name in kind.__struct_fields__ if name not in _DERIVED]
         hinted: set[str] = set()
         for name in table:
@@ -368,7 +368,7 @@ class _Structure:
 
 
 def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
-    """Convert tables to a type; ConfigError has the full key that is unknown or wrongly typed."""
+    """Convert tables to a type; raise ConfigError with the key that is unknown or wrong."""
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
@@ -388,7 +388,7 @@ def _unknown(key: str, table: str, whole: type[Section] = Config) -> str:
 
 
 def unknown_option(index: int, key: str, known: list[str]) -> str:
-    """Return the message for a key of ``source[index]`` that is unknown, to the connector, too."""
+    """Return the message for a key of ``source[index]`` that even the connector does not know."""
     names = [*known, *(name for name in Source.__struct_fields__ if name not in _DERIVED)]
     remedy = hint(key, names, f"the connector knows: {', '.join(known)}")
     return f"source[{index}].{key}: unknown key; {remedy}"
@@ -397,7 +397,7 @@ def unknown_option(index: int, key: str, known: list[str]) -> str:
 def check_text(value: Any, key: str) -> None:
     """Raise ConfigError for control characters, which file names and terminals cannot take.
 
-    This is no pattern of a type because msgspec 0.22 then crashes at exit.
+    A type with a pattern would be simpler, but makes msgspec 0.22 crash at exit.
     """
     for fault in text_faults(value, key):
         raise ConfigError(fault)

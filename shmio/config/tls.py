@@ -11,7 +11,7 @@ from shmio.errors import ConfigError
 
 
 class TlsFiles(NamedTuple):
-    """The contents of the PEM files; ``client_ca`` is None when clients need no certificate."""
+    """The contents of the PEM files; ``client_ca`` is None if clients need no certificate."""
 
     certificate: bytes
     key: bytes
@@ -19,10 +19,10 @@ class TlsFiles(NamedTuple):
 
 
 def read_tls(tls: Tls) -> TlsFiles:
-    """Read and test the gRPC endpoint's PEM files: gRPC reports a bad file like a busy port.
+    """Read and test the gRPC endpoint's PEM files; gRPC would report a bad file as a busy port.
 
     Raises:
-        ConfigError: A file is unusable; names its key.
+        ConfigError: A file is unusable; the message names its key.
 
     """
     found = TlsFiles(
@@ -44,7 +44,7 @@ def read_tls(tls: Tls) -> TlsFiles:
 
 
 def client_context(tls: MqttTls) -> ssl.SSLContext:
-    """Return the TLS context for an external broker; ConfigError.
+    """Return the TLS context for an external broker, or raise ConfigError.
 
     ``ca`` must have issued the broker's certificate, or one of the host's authorities if there is
     no ``ca``.
@@ -60,7 +60,7 @@ def client_context(tls: MqttTls) -> ssl.SSLContext:
 
 
 def server_context(tls: MqttTls) -> ssl.SSLContext:
-    """Return the TLS context of shmio's own broker; ConfigError.
+    """Return the TLS context of shmio's own broker, or raise ConfigError.
 
     With ``ca``, clients must present a certificate issued by it.
     """
@@ -73,7 +73,7 @@ def server_context(tls: MqttTls) -> ssl.SSLContext:
 
 
 class _Socket(ssl.SSLSocket):
-    """Closes itself when the TLS handshake fails; its creator could not close it then."""
+    """A TLS socket that closes itself if its handshake fails, when its creator cannot close it."""
 
     def do_handshake(self, block: bool = False) -> None:
         try:
@@ -122,7 +122,7 @@ def _load_pair(context: ssl.SSLContext, certificate: str, key: str, where: str) 
 
 
 def _load_authority(context: ssl.SSLContext, name: str, key: str) -> None:
-    """Make a context trust the authorities in a file; ConfigError begins with ``key``."""
+    """Make a context trust the authorities in a file; a ConfigError begins with ``key``."""
     try:
         context.load_verify_locations(name)
     except ssl.SSLError as error:
@@ -140,5 +140,5 @@ def _refuse_to_ask() -> str:
 
 
 def _detail(error: ssl.SSLError) -> str:
-    """Return TLS's own reason in brackets, to append to a message, or an empty string."""
+    """Return the TLS library's reason in brackets, to append to a message, or ""."""
     return f" ({error.reason})" if error.reason else ""

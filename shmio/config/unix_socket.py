@@ -1,4 +1,4 @@
-"""Create and clear the file of a UNIX socket to listen on."""
+"""Create and remove the file of a UNIX socket to listen on."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def obstacle(path: str) -> str | None:
 
 
 def listened_on(path: str) -> bool:
-    """Return whether a process listens at a path; True as well if this user may not connect."""
+    """Return whether a process listens at a path; True also if this user may not connect."""
     with socket.socket(socket.AF_UNIX) as probe:
-        probe.setblocking(False)  # its queue may be full
+        probe.setblocking(False)  # the listener's backlog may be full
         try:
             probe.connect(path)
         except (ConnectionRefusedError, FileNotFoundError):
@@ -69,7 +69,7 @@ class SocketFile:
     """The file of a socket that this process creates, and removes when it stops listening."""
 
     def __init__(self, path: str, gid: int | None) -> None:
-        """Set the path; only this user may connect, and the members of group ``gid`` if given."""
+        """Set the path. Only this user, and members of the group ``gid`` if given, may connect."""
         self._path = path
         self._gid = gid
         self._inode = 0
@@ -78,17 +78,17 @@ class SocketFile:
     def binding(self) -> Iterator[str]:
         """Yield a temporary path to bind the socket to, then move the socket to its own path.
 
-        The temporary folder is closed to other users. So nobody can connect before the socket has
-        its mode, whatever the process's umask, which all threads share.
+        Other users cannot enter the temporary folder, so nobody can connect before the socket has
+        its mode. (The umask would not do: all threads of the process share it.)
 
         Raises:
-            EndpointError: The socket cannot be created, or another file is at its path by now.
+            EndpointError: The socket cannot be created, or a file with its path exists.
 
         """
         path, name = Path(self._path), secrets.token_hex(8)
         try:
             with TemporaryDirectory(prefix=".shmio-", dir=path.parent) as folder:
-                # Through the folder's descriptor, because a socket's path must be short.
+                # The path uses the folder's descriptor, because a socket's path must be short.
                 inside = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
                 try:
                     yield f"/proc/self/fd/{inside}/{name}"
@@ -96,7 +96,7 @@ class SocketFile:
                     if self._gid is not None:
                         os.chown(made, -1, self._gid)
                     made.chmod(0o600 if self._gid is None else 0o660)
-                    os.link(made, path)  # renaming would replace a file that is there by now
+                    os.link(made, path)  # a rename would replace a file that appeared meanwhile
                     self._inode = os.lstat(path).st_ino
                 finally:
                     os.close(inside)
@@ -104,7 +104,7 @@ class SocketFile:
             raise EndpointError(f"unix:{self._path}: {error.strerror}") from None
 
     def remove(self) -> None:
-        """Remove the socket's file, unless another file has its name by now."""
+        """Remove the socket's file, unless another file has replaced it."""
         with suppress(FileNotFoundError):
             if os.lstat(self._path).st_ino == self._inode:
                 Path(self._path).unlink()
