@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from shmio.version import __version__
 
-TYPE_CHECKING = False  # importing typing takes 10 ms, during which Ctrl-C would print a traceback
+TYPE_CHECKING = False  # importing typing takes 10 ms, in which Ctrl-C prints a traceback
 if TYPE_CHECKING:
     from typing import Any
 
@@ -21,7 +21,7 @@ __all__ = ["Cell", "__version__", "attach", "connect", "open_dump"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use: most processes of an instance need none of them."""
+    """Import a public name at its first use, because most processes of an instance need none."""
     if name == "attach":
         from shmio.local.attach import attach  # noqa: PLC0415
 

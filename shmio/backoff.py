@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Backoff:
-    """Rule for the waits between attempts. It has no state: the caller counts the attempts.
+    """Rule for the waits between attempts. It has no state: the caller counts the waits.
 
     Attributes:
         first_s: The first wait, in s.

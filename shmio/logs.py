@@ -1,6 +1,6 @@
 """Logging: the format of lines, rotating files, and a rate limit for each kind of record.
 
-A record is one line that names the process; extra fields follow as ``key=value``::
+A record is one line with the name of the process; extra fields follow as ``key=value``::
 
     2026-11-21T05:20:01.123456Z INFO    cell[1234] quality good source=cell cycle=1207
 """
@@ -56,7 +56,7 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
     def __init__(self, file: Path, *, streams: bool, patient: bool) -> None:
         """Open the file.
 
-        If that fails, raise OSError; with ``patient``, try again at each record instead.
+        If that fails, raise OSError; with ``patient``, try again at each record.
         """
         self._streams = False  # they already go to this file, if it can be opened
         super().__init__(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1, delay=True)
@@ -110,9 +110,9 @@ def setup(
         file: The log file.
         process: The process name in each line.
         source: The source name in each line.
-        console: Whether records also go to standard error.
-        streams: Whether standard output and error go to the file, and must go to each new one.
-        patient: Whether to retry a file that cannot be written, instead of raising ConfigError.
+        console: True to write records to standard error as well.
+        streams: True if standard output and error go to the file, and are to follow each new one.
+        patient: True to retry a file that cannot be written, instead of raising ConfigError.
 
     Returns:
         The logger named ``shmio``.
@@ -170,13 +170,13 @@ class LogRateLimit(logging.Filter):
     def __init__(self, clock_s: Callable[[], float] = time.monotonic, *, one_kind: bool = False) -> None:
         """Create the filter.
 
-        With ``one_kind``, all records count as one kind. Use it for loggers of other libraries.
+        With ``one_kind``, all records are of one kind. Use it for loggers of other libraries.
         """
         super().__init__()
         self._clock_s = clock_s
         self._one_kind = one_kind
         self._kinds: dict[str, tuple[float, int]] = {}
-        """For each kind, the end of its interval and the number of records in it."""
+        """End of the present interval, and number of records in it, for each kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether the record is written."""

@@ -61,7 +61,7 @@ def value_to_wire(value: object, path: str) -> wire.Value:
 
 
 def value_from_wire(value: wire.Value, path: str) -> object:
-    """Convert a message to a Python value; ValueRangeError if the message has no value."""
+    """Convert a message to a Python value; raise ValueRangeError if the message has none."""
     kind = value.WhichOneof("kind")
     if kind is None:
         raise ValueRangeError(f"{path}: no value is given")
@@ -126,7 +126,7 @@ def _set(part: Any, field: str, value: Any, key: str) -> None:
 
 
 def declaration_from_wire(found: wire.Declaration, key: str) -> dict[str, Any]:
-    """Convert a message to an ``[[injection]]`` table. Nothing is checked.
+    """Convert a message to an ``[[injection]]`` table, without checking it.
 
     Args:
         found: The message.
@@ -215,7 +215,7 @@ def event_from_wire(found: wire.Event) -> Event:
 
 
 def _found_to_wire(value: object, path: str) -> wire.Value:
-    """Convert a value. None, which stands for invalid bytes, becomes a message without a value."""
+    """Convert a value. None (invalid bytes) becomes a message without a value."""
     if value is None:
         return wire.Value()
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Real-time priority of a process, which then runs before processes without one: sched(7)."""
+"""Real-time priority: a process with one runs before processes without one, sched(7)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def prioritise(priority: int) -> None:
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except OSError as error:  # EPERM, too, where the process's control group has no real-time budget
+    except OSError as error:  # also EPERM if the process's control group has no real-time budget
         raise ConfigError(
             f"realtime_priority: this user may not have {priority} ({error.strerror}); allow it (LimitRTPRIO= in the "
             "service's unit, rtprio in limits.conf, --ulimit rtprio of a container), or leave the key out"
@@ -34,7 +34,7 @@ def check(priority: int) -> None:
         except ConfigError as error:
             refused.append(error)
 
-    thread = threading.Thread(target=attempt, name="priority")  # another thread: the caller keeps its priority
+    thread = threading.Thread(target=attempt, name="priority")  # in a thread: the caller keeps its priority
     thread.start()
     thread.join()
     if refused:

@@ -1,4 +1,4 @@
-"""The common part of all child processes: role, log, heartbeat, report, and stop on request.
+"""Base of all child processes: role, log, heartbeat, report, and stop on request.
 
 A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))``, where ``run(worker)``
 does its work. Exit status: 0 stopped as requested; 1 failed, a restart may help; 2 failed, and the
@@ -28,7 +28,7 @@ MAX_SPEC_BYTES = 1 << 26
 
 
 class Worker:
-    """A child process of the instance. Only the main thread may use it, except for ``stopping``."""
+    """A child process of the instance. Only ``stopping`` may be used outside the main thread."""
 
     def __init__(self, spec: dict[str, Any]) -> None:
         self.name: str = spec["name"]
@@ -37,7 +37,7 @@ class Worker:
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
         self._on_reread: Callable[[], object] | None = None
-        self._rereads = False  # whether SIGHUP has come, perhaps before on_reread()
+        self._rereads = False  # True once SIGHUP has come, perhaps before on_reread()
         self.log = self._set_up_log(Path(spec["log_file"]))
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
@@ -80,7 +80,7 @@ class Worker:
         note: str | None = None,
         activity: Activity | None = None,
     ) -> None:
-        """Update these values in the process table, and send a heartbeat."""
+        """Send a heartbeat, and update the given values in the process table."""
         old = self._report
         self._report = Report(
             old.pid,
@@ -94,9 +94,9 @@ class Worker:
         self.slot.beat()
 
     def on_stop(self, call: Callable[[], object]) -> None:
-        """Call ``call`` in another thread when the process is requested to stop.
+        """Call ``call`` in another thread when a stop is requested.
 
-        If it has been requested already, call it now.
+        If a stop has already been requested, call it now.
         """
         self._on_stop = call
         if self.stopping.is_set():
@@ -105,7 +105,7 @@ class Worker:
     def on_reread(self, call: Callable[[], object]) -> None:
         """Call ``call`` in another thread after each reload of the worker's rules.
 
-        If there was a reload since the process started, call it now, too.
+        If there has been a reload since the process started, also call it now.
         """
         self._on_reread = call
         if self._rereads:
@@ -114,8 +114,8 @@ class Worker:
     def _install_signal_handlers(self) -> None:
         """Make SIGTERM set ``stopping`` and SIGHUP trigger a reread; ignore Ctrl-C.
 
-        A thread does the work: a handler that waited for the event's lock could block the main
-        thread, which may have locked it.
+        A thread handles the signals. A handler would run in the main thread, and block for ever if
+        that thread has locked the event.
         """
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
@@ -127,7 +127,7 @@ class Worker:
 
     def _await_signal(self, reader: int) -> None:
         while os.read(reader, 1)[0] != signal.SIGTERM:
-            self._rereads = True  # first, so that a concurrent on_reread() sees it
+            self._rereads = True  # set first, so that a concurrent on_reread() sees it
             if self._on_reread is not None:
                 self._on_reread()
         self.stopping.set()

@@ -346,7 +346,7 @@ class Faults:
                 self._note(line, math.inf)  # of another file: shown after those of this one
 
     def raise_any(self) -> None:
-        """Raise ConfigError with a line for each fault and warning; LayoutError if all are of one layout."""
+        """Raise ConfigError with a line for each fault and warning, or the layout's LayoutError."""
         if not self.count:
             return
         if self._layout is not None and not self._warnings and [*self._found] == str(self._layout).splitlines():

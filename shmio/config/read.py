@@ -244,7 +244,7 @@ def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
 
 
 class _Structure:
-    """Checks each key of each section by itself: is it known, present, and of the right type?"""
+    """Checks each key by itself: that it is known, present where needed, and of the right type."""
 
     def __init__(
         self, faults: Faults, folder: Path, broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]

@@ -12,7 +12,7 @@ from shmio.worker import BEAT_S, Worker
 
 
 def run(worker: Worker) -> None:
-    """Run the emulator until told to stop.
+    """Run the emulator until a stop is requested.
 
     The process description contains the compiled layouts.
     """

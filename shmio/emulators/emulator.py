@@ -45,8 +45,8 @@ class Emulator:
             listen: The address to listen on.
             db_number: The block's number; default: the layout's own.
             others: Blocks without a program, served under their own numbers.
-            max_clients: The most clients at a time.
-            traits: What the server grants, and its faults.
+            max_clients: Maximum number of clients at a time.
+            traits: Limits and faults of the server.
 
         Raises:
             ConfigError: There is no such program, the layout does not suit it, or a number is
@@ -67,28 +67,30 @@ class Emulator:
 
     @property
     def address(self) -> Address:
-        """The address the server listens on; ShmioError unless started."""
+        """Address on which the server listens; raises ShmioError before the start."""
         return self._server.address
 
     @property
     def cycles(self) -> int:
-        """The number of cycles run."""
+        """Number of cycles that have run."""
         return self._cycles
 
     @property
     def overruns(self) -> int:
-        """The number of cycles skipped because the one before took too long."""
+        """Number of cycles skipped because the previous one took too long."""
         return self._overruns
 
     @property
     def failure(self) -> Exception | None:
-        """The error that ended the program, if any; the runner checks it regularly."""
+        """Error that ended the program, or None; the emulator's process checks it regularly."""
         return self._failure
 
     def start(self) -> None:
         """Run the first cycle, listen, and continue in threads.
 
-        EndpointError if the address is not available.
+        Raises:
+            EndpointError: The address is not available.
+
         """
         self._step(0)
         self._server.start()

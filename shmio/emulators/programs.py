@@ -22,8 +22,8 @@ class A50:
     period_ms = 10
 
     def __init__(self, layout: Layout) -> None:
-        """Find the registers; ConfigError names a missing register or one of another type."""
-        # The printed DB201 has a space for the underscore in some names.
+        """Find the registers; raise ConfigError with one that is missing or of another type."""
+        # A DB201 from print has spaces in place of some underscores.
         named = tuple(
             msgspec.structs.replace(register, path=register.path.replace(" ", "_")) for register in layout.registers
         )
@@ -33,20 +33,20 @@ class A50:
             raise ConfigError(f"program a50: {str(error).removeprefix('layout: ')}") from None
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Put the axes, inputs and outputs of this time into the frame."""
-        self._runner.resume(bytes(frame))  # clients write what they please, outputs included
+        """Write the axes, inputs and outputs at this time into the frame."""
+        self._runner.resume(bytes(frame))  # clients may have written any register, outputs included
         frame[:] = self._runner.step(round(time_s * 1e9), self.period_ms * 1_000_000)
 
 
-# Odd, so that word i of generation g, g + i * STRIDE modulo 2**64, repeats neither along the block nor, within
-# any time a test runs, at the same place.
+# Odd, so that word i of generation g, g + i * STRIDE modulo 2**64, is unique in the block and, as
+# long as any test runs, at its place.
 _STRIDE = 0x9E37_79B9_7F4A_7C15
 
 
 class Counter:
     """Fills the block with big-endian 64-bit words: the cycle number mixed with the place.
 
-    A remainder of less than eight bytes holds the first bytes of its word and is checked too.
+    If fewer than eight bytes remain at the end, they are the first bytes of their word.
     """
 
     period_ms = 1
@@ -56,7 +56,7 @@ class Counter:
         self._places = _places(layout.size)
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Write the generation of this time."""
+        """Write the words of the cycle at this time."""
         generation = np.uint64(round(time_s * 1000 / self.period_ms))
         frame[:] = (self._places + generation).astype(">u8").tobytes()[: self._size]
 
@@ -64,8 +64,7 @@ class Counter:
 def generations(frame: bytes | bytearray | memoryview) -> list[int]:
     """Return the distinct cycle numbers in a frame of a ``Counter``, ascending.
 
-    A frame of a single cycle has one. A byte that no cycle wrote shows as a number far from the
-    others.
+    A frame from a single cycle gives one number. A wrong byte gives a number far from the others.
     """
     size = len(frame)
     whole = size // 8 * 8
@@ -90,7 +89,7 @@ class Idle:
     """Changes no register: a controller in RUN without a user program."""
 
     period_ms = 100
-    """Time between two cycles, which only show that the controller is alive."""
+    """Time between two cycles, in ms; the cycles only show that the controller works."""
 
     def __init__(self, layout: Layout) -> None:
         """Accept any layout."""
@@ -104,13 +103,13 @@ class Program(Protocol):
 
     @property
     def period_ms(self) -> int:
-        """Time between two cycles."""
+        """Time between two cycles, in ms."""
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Run the cycle at ``time_s`` after the program's start on the block, in place.
+        """Run the cycle at ``time_s`` after the program's start, and change the block in place.
 
-        The same times on the same frames give the same frames. Registers that the program does not
-        drive keep what clients wrote; the program may read them. ``frame`` keeps its length.
+        The result depends only on the time and the frame. Registers that the program does not set
+        keep what clients wrote; the program may read them. ``frame`` keeps its length.
         """
 
 

@@ -1,15 +1,15 @@
-"""An S7 server for emulated controllers: answers jobs as a controller does, over python-snap7's server.
+"""An S7 server for emulated controllers, based on python-snap7's server.
 
-Kept from python-snap7 3.3: the memory areas, the ISO-on-TCP handshake, system status lists, block lists, clock,
-and the start and stop of the emulated CPU. Added: the system status list with the operating mode. Replaced,
-because of what was measured and found:
+From python-snap7 3.3 come the memory areas, the ISO-on-TCP handshake, system status lists, block
+lists, the clock, and the start and stop of the emulated CPU. This module adds the status list with
+the operating mode, and replaces:
 
-- jobs (set-up, read, write) are answered by ``Jobs``: the original grants one job and 480 bytes, writes a bit
-  as a whole byte, stores only the first item of a write of several, stores the part that fits of a write past the
-  end, and spends several times as long on a read;
-- listening: the original shares its port in silence with a second server (SO_REUSEPORT);
-- the threads: the original leaves those of its clients behind when it stops, and takes seconds to;
-- block upload and download: refused, since nothing here needs them and they would write past the lock.
+- jobs (set-up, read, write), which ``Jobs`` answers: python-snap7 grants one job and 480 bytes,
+  writes a bit as a whole byte, stores only the first item of a write, stores part of a write past
+  the end of a block, and reads several times slower;
+- listening: python-snap7 shares its port silently with a second server (SO_REUSEPORT);
+- threads: python-snap7 takes seconds to stop, and leaves its clients' threads behind;
+- block upload and download, which are refused: they would write without the lock.
 """
 
 from __future__ import annotations
@@ -68,18 +68,18 @@ _DT = b"\x02\xf0\x80"  # COTP data, and the end of the message: PDUs fit a TPDU,
 _FRAME_OVERHEAD = 7
 _LONGEST_FRAME = MAX_PDU_SIZE + _FRAME_OVERHEAD
 _INBOX_SIZE = 8 * _LONGEST_FRAME
-_ANSWERS_AT_ONCE = 8  # then they are sent, whether or not more requests have come
+_ANSWERS_AT_ONCE = 8  # so many are sent at once, even if more requests are waiting
 _SEND_TIMEOUT_S = 5
 _KEEPALIVE = {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEPCNT: 3}
-"""In s: the place of a client whose host is gone is free within a minute."""
-_SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # start; and what a block that lives in memory alone has done already
-_SERVICE_ARGUMENT = 8  # where, in the parameters, a job for a service has the length of what the service is given
+"""Socket options, in s: a client whose host is down is disconnected within a minute."""
+_SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # start; the others need no action
+_SERVICE_ARGUMENT = 8  # offset, in the parameters, of the length of the service's argument
 _MODE_LIST = 0x0424
 _RUN, _STOP = 0x08, 0x04  # operating modes in that list
 _IS_IT_RUNNING = bytes((0, 1, 0, 0, _READ))
-"""Sizes and parameters of a read without items: ``get_cpu_state()`` of python-snap7 3.
+"""Sizes and parameters of a read without items, which ``get_cpu_state()`` of python-snap7 3 sends.
 
-It takes any acknowledgement for RUN, so in STOP the read is refused.
+That client takes any acknowledgement for RUN, so the server refuses this read in STOP.
 """
 _JOIN_TIMEOUT_S = 10
 
@@ -90,7 +90,7 @@ logger = logging.getLogger(__name__)
 
 
 class Fault(Enum):
-    """A setting that keeps clients from the data."""
+    """A setting of the controller that prevents access to the data."""
 
     PUT_GET_OFF = "PUT/GET is not permitted"
     PROTECTED = "the protection level allows no access"
@@ -100,15 +100,15 @@ class Fault(Enum):
 
 @dataclass(frozen=True)
 class Traits:
-    """How an emulated controller differs from a permissive S7-1500."""
+    """Differences between an emulated controller and a permissive S7-1500."""
 
     max_pdu_size: int = MAX_PDU_SIZE
-    """The largest PDU it grants, in bytes."""
+    """Size of the largest PDU that it grants, in bytes."""
     max_jobs: int = 8
-    """The most jobs that it grants to be in flight at once."""
+    """Maximum number of jobs in flight that it grants."""
     fault: Fault | None = None
     block_size: int | None = None
-    """The apparent size of data blocks in bytes, as in an older version; None: the real size."""
+    """Apparent maximum size of data blocks in bytes, as of an older version; None: no maximum."""
 
     def __post_init__(self) -> None:
         if not (100 <= self.max_pdu_size <= MAX_PDU_SIZE and 1 <= self.max_jobs <= MAX_JOBS):
@@ -120,7 +120,7 @@ class _MalformedJobError(Exception):
 
 
 class _Item(NamedTuple):
-    code: int  # _OK, or why this item cannot be served
+    code: int  # _OK, or the reason for a refusal
     area: bytearray
     start: int
     size: int
@@ -131,7 +131,7 @@ class _Item(NamedTuple):
 class Memory:
     """Memory areas that a client can access, with one lock for all of them.
 
-    Because of the lock, answers and writes of several items happen between program cycles.
+    The lock keeps reads and writes of several items from overlapping with a program cycle.
     """
 
     def __init__(self, areas: Mapping[tuple[S7Area, int], bytearray]) -> None:
@@ -140,7 +140,7 @@ class Memory:
 
 
 class Jobs:
-    """Answers one client's jobs, and holds what was agreed with that client. No I/O.
+    """Answers one client's jobs, and keeps the parameters agreed with that client. No I/O.
 
     Names and codes follow Wireshark's S7 dissector, behaviour follows an S7-1500. Items fail one by
     one, each with its own return code. A job that is wrong as a whole, or whose answer does not fit
@@ -150,7 +150,7 @@ class Jobs:
     def __init__(self, memory: Memory, traits: Traits) -> None:
         self._memory = memory
         self._traits = traits
-        self.pdu_size = 0  # until set up, no job fits
+        self.pdu_size = 0  # before the set-up, every job is too large
 
     def answer(self, pdu: memoryview) -> bytes | None:
         """Answer one S7 PDU of ten or more bytes; return None if it is not a known job."""
@@ -241,7 +241,7 @@ class Jobs:
 
 
 def _refusal(reference: int, error: int) -> bytes:
-    """Build an answer that holds only a header error: ROSCTR 2, as S7-1200 and S7-1500 send it."""
+    """Build an answer with only a header error: ROSCTR 2, as S7-1200 and S7-1500 send it."""
     return _ANSWER.pack(_PROTOCOL, 2, 0, reference, 0, 0, error)
 
 
@@ -297,7 +297,7 @@ def _write_item(item: _Item, value: memoryview) -> int:
 class S7Server(Server):
     """Serves data blocks to S7 clients on one address. Start and stop it once; or use ``with``.
 
-    ``lock`` is held during each job: whoever holds it changes blocks between jobs.
+    Each job takes ``lock``. Take it to change a block between two jobs.
     """
 
     def __init__(self, address: Address, *, max_clients: int = 16, traits: Traits | None = None) -> None:
@@ -312,20 +312,24 @@ class S7Server(Server):
     def add_block(self, number: int, data: bytearray) -> None:
         """Serve ``data``, in place, as data block ``number``.
 
-        ConfigError if the number is taken or invalid.
+        Raises:
+            ConfigError: The number is in use or invalid.
+
         """
         if not 1 <= number <= 65535:
             raise ConfigError(f"DB{number}: data blocks are numbered 1 to 65535")
         if (S7Area.DB, number) in self.memory_areas:
             raise ConfigError(f"DB{number} is served already")
         self.register_area(SrvArea.DB, number, data)
-        self.area_locks[(S7Area.DB, number)] = self.lock  # for the parts of python-snap7 that are kept
+        self.area_locks[(S7Area.DB, number)] = self.lock  # for python-snap7's own code
 
     @property
     def address(self) -> Address:
-        """The address it listens on, with the real port if port 0 was asked for.
+        """Address on which it listens, with the actual port if port 0 was requested.
 
-        ShmioError unless started.
+        Raises:
+            ShmioError: The server is not started.
+
         """
         if self.server_socket is None:
             raise ShmioError("the S7 server is not started")
@@ -333,10 +337,14 @@ class S7Server(Server):
         return Address(host, port)
 
     def start(self, tcp_port: int | None = None) -> int:
-        """Listen and serve in threads; EndpointError with the address if it is not available.
+        """Listen, and serve in threads.
 
-        No other socket can listen there too: SO_REUSEADDR, unlike SO_REUSEPORT, only ignores closed
+        No other socket can share the port: SO_REUSEADDR, unlike SO_REUSEPORT, only ignores closed
         connections.
+
+        Raises:
+            EndpointError: The address is not available.
+
         """
         if self.running or self._stopping.is_set():
             raise ShmioError("an S7 server can be started only once")
@@ -351,7 +359,7 @@ class S7Server(Server):
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(place)
-            listener.listen()  # the largest backlog: a client too many is refused at once
+            listener.listen()  # the largest backlog, so that excess clients are refused at once
         except OSError as error:
             listener.close()
             taken = ": another program, maybe a running instance, has it" if error.errno == errno.EADDRINUSE else ""
@@ -367,7 +375,9 @@ class S7Server(Server):
     def stop(self) -> int:
         """Close all sockets and wait for all threads.
 
-        ShmioError if one does not end, which would be a defect.
+        Raises:
+            ShmioError: A thread does not end, which would be a defect.
+
         """
         if not self.running:
             return 0
@@ -406,13 +416,13 @@ class S7Server(Server):
             try:
                 client, _ = listener.accept()
             except OSError as error:
-                if not self._stopping.is_set():  # a client that left at once; or no descriptors, which may pass
+                if not self._stopping.is_set():  # the client has left, or no descriptor is free
                     logger.warning("accept failed: %s", error)
                     self._stopping.wait(0.1)
                 continue
             try:
                 self._admit(client)
-            except (OSError, RuntimeError) as error:  # gone already; or no more threads
+            except (OSError, RuntimeError) as error:  # the client has gone, or no thread can start
                 logger.warning("client refused: %s", error)
                 client.close()
 
@@ -435,7 +445,7 @@ class S7Server(Server):
             with contextlib.suppress(OSError):  # the client has gone
                 self._serve(client_socket, address)
         finally:
-            with self.client_lock:  # waits for _admit to have entered it
+            with self.client_lock:  # waits until _admit has registered the client
                 self.clients.remove(threading.current_thread())
                 self._client_sockets.discard(client_socket)
                 self.client_count -= 1
@@ -447,9 +457,9 @@ class S7Server(Server):
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEPALIVE.items():
             client.setsockopt(socket.IPPROTO_TCP, option, value)
-        if not ServerISOConnection(client).accept_connection():  # has a deadline of its own
+        if not ServerISOConnection(client).accept_connection():  # has its own time-out
             return
-        client.setblocking(True)  # a quiet client may stay, but one that takes no answers may not
+        client.setblocking(True)  # only sends time out, so a silent client may stay
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", _SEND_TIMEOUT_S, 0))
         jobs = Jobs(self._memory, self._traits)
         inbox = memoryview(bytearray(_INBOX_SIZE))
@@ -483,12 +493,12 @@ class S7Server(Server):
             end = left
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
-        """Let python-snap7 answer what it may apart from read, write and set-up.
+        """Answer a job other than read, write and set-up: by python-snap7, if that is safe.
 
-        Refuse the rest.
+        All other jobs are refused.
         """
         protocol, kind, function = request_data[0], request_data[1], request_data[10] if len(request_data) > 10 else 0
-        if protocol != _PROTOCOL:  # S7comm-plus, say
+        if protocol != _PROTOCOL:  # such as S7comm-plus
             return None
         if (
             kind == S7PDUType.USERDATA
@@ -505,8 +515,8 @@ class S7Server(Server):
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
         """Return the operating mode as in the manual of S7-300/400: one record of 20 bytes.
 
-        The previous mode, in the same byte, is left out: Snap7's ``Cli_GetPlcStatus`` takes RUN
-        after STOP for STOP.
+        The previous mode, which shares the byte, is left out: with it, Snap7's
+        ``Cli_GetPlcStatus`` would report STOP for RUN after STOP.
         """
         if szl_id != _MODE_LIST:
             found: bytes | None = super()._get_szl_data(szl_id, szl_index)
@@ -519,10 +529,10 @@ class S7Server(Server):
 def _is_served(job: bytes) -> bool:
     """Return whether a PLC control job is for one of ``_SERVICES``.
 
-    Its parameters, named as in Wireshark's S7 dissector, are: the function and 7 bytes; two bytes
-    of length and the argument; one byte of length and the name of the service. Python-snap7 looks
-    for names anywhere in them, and takes a job without a name for a start. So no other name may be
-    there.
+    The parameters of the job, as in Wireshark's S7 dissector, are: the function and 7 bytes; the
+    argument after its length (2 bytes); the name of the service after its length (1 byte).
+    python-snap7 searches all of them for a name, and treats a job without one as a start.
+    Therefore this function accepts a job only if exactly one name occurs.
     """
     parameters = job[10 : 10 + int.from_bytes(job[6:8], "big")]
     argument_size = int.from_bytes(parameters[_SERVICE_ARGUMENT : _SERVICE_ARGUMENT + 2], "big")

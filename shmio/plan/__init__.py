@@ -1,1 +1,1 @@
-"""Plan an instance: from a checked configuration to the processes to start."""
+"""Plan an instance: turn a checked configuration into the processes to start."""

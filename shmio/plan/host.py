@@ -1,4 +1,4 @@
-"""Check what a configuration needs of the host, and find what other users of the host may do to the instance."""
+"""Check what a configuration needs of the host, and what other users of the host may do."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_NAMES: Final = 3
 
 
 def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> list[str]:
-    """Check group, priorities, folders, TLS files and tokens; return warnings. Nothing is created.
+    """Check group, priorities, folders, TLS files and tokens, and return warnings. Create nothing.
 
     ``catching`` returns a context manager that collects a ConfigError instead of raising it.
     """
@@ -115,7 +115,7 @@ def _check_priority(key: str, priority: int | None) -> None:
 
 
 def _check_folder(key: str, folder: Path) -> list[str]:
-    """Raise ConfigError if a folder cannot be written; a full disk is only a warning."""
+    """Raise ConfigError if a folder cannot be written; if its disk is full, return a warning."""
     found = unwritable(folder)
     if found is None:
         return []
@@ -125,7 +125,7 @@ def _check_folder(key: str, folder: Path) -> list[str]:
 
 
 def exposure(config: Config) -> str | None:
-    """Return a line on what other users of this host may do without authentication, or None."""
+    """Return a line about what other users of this host may do without authentication, or None."""
     ways = [*_open_grpc(config), *_open_mqtt(config), *_open_opcua(config)]
     users = other_users() if ways else []
     if not users:
@@ -141,7 +141,7 @@ def exposure(config: Config) -> str | None:
 def other_users() -> list[str]:
     """Return the names of other users who can log in, without root.
 
-    A directory service need not list all its users.
+    Users that a directory service does not list are missing.
     """
     return [user.pw_name for user in pwd.getpwall() if _may_log_in(user) and user.pw_uid not in (0, os.geteuid())]
 
@@ -151,7 +151,7 @@ def _may_log_in(user: pwd.struct_passwd) -> bool:
 
 
 def _open_grpc(config: Config) -> Iterator[str]:
-    """Yield what clients without token and certificate may do by gRPC."""
+    """Yield a text for what clients without token and certificate may do by gRPC."""
     grpc = config.grpc
     if grpc is None:
         return
@@ -166,7 +166,7 @@ def _open_grpc(config: Config) -> Iterator[str]:
 
 
 def _open_mqtt(config: Config) -> Iterator[str]:
-    """Yield what clients without account may do at shmio's own broker."""
+    """Yield a text for what clients without account may do at shmio's own broker."""
     mqtt = config.mqtt
     if mqtt is None or not mqtt.listen:
         return
@@ -179,7 +179,7 @@ def _open_mqtt(config: Config) -> Iterator[str]:
 
 
 def _open_opcua(config: Config) -> Iterator[str]:
-    """Yield what clients without account and certificate may do by OPC UA."""
+    """Yield a text for what clients without account and certificate may do by OPC UA."""
     opcua = config.opcua
     if opcua is None or opcua.trusted:
         return

@@ -22,7 +22,7 @@ from shmio.segment.standing_injections import StandingInjection, declared_docume
 
 
 def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
-    """Return the declared injections encoded for each source's process, and a line about each.
+    """Return the declared injections, encoded for each source's process, and a line about each.
 
     Raises:
         ConfigError: An injection is invalid; the message begins with the full key.
@@ -73,7 +73,7 @@ def _document(source: str, programs: list[Program]) -> bytes:
 
 
 def _standing(program: Program) -> StandingInjection:
-    """Return a declared injection in the form in which its source's process publishes it."""
+    """Return a declared injection as the record that its source's process publishes."""
     declaration = program.declaration
     return StandingInjection(
         2**64 - 1, program.direction, declaration.priority, True, declaration.name, NO_WRITER, 0,

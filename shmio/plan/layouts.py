@@ -1,4 +1,4 @@
-"""Compile the data-block sources that a configuration names, and choose a block of each."""
+"""Compile the data-block sources that a configuration names, and choose a block from each."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class LayoutFiles:
         self._compiled: dict[object, compiler.Compiled | LayoutError] = {}
         self.warnings: list[str] = []
         self.odd: list[str] = []
-        """Remarks on keys that are probably mistakes; each begins with the key."""
+        """Warnings about keys that are probably mistakes; each begins with the key."""
 
     def get(self, key: str, section: Source | Emulator, number: int | None) -> Layout:
         """Return the layout of a section's data block.
 
-        If the files hold several blocks, ``block`` or ``number`` chooses one, and errors in the
+        If the files declare several blocks, ``block`` or ``number`` chooses one, and errors in the
         other blocks are ignored.
 
         Raises:
@@ -45,12 +45,18 @@ class LayoutFiles:
         try:
             block = _choose(key, section, program.blocks, number)
         except ConfigError:
-            program.compile(())  # damaged sources are reported first
+            program.compile(())  # raises errors in damaged sources first
             raise
         return self._compile(key, section, paths, program, block.name)[0]
 
     def all(self, key: str, section: Source | Emulator) -> tuple[Layout, ...]:
-        """Return all layouts of a section's files; ConfigError (missing file) or LayoutError."""
+        """Return all layouts of a section's files.
+
+        Raises:
+            ConfigError: A file is missing.
+            LayoutError: A block cannot be compiled.
+
+        """
         return self._compile(key, section, *self._program(key, section), None)
 
     def _program(self, key: str, section: Source | Emulator) -> tuple[tuple[Path, ...], compiler.Program]:
@@ -112,7 +118,7 @@ def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
 
 
 def _read(path: Path, key: str) -> compiler.Source:
-    """Read a source, at most slightly more than allowed: the compiler refuses that."""
+    """Read a source, a few bytes more than allowed at most: the compiler refuses larger files."""
     try:
         with open(path, "rb", opener=_open_at_once) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -123,7 +129,7 @@ def _read(path: Path, key: str) -> compiler.Source:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Open a file without waiting for a writer if it is a FIFO."""
+    """Open a file; if it is a FIFO, do not wait for a writer."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 

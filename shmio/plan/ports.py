@@ -1,4 +1,4 @@
-"""Check before the start whether listening addresses are local and free."""
+"""Check before the start that listening addresses are local and free."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ def check_ports(plan: Plan) -> None:
 
 
 def taken(plan: Plan) -> Iterator[str]:
-    """Yield a message for each address of the plan that is in use, with its user where visible.
+    """Yield a message for each address of the plan that is in use, with the program if visible.
 
-    Other faults of an address are left for its process to report.
+    Other faults of an address are reported by its process.
     """
     for job in plan.jobs:
         for text in job.listening:
@@ -77,19 +77,19 @@ def taken(plan: Plan) -> Iterator[str]:
 
 
 def in_use(address: Address) -> bool:
-    """Return whether an address is in use; a name counts if all its addresses are. ConfigError."""
+    """Return whether the address, or each one of a name, is in use; an unknown name: ConfigError."""
     with suppress(OSError):
         return address.port != 0 and all(_taken(family, place) for family, place in _places(address))
     return False
 
 
 def served(address: Address) -> bool:
-    """Return whether a process of this host listens at an address of it."""
+    """Return whether a process of this host listens at the address, or at one that the name has."""
     return any(True for _ in _listening(address))
 
 
 def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
-    """Return (family, socket address) for each address of a host name; ConfigError if unknown."""
+    """Return (family, socket address) for each address of a host, or raise ConfigError."""
     try:
         found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:  # UnicodeError: a part of the name is empty, or too long
@@ -109,7 +109,7 @@ def _hosts(address: Address) -> set[str]:
 
 
 def _share(hosts: set[str], others: set[str]) -> bool:
-    """Return whether listeners on two sets of hosts exclude each other; [::] takes IPv4, too."""
+    """Return whether listeners on two sets of hosts conflict; [::] includes IPv4."""
     if hosts & others or _ANY in hosts | others:
         return True
     ours, theirs = ({host for host in all_ if len(host) == len(_ANY_IPV4)} for all_ in (hosts, others))
@@ -118,7 +118,7 @@ def _share(hosts: set[str], others: set[str]) -> bool:
 
 def _taken(family: int, place: tuple[Any, ...]) -> bool:
     with socket.socket(family) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections that are over do not count
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # ignore closed connections
         try:
             probe.bind(place)
         except OSError as error:
@@ -179,7 +179,7 @@ def _command(pid: int) -> str:
 
 
 def _open_files(pid: int) -> Iterator[str]:
-    """Yield the targets of a process's descriptors, as far as this user may read them."""
+    """Yield the targets of a process's file descriptors, as far as this user may read them."""
     with suppress(OSError):
         for entry in Path(f"/proc/{pid}/fd").iterdir():
             with suppress(OSError):

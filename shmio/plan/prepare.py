@@ -48,7 +48,7 @@ class Prepared:
     emulated: dict[str, tuple[Layout, ...]]
     """All blocks of each emulator, by emulator name."""
     injections: tuple[str, ...]
-    """A line about each declared injection."""
+    """Lines about the declared injections."""
     notes: tuple[str, ...] = ()
     """Remarks that are not faults."""
 
@@ -171,7 +171,7 @@ def _spelled_source(source: Source, layout: Layout) -> Source:
 
 
 def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) -> None:
-    """Warn of the sources' patterns as far as their layouts are known, in spite of faults elsewhere."""
+    """Warn about patterns of sources with known layouts, although there are faults elsewhere."""
     names = [source.name for source in config.source]
     for index, source in enumerate(config.source):
         if source.name in layouts and names.count(source.name) == 1:
@@ -182,7 +182,7 @@ def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) ->
 
 
 def peer(source: Source) -> str:
-    """Return the device of a checked source as host:port, or what it has of these."""
+    """Return the device of a checked source as host:port, as the host alone, or ""."""
     host, port = source.options.get("host"), source.options.get("port")
     return str(Address(host, port)) if host and port else str(host or "")
 
@@ -226,7 +226,7 @@ def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
 
 
 def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str]:
-    """Return warnings about settings that are valid but probably unintended; note invalid patterns."""
+    """Return warnings about probably unintended settings; add faults for invalid patterns."""
     odd = []
     for index, source in enumerate(config.source):
         key, layout = f"source[{index}]", layouts[source.name]
@@ -242,7 +242,7 @@ def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str
 
 
 def _odd_patterns(key: str, source: Source, layout: Layout, faults: Faults) -> Iterator[str]:
-    """Yield warnings about a source's patterns that name nothing; note invalid ones."""
+    """Yield warnings about a source's patterns that name nothing; add faults for invalid ones."""
     for name, patterns in (("writable", source.writable), ("allow_nonfinite", source.allow_nonfinite)):
         for pattern in patterns:
             try:
@@ -282,7 +282,7 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
 
 
 def _check_part(path: str, layouts: dict[str, Layout]) -> None:
-    """Raise PathError if there is no such bit, slice or other part."""
+    """Raise PathError if the path names a bit, slice or other part that does not exist."""
     topic = parse_topic(path, layouts, None)
     look_up(layouts[topic.source], topic)
 
@@ -340,7 +340,7 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
 
 
 def _not_emulated(config: Config) -> Iterator[str]:
-    """Yield warnings about sources that read this host where none of its emulators listens."""
+    """Yield warnings about sources that read this host at an address without an emulator."""
     listening = {emulator.name: str(Address.parse(emulator.listen)) for emulator in config.emulator}
     for index, source in enumerate(config.source):
         device = peer(source)
@@ -359,9 +359,13 @@ def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
 
 
 def _covers(pattern: str, layout: Layout, types: Sequence[str] = ()) -> bool:
-    """Return whether a pattern names a register of these types, something above it, or a part.
+    """Return whether a pattern names a register of these types, a part of it, or its container.
 
-    Without ``types`` all types count. PathError: the pattern is invalid.
+    Without ``types``, all types count.
+
+    Raises:
+        PathError: The pattern is invalid.
+
     """
     if names_part(pattern):
         return any(not types or register.type in types for register in chosen(layout, pattern))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from shmio.connectors.replay.recording import Recording
 
 LEAD_NS: Final = 2_000_000_000
-"""Lead of the clock's start over the recording's, if possible, for the processes to start."""
+"""Time between the clock's start and the recording's, if possible: the processes start then."""
 
 
 class Replayed(NamedTuple):
@@ -30,9 +30,10 @@ class Replayed(NamedTuple):
 
 
 class Recordings:
-    """Opens the recordings that a configuration plays: each once for all sources that follow one another.
+    """Opens the recordings that a configuration plays.
 
-    It keeps the one that was requested last open. Use it as a context manager.
+    The last one stays open, so that consecutive sources of one recording share it. Use it as a
+    context manager.
     """
 
     def __init__(self) -> None:
@@ -40,7 +41,7 @@ class Recordings:
         self._recording: Recording | None = None
 
     def get(self, files: Sequence[str]) -> Recording:
-        """Return the recording of these files, valid until another is requested; RecordingError."""
+        """Return the recording of these files, or raise RecordingError; the next call closes it."""
         from shmio.connectors.replay.recording import Recording  # noqa: PLC0415  most configurations play none
 
         if self._recording is None or files != self._files:
@@ -62,7 +63,7 @@ class Recordings:
 
 
 def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) -> Replayed:
-    """Return the configuration with only the recording's sources; ConfigError with its key."""
+    """Return the configuration with only the recording's sources; raise ConfigError with its key."""
     section = _section(config, keys)
     files = [str(config.path(file)) for file in _listed(section.file)]
     if not files:
@@ -144,7 +145,7 @@ def _mqtt(config: Config, names: list[str]) -> Mqtt | None:
 
 
 def _gone(config: Config, rule: MqttTopic, names: list[str]) -> list[str]:
-    """Return the configured sources that a rule for frames names and the recording lacks."""
+    """Return the configured sources that a rule for frames names but that the recording lacks."""
     own = {source.name for source in config.source} - set(names)
     return [pattern for pattern in rule.patterns if rule.payload == "frames" and pattern in own]
 

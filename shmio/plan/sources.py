@@ -26,7 +26,7 @@ from shmio.plan.replay import Recordings
 
 NEEDED: Final = "this key is needed"
 PATIENCE_S: Final = 60.0
-"""The longest time that the import of a model may take."""
+"""Time-out for the import of a model, in s."""
 
 
 class Sources(NamedTuple):
@@ -90,7 +90,7 @@ def _check_source(
     if issubclass(connector, Connector) and connector.register_quality:
         layout = layout.with_statuses()
     found.layouts[source.name] = layout
-    if options is None:  # its faults are reported, and so are those that the connector finds
+    if options is None:  # its faults have been added, with those that the connector found
         options = _filled(connector.Options, source)
         if options is None:
             return
@@ -107,7 +107,7 @@ def _check_source(
 
 
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
-    """Add the faults of a source's connector keys; ``index`` is the source's place in the file."""
+    """Add the faults of a source's connector keys; ``index`` is the source's index in the file."""
     key = f"source[{index}]"
     try:
         known = [field.encode_name for field in msgspec.structs.fields(registry.options_type(connector))]
@@ -182,7 +182,7 @@ def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tupl
 
 
 def _describe(key: str, options: Simulation.Options, layout: Layout | None) -> tuple[Layout, tuple[str, ...]]:
-    """Return the layout of a model's block, and the inputs that can be connected.
+    """Return the layout of a model's block, and the paths of its inputs.
 
     A separate process imports the model.
 

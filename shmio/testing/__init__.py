@@ -1,1 +1,1 @@
-"""What tests and benchmarks share: faults on the wire, ports. Never imported by the rest of shmio."""
+"""Code that tests and benchmarks share: faults on the wire, ports. Never imported at run time."""

@@ -1,4 +1,4 @@
-"""A whole cell that a test starts and stops by the commands, and what such tests need of the host."""
+"""A whole cell that a test starts and stops by the commands, and helpers for such tests."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Cell:
         self.output("shmio-supervisor", "up", "--detach")
 
     def down(self) -> None:
-        """Stop the instance; return when it is gone."""
+        """Stop the instance; return when it has ended."""
         self.output("shmio-supervisor", "down")
 
     def status(self) -> dict[str, Any]:
@@ -107,7 +107,7 @@ class Cell:
 
 
 def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE_S) -> None:
-    """Wait until a condition holds; AssertionError if it does not in time."""
+    """Wait until a condition is true; raise AssertionError if it is not in time."""
     deadline = time.monotonic() + patience_s
     while not condition():
         if time.monotonic() > deadline:
@@ -116,7 +116,7 @@ def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE
 
 
 def kill(pid: int, sign: signal.Signals = signal.SIGKILL) -> None:
-    """Signal a process that is not a child of this one; a pidfd ensures that no other process gets the signal."""
+    """Signal a process that need not be a child, by a pidfd, so that no other one gets the signal."""
     handle = os.pidfd_open(pid)
     try:
         signal.pidfd_send_signal(handle, sign)

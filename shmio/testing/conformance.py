@@ -25,7 +25,7 @@ PERIOD_NS = 5_000_000
 
 
 class Rig(Protocol):
-    """A device behind a proxy, whose block changes all the time."""
+    """A device behind a fault proxy; its block changes continuously."""
 
     proxy: FaultProxy
     layout: Layout
@@ -36,7 +36,9 @@ class Rig(Protocol):
     def generation(self, raw: bytes) -> int:
         """Return a number for an image of the device that never decreases over time.
 
-        AssertionError: The device never had this image.
+        Raises:
+            AssertionError: The device never had this image.
+
         """
 
 
@@ -56,7 +58,7 @@ class Run:
             thread.start()
 
     def until(self, condition: Callable[[Frame], bool]) -> Frame:
-        """Follow the block until a frame fulfils the condition."""
+        """Follow the block until a frame satisfies the condition, and return that frame."""
         deadline = time.monotonic() + PATIENCE_S
         while (rest_s := deadline - time.monotonic()) > 0:
             frame = self._cursor.next(rest_s)
@@ -75,7 +77,7 @@ class Run:
         return self.until(lambda frame: frame.quality is Quality.BAD)
 
     def stop(self) -> None:
-        """Stop the loop, and check the rules that hold for all frames."""
+        """Stop the loop, and check the rules that apply to all frames."""
         self._clock.stop()
         self.loop.commands.stop()
         for thread in self._threads:
@@ -98,13 +100,13 @@ class Run:
 
 
 class ConnectorConformance:
-    """Tests of reading: inherit from this class, and define a fixture ``rig``.
+    """Tests of reading: inherit from this class, and define a fixture ``rig``, a :class:`Rig`.
 
     Connectors that can write use :class:`shmio.testing.write_conformance.WriteConformance`.
     """
 
     writable: ClassVar[tuple[str, ...]] = ()
-    """Patterns of what the source may write."""
+    """Patterns of the registers that are writable."""
 
     @pytest.fixture
     def run(self, rig: Rig, instance: str) -> Iterator[Run]:
@@ -131,13 +133,13 @@ class ConnectorConformance:
         run.until(lambda frame: rig.generation(frame.raw) > first)
 
     def test_absent_at_start(self, absent: None, run: Run, rig: Rig) -> None:
-        """Bad with a reason until the device comes, then good."""
+        """The source is bad with a reason until the device appears, and then good."""
         assert "refused" in run.bad().reason
         rig.proxy.admit()
         run.good()
 
     def test_lost_and_back(self, run: Run, rig: Rig) -> None:
-        """The peer closes, refuses for a while, and is back: twice."""
+        """Twice, the peer closes the connection, refuses others for a while, and is back."""
         for _ in range(2):
             run.good()
             rig.proxy.refuse()
@@ -146,14 +148,14 @@ class ConnectorConformance:
             run.good()
 
     def test_reset(self, run: Run, rig: Rig) -> None:
-        """The peer crashes and is there again at once."""
+        """The peer crashes and is available again at once."""
         run.good()
         rig.proxy.cut(reset=True)
         run.bad()
         run.good()
 
     def test_cut_in_the_middle_of_an_answer(self, run: Run, rig: Rig) -> None:
-        """Half an answer counts as none."""
+        """Half an answer never becomes a frame."""
         run.good()
         rig.proxy.cut_after(30)
         run.bad()
@@ -161,7 +163,7 @@ class ConnectorConformance:
         run.good()
 
     def test_half_open(self, run: Run, rig: Rig) -> None:
-        """The connection is open but nothing comes: bad after the time-out, then good."""
+        """The connection is open but the peer is silent: bad after the time-out, then good."""
         run.good()
         rig.proxy.freeze()
         assert "answer" in run.bad().reason
@@ -178,7 +180,7 @@ class ConnectorConformance:
         run.good()
 
     def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Rig) -> None:
-        """A late answer arrives on a new connection, where nobody waits for it."""
+        """A late answer that arrives on the next connection is never taken for another answer."""
         run.good()
         rig.proxy.hold(frames=1)
         run.bad()

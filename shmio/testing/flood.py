@@ -1,4 +1,4 @@
-"""A flood of gRPC calls to unknown methods, as raw HTTP/2, because client libraries refuse to send some of them."""
+"""A flood of gRPC calls to unknown methods, as raw HTTP/2: client libraries refuse to send some."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final
 NOT_UTF8: Final = b"/x\xff\xfe/y"
 UNKNOWN: Final = b"/shmio.v1.Shmio/NoSuchCall"
 WINDOW: Final = 64
-"""A server accepts at least this many concurrent calls on a connection."""
+"""Number of concurrent calls on a connection that every server accepts."""
 
 _PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 _FIELDS: Final = {
@@ -31,11 +31,11 @@ class Flood:
     """Threads that send such calls as fast as they are answered, each over its own connections."""
 
     def __init__(self, names: Sequence[bytes] = (NOT_UTF8, UNKNOWN), window: int = WINDOW) -> None:
-        """Take the names to call, and the maximum number of unanswered calls of a connection."""
+        """Set the names to call, and the maximum number of unanswered calls on a connection."""
         self.answered = 0
         """Number of calls that were answered with a status."""
         self.lost = 0
-        """Number of connections that the server ended."""
+        """Number of connections that the server closed."""
         self._names = names
         self._window = window
         self._connections: set[socket.socket] = set()
@@ -56,7 +56,7 @@ class Flood:
             self._over.set()
             with self._lock:
                 for connection in self._connections:
-                    _end(connection)  # else a worker waits for answers from an event loop that waits for the worker
+                    _end(connection)  # or the event loop and a worker would wait for each other
             for worker in workers:
                 worker.join()
 
@@ -114,13 +114,13 @@ def connect(target: tuple[str, int] | str, tls: ssl.SSLContext | None = None) ->
 
 
 def _end(connection: socket.socket) -> None:
-    """Shut the socket down without TLS's farewell, so that the thread that reads from it sees the end."""
+    """Shut the socket down without a TLS close, so that the thread that reads it sees the end."""
     with suppress(OSError):
         socket.socket.shutdown(connection, socket.SHUT_RDWR)
 
 
 def _frames(connection: socket.socket) -> Iterator[tuple[int, int]]:
-    """Yield the kind and the flags of each frame; OSError at the end."""
+    """Yield the kind and the flags of each frame; raise OSError when the server closes."""
     received = bytearray()
     while True:
         while len(received) < 9 or len(received) < 9 + int.from_bytes(received[:3], "big"):

@@ -13,7 +13,7 @@ from shmio.endpoints.mqtt.broker.program import find_mosquitto
 
 PATIENCE_S = 20.0
 TETHER = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
-"""Ends the broker with the thread that started it, so that a killed test run leaves none. Part of util-linux."""
+"""Command of util-linux that kills the broker when the thread that started it ends."""
 
 
 def missing() -> str:
@@ -22,10 +22,10 @@ def missing() -> str:
 
 
 class Mosquitto:
-    """A broker that keeps its port when it restarts; its log is ``mosquitto.log`` in its folder."""
+    """A broker that keeps its port over restarts; its log is ``mosquitto.log`` in its folder."""
 
     def __init__(self, folder: Path, address: Address, *lines: str) -> None:
-        """Write the configuration; ``lines`` follow the lines for the port, and by default anybody may connect."""
+        """Write the configuration: the port, then ``lines``; by default anybody may connect."""
         self.folder = folder
         self.address = address
         self._file = folder / "mosquitto.conf"
@@ -35,12 +35,12 @@ class Mosquitto:
 
     @property
     def log(self) -> str:
-        """The log so far."""
+        """Text of the log file."""
         return (self.folder / "mosquitto.log").read_text()
 
     @property
     def pid(self) -> int:
-        """The pid of the broker, or 0 if it does not run."""
+        """Pid of the broker, or 0 if it does not run."""
         return self._process.pid if self._process else 0
 
     def start(self) -> None:

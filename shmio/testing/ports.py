@@ -1,4 +1,4 @@
-"""TCP ports for tests: the kernel chooses them, so tests contain no port numbers."""
+"""TCP ports for tests, chosen by the kernel, so that tests contain no port numbers."""
 
 from __future__ import annotations
 

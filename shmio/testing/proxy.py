@@ -1,8 +1,8 @@
 """TCP proxy with faults on demand between a program and its peer, for tests and benchmarks.
 
-It has one thread and uses ``select``, whose time-outs resolve microseconds, unlike those of
-``epoll``. Every method that changes the behaviour returns when the change is in effect, so that
-tests need not wait.
+It has one thread and uses ``select``, because its time-outs have microseconds, unlike those of
+``epoll``. A method that changes the behaviour returns when the change is in effect, so that tests
+need not wait.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Framing = Callable[[bytes | bytearray], int]
 
 _CHUNK = 1 << 16
 _TIMEOUT_S = 10
-_MAX_QUEUED = 4 << 20  # bytes under way in one direction, beyond which the sender is left waiting
+_MAX_QUEUED = 4 << 20  # bytes queued in one direction; then the sender has to wait
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with RST
 
 
 class Link:
-    """A client's connection, with the connection to the server that belongs to it."""
+    """A client's connection, and the matching connection to the server."""
 
     def __init__(self, client: socket.socket, server: socket.socket) -> None:
         self._sockets = (client, server)
@@ -44,13 +44,13 @@ class Link:
 
     @property
     def open(self) -> bool:
-        """Return whether bytes may still pass."""
+        """True if bytes may still pass."""
         if self._sockets[0].fileno() >= 0 and all(pipe.finished for pipe in self.pipes):
             self.close()
         return self._sockets[0].fileno() >= 0
 
     def close(self, *, reset: bool = False) -> None:
-        """Close both ends; with ``reset`` as a crashed peer does."""
+        """Close both connections; with ``reset`` by a TCP reset, as when a peer crashes."""
         for end in self._sockets:
             if end.fileno() >= 0 and reset:
                 end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
@@ -63,7 +63,7 @@ class Pipe:
     def __init__(self, link: Link, source: socket.socket, sink: socket.socket) -> None:
         self.link = link
         self.source, self.sink = source, sink
-        self.partial = bytearray()  # of a frame to be edited
+        self.partial = bytearray()  # an incomplete frame that is to be edited
         self.due = bytearray()
         self.ended = False
         self.finished = False
@@ -73,12 +73,12 @@ class Pipe:
 
     @property
     def hungry(self) -> bool:
-        """Return whether to read more from the sender."""
+        """True if more bytes may be read from the sender."""
         return not self.ended and self._queued < _MAX_QUEUED
 
     @property
     def next_s(self) -> float:
-        """Return when the next bytes are due, on the monotonic clock; infinity if there are none."""
+        """Time at which the next bytes are due, in s (monotonic); infinity if there are none."""
         return self._later[0][0] if self._later else float("inf")
 
     def enqueue(self, data: bytes, delay_s: float) -> None:
@@ -95,7 +95,7 @@ class Pipe:
             self.due += self._later.popleft()[1]
 
     def end_when_drained(self) -> None:
-        """Pass on the end of the stream after its last byte."""
+        """Pass on the end of the stream once its last byte is sent."""
         if self.ended and not self.due and not self._later and not self.finished:
             self.finished = True
             with contextlib.suppress(OSError):
@@ -126,21 +126,21 @@ def reference_edit(change: Callable[[int], int]) -> Edit:
 
 
 class Tampering:
-    """The present edit, and the frames on hold; only the proxy's thread uses it.
+    """The present edit, and the frames on hold. Only the proxy's thread may use it.
 
-    ``frame_held`` may be used by all threads.
+    Any thread may use ``frame_held``.
     """
 
     def __init__(self, framing: Framing | None) -> None:
-        """Take the function that finds the end of a frame; with None each ``recv`` is a frame."""
+        """Set the function that measures a frame; with None each ``recv`` is a frame."""
         self._framing = framing
         self._edit: Edit | None = None
         self._held: list[bytes] = []
         self.frame_held = threading.Event()
-        """Set while a frame is kept back."""
+        """Set while a frame is on hold."""
 
     def begin(self, edit: Edit, frames: int | None) -> None:
-        """Pass frames through a function, for ``frames`` frames or until the end."""
+        """Pass frames through a function: ``frames`` of them, or all until :meth:`end` if None."""
         left = frames
 
         def counted(frame: bytes) -> bytes | None:
@@ -154,7 +154,7 @@ class Tampering:
         self._edit = counted
 
     def keep(self, frame: bytes) -> None:
-        """Put a frame on hold; this method is an edit."""
+        """Put a frame on hold. This method can be used as an edit."""
         self._held.append(frame)
         self.frame_held.set()
 
@@ -207,10 +207,10 @@ class FaultProxy:
         self._links: list[Link] = []
         self._waiting: list[socket.socket] = []
         self.accepted = 0
-        """Connections taken so far."""
+        """Number of connections accepted so far."""
         self._cleanup = contextlib.ExitStack()
         self.address = self._cleanup.enter_context(reserved_port())
-        """Where clients connect to."""
+        """Address to which clients connect."""
         self._listener: socket.socket | None = socket.create_server((self.address.host, self.address.port))
         self._running = True
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -229,7 +229,7 @@ class FaultProxy:
         if self._thread.is_alive():
             self._do(self._end)
             self._thread.join(_TIMEOUT_S)
-        self._wake_in.close()  # here, because callers of _do still use them when the thread has ended
+        self._wake_in.close()  # not in the thread, because callers of _do use them after its end
         self._wake_out.close()
 
     # -- faults --------------------------------------------------------------------------------------------------------
@@ -254,7 +254,7 @@ class FaultProxy:
         self._do(change)
 
     def cut(self, *, reset: bool = False) -> None:
-        """Close all connections now: in good order, or with ``reset`` as a crashed peer does."""
+        """Close all connections now; with ``reset`` by a TCP reset, as when a peer crashes."""
 
         def change() -> None:
             for link in self._links:
@@ -263,7 +263,7 @@ class FaultProxy:
         self._do(change)
 
     def cut_after(self, count: int) -> None:
-        """Let ``count`` more bytes through to the clients, then cut."""
+        """Pass ``count`` more bytes to the clients, then cut all connections."""
 
         def change() -> None:
             self._left_bytes = count
@@ -315,7 +315,7 @@ class FaultProxy:
         self.edit(self._tampering.keep, frames=frames)
 
     def wait_held(self, timeout_s: float = _TIMEOUT_S) -> bool:
-        """Wait until a frame is on hold; False if none came in time."""
+        """Wait until a frame is on hold; return False if none came in time."""
         return self._tampering.frame_held.wait(timeout_s)
 
     def release(self) -> None:
@@ -331,7 +331,7 @@ class FaultProxy:
     # -- the thread ----------------------------------------------------------------------------------------------------
 
     def _do(self, action: Callable[[], None]) -> None:
-        """Have the thread run ``action``, and wait for it."""
+        """Run ``action`` in the proxy's thread, and wait until it is done."""
         done = threading.Event()
 
         def act() -> None:

@@ -1,7 +1,7 @@
 """Test suite for connectors that can write, in addition to that of reading. It needs pytest.
 
 It checks that reported outcomes are true, that a bit is written without its neighbours, and that
-after any fault no confirmation is taken for that of another write.
+after any fault no confirmation is matched to another write.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class WriteRig(Rig, Protocol):
     """A device that accepts writes."""
 
     spare: int
-    """Offset of ``SPARE`` bytes that the device leaves as they were written. Zero at first."""
+    """Offset of ``SPARE`` bytes, initially zero, which the device never changes."""
     flags: int
-    """Offset of a byte in whose other bits the device counts all the time, and whose lowest bit it leaves alone.
+    """Offset of a byte of which the device leaves the lowest bit alone, and counts in the others.
 
-    ``generation`` asserts that it has not lost a count.
+    ``generation`` asserts that no count is lost.
     """
     refused: Write
-    """What the device refuses."""
+    """A write that the device refuses."""
 
 
 class Writer:
@@ -46,7 +46,7 @@ class Writer:
         self._events = run.block.events.cursor()
 
     def write(self, *writes: Write) -> Event:
-        """Send a command; return the event that ends its first item once all items have ended."""
+        """Send a command, and wait for the outcomes of all items; return that of the first."""
         number = self._sender.submit(writes, time.monotonic_ns() + round(FAR_S * 1e9))
         ends: list[Event] = []
         deadline_s = time.monotonic() + PATIENCE_S
@@ -71,7 +71,7 @@ class Writer:
         return self._run.until(lambda frame: frame.quality is Quality.GOOD and frame.source_ns > end.utc_ns)
 
     def once_open(self, *writes: Write) -> Event:
-        """Send a command, again and again while the source is not connected."""
+        """Send a command, and repeat it until the source is connected."""
         deadline_s = time.monotonic() + PATIENCE_S
         while True:
             try:
@@ -88,12 +88,12 @@ class WriteConformance(ConnectorConformance):
 
     @pytest.fixture
     def writer(self, run: Run) -> Writer:
-        """Provide a writer of commands to the running source, which is connected."""
+        """Provide a writer of commands, once the running source is connected."""
         run.good()
         return Writer(run)
 
     def test_a_value_written_is_in_the_next_frame(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """After the confirmation, every request gets the new value."""
+        """Every read that is requested after the confirmation returns the new value."""
         for turn in range(1, 20):
             value = bytes([turn]) * SPARE
             frame = writer.written(Write(rig.spare, 0, value))
@@ -107,7 +107,7 @@ class WriteConformance(ConnectorConformance):
         assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
 
     def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """The device counts in the other bits meanwhile; every frame is checked for lost counts."""
+        """The device counts in the other bits meanwhile, and no count is lost."""
         for turn in range(50):
             frame = writer.written(Write(rig.flags, 1, bytes([turn & 1])))
             assert frame.raw[rig.flags] & 1 == turn & 1
