@@ -1,1 +1,1 @@
-"""Layouts: compile data-block sources to registers, and encode and name their values. No I/O."""
+"""Layouts: compile data-block sources, find registers by path, and convert values. No I/O."""

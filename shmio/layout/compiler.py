@@ -32,7 +32,7 @@ from shmio.layout.source.syntax import (
 
 MAX_ALL_REGISTERS = 500_000
 MAX_ALL_STRUCTURES = 500_000
-"""Limits for all blocks compiled together: a small source can declare many large ones."""
+"""Limit for all blocks that are compiled together: a small source can declare many large ones."""
 
 _Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, ConstantDeclaration)
 
@@ -55,7 +55,7 @@ class Source:
 class Compiled:
     """Result of a compilation: the layouts in source order, and the warnings.
 
-    ``unused`` names the types whose size was given although nothing has this type.
+    ``unused`` has the types for which a size was given although no member has the type.
     """
 
     layouts: tuple[Layout, ...]
@@ -86,7 +86,7 @@ def compile_sources(
         The layouts in source order, with the warnings.
 
     Raises:
-        LayoutError: A source is wrong; ``diagnostics`` has everything found, errors first.
+        LayoutError: A source is wrong; ``diagnostics`` has all errors, then all warnings.
 
     """
     return Program(sources).compile(blocks, type_bytes)
@@ -96,7 +96,7 @@ class Program:
     """Parsed sources, whose data blocks can be compiled together or one at a time."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
-        """Parse the sources. LayoutError: a tag table is invalid, or given with other files."""
+        """Parse the sources; raise LayoutError for an invalid tag table, or one with other files."""
         self._files = [source.file for source in sources]
         self._general = Report(self._files)
         self._table: Layout | None = None
@@ -133,7 +133,7 @@ class Program:
             report.add(Diagnostic(file, 1, 1, "expected a DATA_BLOCK, found none"))
 
     def _by_name(self, declarations: Sequence[_Declaration]) -> tuple[dict[str, _Declaration], dict[str, Diagnostic]]:
-        """Index declarations by name in lower case; return an error for each duplicate, too."""
+        """Index declarations by name in lower case; also return an error for each duplicate."""
         found: dict[str, _Declaration] = {}
         doubles: dict[str, Diagnostic] = {}
         for declaration in declarations:
@@ -145,9 +145,9 @@ class Program:
         return found, doubles
 
     def _faults(self) -> Iterator[Diagnostic]:
-        """Errors and warnings of all declarations, without those of function blocks.
+        """Yield the errors and warnings of all declarations except function blocks.
 
-        A function block's faults count only where it is used.
+        A function block's faults are reported only where it is used.
         """
         for unit in self._units:
             declarations: list[TypeDeclaration | BlockDeclaration] = [*unit.types, *unit.blocks]
@@ -160,7 +160,7 @@ class Program:
         """Compile all data blocks, or those named; see :func:`compile_sources`.
 
         Raises:
-            LayoutError: A source is wrong; ``diagnostics`` has everything found, errors first.
+            LayoutError: A source is wrong; ``diagnostics`` has all errors, then all warnings.
 
         """
         if self._table is not None:
@@ -202,7 +202,7 @@ class Program:
         return Compiled(tuple(layouts), tuple(report.warnings), unused)
 
     def _report_chosen(self, wanted: Sequence[BlockDeclaration], report: Report) -> None:
-        """Report only the faults of these blocks."""
+        """Report the faults of these blocks only."""
         names: dict[str, BlockDeclaration] = {}
         for block in wanted:
             report.extend(block.faults)

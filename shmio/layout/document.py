@@ -1,7 +1,7 @@
-"""Reads a layout's JSON, as segments and recordings store it.
+"""Read a layout's JSON, as segments and recordings store it.
 
-It trusts nothing: types are checked strictly, then every value that can be computed is
-computed again and compared.
+The JSON is untrusted: types are checked strictly, then every value that can be computed is computed
+again and compared.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class _Layout(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     status_offset: Annotated[int, msgspec.Meta(ge=0)] | None = None
 
 
-_DECODER = msgspec.json.Decoder(_Layout)  # msgspec crashes if two threads use a type first
+_DECODER = msgspec.json.Decoder(_Layout)  # msgspec crashes if two threads are the first to use a type
 
 
 def load_layout(data: bytes) -> Layout:
@@ -70,7 +70,7 @@ def load_layout(data: bytes) -> Layout:
         document.name, document.number, document.size, document.optimized, registers,
         document.byte_order, document.status_offset,
     )  # fmt: skip
-    vars(layout)["hash"] = hashlib.sha256(data).digest()  # to make the JSON anew would take longer than to read it
+    vars(layout)["hash"] = hashlib.sha256(data).digest()  # making the JSON again would take longer
     return layout
 
 
@@ -109,7 +109,7 @@ def _check(document: _Layout) -> None:
 
 
 def _kind(register: Register) -> tuple[int, int, bool]:
-    """Return size, count and whether it has a bit, of each register of this type and these bounds.
+    """Return size, count and whether there is a bit, for a register's type and bounds.
 
     Raises:
         LayoutError: There is no such type, or a bound is wrong.

@@ -43,7 +43,7 @@ class _Expansion:
 
     def __init__(self, report: Report) -> None:
         self._report = report
-        # Caches: each text is parsed once, however often its structure is expanded.
+        # Caches, so that each text is parsed once, however often its structure is expanded.
         self._split: dict[tuple[int, str], dict[str, str]] = {}
         self._listed: dict[tuple[int, str], list[str | None]] = {}
         self._told: set[Position] = set()
@@ -137,7 +137,7 @@ def _member_values(text: str, group: Group) -> dict[str, str]:
 
 
 def _element_values(text: str, dims: Dims) -> list[str | None]:
-    """Return the text for each element of an array of structures; None for an element without one."""
+    """Return the initial value's text for each element of an array of structures, or None."""
     shape = shape_of(dims)
     values: list[str | None] = [None] * math.prod(shape)
     if text.strip().startswith("("):
@@ -285,7 +285,7 @@ class _InitialTexts:
         self._register = register
         self._whole = register.initial
         self._elements: dict[int, str] = {}
-        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # DTLs that are assigned by member
+        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # DTLs assigned by member
 
     def set(self, index: tuple[int, ...], text: str) -> None:
         """Assign one element, or the whole register if ``index`` is empty."""

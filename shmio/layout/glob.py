@@ -1,9 +1,9 @@
 """Glob patterns over register paths.
 
-``*`` matches within one segment. ``**`` crosses segments; as a whole segment it also matches none.
-The name of an array or a structure covers everything below it. Segments may be percent-encoded
-like those of a path, so ``%2A`` is a literal star. Patterns come from clients: matching time is
-linear in the path's length, whatever the pattern.
+``*`` matches within one segment. ``**`` crosses segments; a whole segment ``**`` also matches no
+segment. The name of an array or a structure matches everything below it. Segments may be
+percent-encoded like those of a path, so ``%2A`` is a literal star. Patterns come from clients, so
+the time to match is linear in the path's length, whatever the pattern.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Glob:
             if position:
                 self._literal("/")
             if segment == "**" and position < len(segments) - 1:
-                self._forks |= 1 << self._final  # `**/` as a whole may match nothing
+                self._forks |= 1 << self._final  # a whole segment `**/` may match nothing
                 self._final += 1
             for piece in _pieces(segment):
                 if piece.startswith("*"):
@@ -105,7 +105,7 @@ def _pieces(segment: str) -> list[str]:
     if "*" not in segment:
         return [encode_segment(decode_segment(segment))]
     pieces = _PIECES.findall(segment)
-    # "in" and "out" are encoded only as whole names, hence the guard letter.
+    # "in" and "out" are encoded only as whole names; the added letter prevents that.
     return [piece if piece[0] == "*" else encode_segment(f"_{decode_segment(piece)}")[1:] for piece in pieces]
 
 

@@ -1,4 +1,4 @@
-"""Initial image of a block, as after a download to the controller: all initial values."""
+"""Initial image of a block with all initial values, as after a download to the controller."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.literal import default_text, parse_literal
 
 MAX_LISTED: Final = 20
-"""Number of unreadable initial values that are listed one by one."""
+"""Maximum number of unreadable initial values that get a line each."""
 
 
 def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:

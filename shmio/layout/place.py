@@ -3,11 +3,11 @@
 - BOOL takes the next bit; anything else begins at the next whole byte.
 - One-byte types take the next byte; all wider types, strings included, begin at an even byte.
 - Arrays and structures begin at an even byte and are padded to an even length.
-- In an instance of a function block, so does each section: inputs, outputs, in-outs, static
-  members. An in-out of a structured type is a POINTER to the caller's argument.
+- In an instance of a function block, each section (inputs, outputs, in-outs, static members) does
+  the same. An in-out of a structured type is a POINTER to the caller's argument.
 
-Each type is placed once, however often it is used. The size of the expansion is computed, and
-limited, before ``emit.py`` expands anything. ``docs/reference/layout-rules.md`` gives the rules with
+Each type is placed once, however often it is used. The size of the expansion is computed and
+checked before ``emit.py`` expands anything. ``docs/reference/layout-rules.md`` gives the rules with
 their evidence.
 """
 
@@ -64,7 +64,7 @@ class Leaf:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A placed structure; ``size`` in bytes, always even. ``opaque``: its members are unknown."""
+    """A placed structure; ``size`` in bytes, always even. ``opaque``: True if its members are unknown."""
 
     fields: dict[str, Field]  # by name in lower case: S7 names are case-insensitive
     size: int
@@ -158,7 +158,7 @@ class Placer:
         self._global = self._constants = constants
         self._report = report
         self.placed: dict[str, Group | None] = {}
-        """Placed types by name in lower case; None for a type with errors."""
+        """Placed types by name in lower case, with None for a type with errors."""
         self._open: dict[str, str] = {}  # names of the types that are being placed, by key
 
     def block(self, struct: Struct, constants: Constants) -> Group | None:
@@ -244,7 +244,7 @@ class Placer:
             self._report.add(fault)
         if declaration.faults and declaration.is_function_block:
             return None
-        if not declaration.body.members:  # a function block without stored members
+        if not declaration.body.members:  # a function block that stores nothing
             return Group({}, 0, Cost(), 0)
         outside, self._constants = self._constants, Constants(declaration.constants, self._global)
         self._open[key] = declaration.name

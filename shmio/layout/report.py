@@ -11,11 +11,11 @@ MAX_WARNINGS = 1000
 
 
 class TooManyErrors(ShmioError):  # noqa: N818  (a signal to stop, never seen outside the compiler)
-    """``MAX_ERRORS`` have been found; the rest of the sources is not read."""
+    """``MAX_ERRORS`` errors have been found; the rest of the sources is not read."""
 
 
 class Report:
-    """Errors and warnings of one compilation of these files."""
+    """Errors and warnings of one compilation."""
 
     def __init__(self, files: Sequence[str]) -> None:
         self._order = {file: position for position, file in enumerate(files)}

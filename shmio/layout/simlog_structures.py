@@ -27,9 +27,9 @@ class Member(NamedTuple):
     name: str
     type: str
     many: Literal["", "joints", "points"] = ""
-    """If the member is an array, what each of its elements stands for."""
+    """"joints" or "points": an array with an element for each of these; "": not an array."""
     needed: bool = True
-    """Whether a structure must have this member to be recognised."""
+    """True if a structure must have this member to be recognised."""
 
 
 _HEADER: Final = Member("header", "Header", needed=False)
@@ -125,13 +125,13 @@ def _expanded(shape: str, lengths: Mapping[str, int], prefix: str) -> Iterator[t
 
 
 Found = Mapping[str, "Register | Found | Sequence[Found]"]
-"""Members by the shape's names: a register, a structure, or an ordered list of structures."""
+"""Members by name: each is a register, a structure, or an ordered list of structures."""
 
 
 def recognise(path: str, registers: Sequence[Register]) -> tuple[str, Found] | None:
-    """Return the shape in ``CONTENTS`` that these registers have, with its members, or None.
+    """Return the shape in ``CONTENTS`` that these registers form, with its members, or None.
 
-    A shape fits if all its needed members are there with fitting types, and no other members.
+    They must have all needed members of the shape, with matching types, and no others.
     """
     if not 0 < len(registers) <= MAX_REGISTERS:
         return None
@@ -149,7 +149,7 @@ _Parts = Sequence[tuple[Sequence[str], Register]]
 def _match(shape: str, parts: _Parts) -> Found | None:
     """Return the members of a shape, or None if the registers do not fit it.
 
-    ``parts`` has the names, in lower case, that lead to each register.
+    ``parts`` has the path of each register as names in lower case.
     """
     groups = _by_name(parts)
     if groups.keys() - {member.name for member in SHAPES[shape]}:

@@ -81,7 +81,7 @@ def _is_block(name: str, layout: Layout) -> bool:
 
 
 def _escaped(name: str) -> str:
-    """Encode the names ``in`` and ``out``; other names may be percent-encoded already."""
+    """Encode the names ``in`` and ``out`` only, because others may be encoded already."""
     return encode_segment(name) if name in ("in", "out") else name
 
 
@@ -89,7 +89,7 @@ def _translated(text: str) -> str:
     """Return the text in shmio's spelling, or an empty string if it is not in TIA Portal's."""
     if len(text) > MAX_TOPIC or "://" in text:
         return ""
-    segments, at, joined = list[str](), 0, True  # joined: a name is due
+    segments, at, joined = list[str](), 0, True  # joined: a name must follow
     while at < len(text):
         token = _TOKEN.match(text, at)
         kind = token.lastgroup if token else None

@@ -1,8 +1,8 @@
-"""Reads tag tables from CSV files and spreadsheets: a header row, then a row for each register.
+"""Read tag tables from CSV files and spreadsheets: a header row, then a row for each register.
 
 The columns are ``path`` and ``type``, and any of ``address``, ``unit``, ``comment``, ``scale``,
-``initial``, ``deadband`` and ``writable``, in any order. Cells have the texts that a spreadsheet
-program writes: comma, semicolon or tab between them, and with semicolons a decimal comma.
+``initial``, ``deadband`` and ``writable``, in any order. A comma, semicolon or tab separates the
+cells of a CSV file; with semicolons, numbers have a decimal comma.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _NUMBER: Final = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[
 
 
 class Sheet(NamedTuple):
-    """The registers of a table, and the row in which each is."""
+    """The registers of a table, and the row of each."""
 
     registers: Mapping[str, object]
     rows: Mapping[str, int]
 
 
 def read_sheet(file: str, data: bytes, report: Report) -> Sheet:
-    """Read a table; errors go to the report."""
+    """Read a table, and add its errors to the report."""
     try:
         rows, comma = _rows_of(file, data)
         return _sheet(file, rows, report, decimal_comma=comma)
@@ -49,7 +49,7 @@ def read_sheet(file: str, data: bytes, report: Report) -> Sheet:
 
 
 def _rows_of(file: str, data: bytes) -> tuple[Iterable[tuple[int, Sequence[str]]], bool]:
-    """Return the rows with their numbers, and whether numbers have a decimal comma; ValueError."""
+    """Return the numbered rows, and whether numbers have a decimal comma, or raise ValueError."""
     if file.lower().endswith(".xlsx"):
         return read_rows(data, _sheet_of_tags), False
     try:
@@ -76,7 +76,7 @@ def _sheet_of_tags(names: Sequence[str]) -> str | None:
 
 
 def _sheet(file: str, rows: Iterable[tuple[int, Sequence[str]]], report: Report, *, decimal_comma: bool) -> Sheet:
-    """Convert rows to what a TOML table would have; ValueError if the header is wrong."""
+    """Convert rows to entries as of a TOML table; raise ValueError if the header is wrong."""
     rows = iter(rows)
     _, header = next(rows, (1, ()))
     columns = _columns([cell.strip().lower() for cell in header])
@@ -106,7 +106,7 @@ def _sheet(file: str, rows: Iterable[tuple[int, Sequence[str]]], report: Report,
 
 
 def _columns(header: Sequence[str]) -> list[str]:
-    """Return the names of the columns; ValueError if one is missing, unknown or there twice."""
+    """Return the names of the columns; raise ValueError if one is missing, unknown or duplicate."""
     while header and not header[-1]:
         header = header[:-1]
     if missing := [name for name in _NEEDED if name not in header]:
@@ -125,7 +125,7 @@ def _columns(header: Sequence[str]) -> list[str]:
 
 
 def _entry(cells: Mapping[str, str], *, decimal_comma: bool) -> dict[str, object]:
-    """Return a row's cells as the entry of a TOML table; ValueError if one is wrong."""
+    """Return a row's cells as an entry of a TOML table; raise ValueError if one is wrong."""
     if "type" not in cells:
         raise ValueError("the type is missing")
     entry: dict[str, object] = {name: cells[name] for name in COLUMNS[1:5] if name in cells}

@@ -31,7 +31,7 @@ Direction = Literal["in", "out"]
 _Found = TypeVar("_Found")
 
 MAX_TOPIC = MAX_PATH
-_MAX_SEGMENTS = MAX_DEPTH * (1 + MAX_DIMENSIONS)  # names, each with its indices
+_MAX_SEGMENTS = MAX_DEPTH * (1 + MAX_DIMENSIONS)  # names and their indices
 _NEAR_CANDIDATES = 500
 _NEAR_CHARACTERS = 200
 _SOURCES_SHOWN = 4
@@ -54,8 +54,8 @@ _NOT_PLAIN = re.compile(r"[%+#\x00-\x09\x0b-\x1f\x7f]|//|^/|/$|(?:^|/)(?:in|out)
 class Topic:
     """A register's path within a source, and a direction if one was named.
 
-    ``path`` is in canonical encoding, and empty when the text named only the source. ``named``
-    is False if the text named no source, and the source is the default one.
+    ``path`` is in canonical encoding, and "" if the text names only the source. ``named`` is False
+    if the text names no source, so that the default one applies.
     """
 
     source: str
@@ -84,7 +84,7 @@ def decode_segment(segment: str) -> str:
     """
     if "%" not in segment:
         return segment
-    if _PART.fullmatch(segment):  # no name looks like that: its % would not decode
+    if _PART.fullmatch(segment):  # never a name: its % could not be decoded
         raise PathError(
             f"{shorten(segment)}: a bit or another part of a register is allowed only at the end of a register's path"
         )
@@ -130,7 +130,7 @@ def canonical_path(path: str, *, parts: bool = False) -> str:
 
 
 def check_canonical(paths: Sequence[str]) -> None:
-    """Check that paths are in canonical encoding; fast if none of them needs an encoding.
+    """Check that paths are in canonical encoding, quickly if they need no encoding.
 
     Raises:
         PathError: A path is not in its canonical form.
@@ -199,7 +199,7 @@ def _source_of_scheme(scheme: str, sources: Collection[str]) -> str:
 
 
 def _which(first: str, sources: Collection[str]) -> str:
-    """Return the error text for a path that must begin with a source and does not."""
+    """Return the error text for a path that does not begin with a source although it must."""
     if not sources:
         return "there is no source"
     some = [f"{source}/…" for source in sources][:_SOURCES_SHOWN]
@@ -208,12 +208,12 @@ def _which(first: str, sources: Collection[str]) -> str:
 
 
 def look_up(layout: Layout, topic: Topic) -> Register:
-    """Find the register of a topic as :func:`find` does, with the source in its PathError."""
+    """Return the register of a topic, as :func:`find`; a PathError also names the source."""
     return _with_source_in_errors(layout, topic, find)
 
 
 def look_up_each(layout: Layout, topic: Topic) -> list[Register]:
-    """Find the registers of a topic as :func:`find_each` does, with the source in its PathError."""
+    """Return the registers of a topic, as :func:`find_each`; a PathError also names the source."""
     return _with_source_in_errors(layout, topic, lambda layout, path: list(find_each(layout, path)))
 
 
@@ -283,7 +283,7 @@ def part_of(layout: Layout, register: Register, kind: str, number: int) -> Regis
 def slice_of(layout: Layout, array: Register, leading: tuple[int, ...], low: int, high: int) -> Register:
     """Return the elements ``low`` to ``high`` of an array's last dimension as one register.
 
-    ``leading`` holds the indices of the other dimensions.
+    ``leading`` has the indices of the other dimensions.
 
     Raises:
         PathError: The array has no such row, or lacks some of these elements.
@@ -325,7 +325,7 @@ def holders(path: str) -> Iterator[str]:
 
 
 def holder(layout: Layout, register: Register) -> str:
-    """Return the path of the layout's register that contains a result of :func:`find`."""
+    """Return the path of the layout's register that contains a register from :func:`find`."""
     return next(path for path in holders(register.path) if path in layout.by_path)
 
 
@@ -396,7 +396,7 @@ def near(layout: Layout, path: str) -> list[str]:
 
 
 def _where_it_ends(layout: Layout, path: str) -> tuple[str, str, list[str]]:
-    """Return the longest prefix that is a structure, the segment after it, and the names there."""
+    """Return the longest prefix that is a structure, the next segment, and its members' names."""
     known, below = path, tuple[int, ...]()
     while known and not below:
         known = known.rpartition("/")[0]

@@ -1,6 +1,6 @@
 """Read the rows of an Excel workbook (``.xlsx``) as text, within bounds.
 
-openpyxl reads the workbook; it is an extra, and imported when a workbook is read.
+openpyxl reads the workbook. It is an optional library, imported only when a workbook is read.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from openpyxl import Workbook
 
 MAX_UNPACKED_BYTES: Final = 64 << 20
-"""Limit for the unpacked parts of a workbook together: a small archive can unpack to very much."""
+"""Maximum size of all parts of a workbook, unpacked: a small archive can unpack to a huge one."""
 MAX_PARTS: Final = 1000
 MAX_COLUMNS: Final = 64
 MAX_ROWS: Final = 1 << 20
-"""Excel's own limit; a damaged workbook can number its rows without one."""
+"""Maximum number of rows, as in Excel; a damaged workbook may have larger row numbers."""
 INSTALL: Final = "reading .xlsx needs openpyxl: pip install 'shmio[xlsx]', or save the sheet as CSV UTF-8 (.csv)"
 
 Row = tuple[int, list[str]]
-"""The number of a row as Excel shows it, and the text of its cells."""
+"""A row: its number as Excel shows it, and the text of its cells."""
 
 
 class WorkbookError(ShmioError):
-    """A workbook cannot be read; the text says why. ``row`` is 1 if no row is to blame."""
+    """A workbook cannot be read; the message says why. ``row`` is 1 if the error is in no row."""
 
     def __init__(self, message: str, row: int = 1) -> None:
         super().__init__(message)
@@ -44,11 +44,12 @@ def read_rows(data: bytes, choose: Callable[[list[str]], str | None]) -> list[Ro
     Cells right of column ``MAX_COLUMNS`` are not read. Formulas give the values that Excel saved.
 
     Args:
-        data: The file.
-        choose: Gets the names of the sheets and returns the one to read, or None.
+        data: Contents of the file.
+        choose: Function that gets the names of the sheets, and returns the one to read or None.
 
     Raises:
-        WorkbookError: openpyxl is missing, or the file is no workbook, is too large, or lacks the sheet.
+        WorkbookError: openpyxl is missing, or the file is not a workbook, too large, or lacks the
+            sheet.
 
     """
     try:
@@ -73,7 +74,7 @@ def read_rows(data: bytes, choose: Callable[[list[str]], str | None]) -> list[Ro
 
 
 def _check_archive(data: bytes) -> None:
-    """Raise WorkbookError if the parts are too many or too large; zipfile unpacks no more than they declare."""
+    """Raise WorkbookError if there are too many parts, or their declared sizes are too large."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             parts = archive.infolist()
@@ -111,6 +112,6 @@ def _text(cell: object, row: int, column: int) -> str:
 
 
 def _letters(column: int) -> str:
-    """Return the letters of a column, counted from 0, of at most two letters."""
+    """Return the letters of a column, which is counted from 0 and below 702."""
     first, second = divmod(column, 26)
     return (chr(ord("A") + first - 1) if first else "") + chr(ord("A") + second)

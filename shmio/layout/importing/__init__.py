@@ -1,1 +1,1 @@
-"""Convert the tag lists of other vendors' tools to tag tables; one file for each format."""
+"""Convert tag lists of other vendors' tools to tag tables; one module for each format."""

@@ -1,4 +1,4 @@
-"""What an importer found: tags that fit into a tag table, and what it left out and why."""
+"""Result of an import: the tags for a tag table, and what was left out and why."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NAMES_SHOWN: Final = 5
 
 
 class ImportingError(ShmioError):
-    """A file is no tag list that can be imported; the text says why."""
+    """A file is not a tag list that can be imported; the message says why."""
 
 
 @dataclass
@@ -26,9 +26,9 @@ class Found:
     """The tags of a file, in its order.
 
     Attributes:
-        kind: Name of the format, for people.
-        tags: For each path the entry of a tag table.
-        remarks: What people should know of the file as a whole.
+        kind: Name of the format, for messages.
+        tags: Tag-table entry for each path.
+        remarks: Remarks about the file as a whole.
 
     """
 
@@ -39,12 +39,12 @@ class Found:
     _heads: set[str] = field(default_factory=set)
 
     def add(self, names: tuple[str, ...], kind: str, **columns: object) -> None:
-        """Add a tag, or skip it if no tag table can have it.
+        """Add a tag, or skip it if a tag table cannot have it.
 
         Args:
             names: The segments of the path, as the vendor spells them.
-            kind: The type in a tag table.
-            columns: Other columns of a tag table; None and "" count as left out.
+            kind: Type in the tag table.
+            columns: Other columns of the tag table; those with None or "" are left out.
 
         """
         shown = "/".join(names)
@@ -74,12 +74,12 @@ class Found:
         return None
 
     def skip(self, name: str, why: str) -> None:
-        """Leave out one thing of the file."""
+        """Record that an item of the file is left out, and why."""
         self._skipped.setdefault(why, []).append(name)
 
     @property
     def skipped(self) -> Mapping[str, list[str]]:
-        """The names of what was left out, by reason."""
+        """Names of the items that were left out, by reason."""
         return self._skipped
 
     def report(self) -> Iterator[str]:
@@ -96,7 +96,7 @@ class Found:
 
         Args:
             source: Name of the file, for the first line.
-            writable: Whether to keep which tags the vendor's tool lets others write.
+            writable: True to make the tags writable that the vendor's tool lets others write.
 
         """
         lines = [f"# {printable(self.kind)}, imported from {printable(source)}", "[registers]"]

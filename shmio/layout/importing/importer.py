@@ -19,13 +19,13 @@ def import_tags(data: bytes) -> Found:
     """Import a tag list.
 
     Args:
-        data: The file, as the vendor's tool wrote it.
+        data: Contents of the file, as the vendor's tool wrote it.
 
     Returns:
-        The tags that a tag table can have, and what was left out.
+        The tags, and what was left out.
 
     Raises:
-        ImportingError: The file is of none of the formats, damaged or too large.
+        ImportingError: The file has an unknown format, is damaged, or is too large.
 
     """
     if len(data) > MAX_BYTES:

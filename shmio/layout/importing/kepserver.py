@@ -1,4 +1,4 @@
-"""Import the CSV files that KEPServerEX exports from a device's tags."""
+"""Import the CSV file that KEPServerEX exports for a device's tags."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ARRAY: Final = re.compile(r"(.*?)\s*\[([0-9]{1,6})\]")
 
 
 def read(data: bytes) -> Found:
-    """Return the tags; ImportingError if the file is no export of tags."""
+    """Return the tags; raise ImportingError if the file is not an export of tags."""
     text = decode(data).text
     first = text.partition("\n")[0]
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=first.count))
@@ -69,7 +69,7 @@ def _add(found: Found, row: Mapping[str, str]) -> None:
 
 
 def _scale(row: Mapping[str, str]) -> tuple[list[float] | None, str]:
-    """Return [factor, offset] and the scaled type; ValueError if the scaling is not a straight line."""
+    """Return [factor, offset] and the scaled type; raise ValueError if scaling is not linear."""
     how = row.get("scaling", "").lower()
     if how in ("", "none"):
         return None, ""

@@ -27,7 +27,7 @@ _MAX_DEPTH: Final = 100
 
 
 class _Model:
-    """The nodes of a file, by the ids that it uses."""
+    """The nodes of a file by node id, as the file writes it."""
 
     def __init__(self, root: Element) -> None:
         self.aliases = {name: f"i={number}" for name, number in _NAMES.items()}
@@ -58,7 +58,7 @@ class _Model:
         return self.aliases.get(name, name)
 
     def way(self, key: str) -> tuple[list[str], str]:
-        """Return the names from the topmost object of the file to a node, and why it is no instance, or ""."""
+        """Return the names from the topmost object to a node, and why it is left out, or ""."""
         names: list[str] = []
         while key in self.nodes and len(names) <= _MAX_DEPTH:
             node = self.nodes[key]
@@ -70,7 +70,7 @@ class _Model:
         return (names, "") if len(names) <= _MAX_DEPTH else (names, "its references form a loop")
 
     def type_of(self, kind: str) -> str | None:
-        """Return the S7 type of a data type; it may be derived from one that is known."""
+        """Return the S7 type of a data type, which may be derived from a known one, or None."""
         key = self.real(kind or "i=24")
         for _ in range(_MAX_DEPTH):
             known = _BUILT_IN.get(int(key[2:])) if re.fullmatch(r"i=[0-9]{1,9}", key) else None
@@ -80,7 +80,7 @@ class _Model:
         return None
 
     def address(self, key: str) -> str:
-        """Return a node id that names its namespace: a server may number namespaces otherwise than the file."""
+        """Return a node id with its namespace's URI: servers number namespaces differently."""
         match = _NODE.fullmatch(key)
         if match is None or int(match[1]) >= len(self.uris):
             return key
@@ -89,7 +89,7 @@ class _Model:
 
 
 def read(root: Element) -> Found:
-    """Return the variables of all objects; ImportingError if the file has no nodes."""
+    """Return the variables of all objects; raise ImportingError if the file has no nodes."""
     model = _Model(root)
     if not model.nodes:
         raise ImportingError("expected nodes below UANodeSet, found none")
@@ -137,7 +137,7 @@ def _elements(node: Mapping[str, str]) -> str | None:
 
 
 def _name(node: Element) -> str:
-    """Return the name that clients show: without its namespace."""
+    """Return a node's name without its namespace, as clients show it."""
     name = node.get("BrowseName", "")
     index, colon, rest = name.partition(":")
     return rest if colon and index.isdecimal() else name

@@ -1,4 +1,4 @@
-"""Absolute addresses of S7 controllers: from the notation of STEP 7 classic to that of TIA Portal."""
+"""Convert absolute addresses of S7 controllers from STEP 7 classic's notation to TIA Portal's."""
 
 from __future__ import annotations
 
@@ -42,5 +42,5 @@ def in_block(number: int, offset: int, bit: int | None, element_bytes: int) -> s
 
 
 def value_type(kind: str) -> str:
-    """Return the type of the value of a tag: timers and counters have one of their own."""
+    """Return the type of a tag's value; for timers and counters it is not the tag's type."""
     return {"TIMER": "S5TIME", "COUNTER": "WORD"}.get(kind.upper(), kind)

@@ -20,7 +20,7 @@ _ARRAY: Final = re.compile(r"Array\[([-0-9., ]+)\] of (.+)", re.IGNORECASE)
 
 
 def read(root: Element) -> Found:
-    """Return the tags of all tag tables and global data blocks; ImportingError if there are none."""
+    """Return the tags of all tag tables and global data blocks; raise ImportingError if none."""
     found = Found("XML of TIA Portal Openness")
     tables, blocks = list(root.iter("SW.Tags.PlcTagTable")), list(root.iter("SW.Blocks.GlobalDB"))
     if not tables and not blocks:
@@ -54,7 +54,7 @@ def _add_tag(found: Found, tag: Element) -> None:
 
 
 def _add_block(found: Found, block: Element, prefix: tuple[str, ...]) -> None:
-    """Add the registers of a block: its members are compiled as the source that TIA Portal would generate."""
+    """Add the registers of a block: write its members as source text, and compile that."""
     name, number = _attribute(block, "Name"), _attribute(block, "Number")
     section = block.find("AttributeList/Interface/Sections/Section[@Name='Static']")
     if section is None:
@@ -117,7 +117,7 @@ def _members(found: Found, section: Element, path: tuple[str, ...], depth: int) 
 
 
 def _is_plain(start: str) -> bool:
-    """Return whether a start value is a literal, not the name of a constant."""
+    """Return whether a start value is a literal and not the name of a constant."""
     return (bool(re.fullmatch(r"'[^'$;]*'|[-+0-9A-Za-z#_.:]+", start)) and not start[0].isalpha()) or bool(
         re.fullmatch(r"true|false|[A-Za-z0-9_]+#[-+0-9A-Za-z_.:#]+", start, re.IGNORECASE)
     )

@@ -1,4 +1,4 @@
-"""Parse XML of unknown origin: without entities and external files, and within bounds."""
+"""Parse XML of unknown origin: no entities, no external files, and limits of size and depth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_DEPTH: Final = 200
 
 
 def parse(data: bytes) -> Element:
-    """Return the root; the names of elements have no namespaces.
+    """Return the root element, with all element names stripped of their namespaces.
 
     Raises:
         ImportingError: The data is not XML, has a document type, or is too large or too deep.

@@ -1,8 +1,8 @@
 """Whole numbers and constants of a source.
 
 Bounds of arrays, lengths of strings, and indices are whole numbers, constants, or sums and products
-of both, as in classic SCL. The parser reads them with the functions here; ``Constants`` evaluates
-them when a declaration is placed, and puts constants into initial values.
+of both, as in classic SCL. The parser reads them with these functions. When a declaration is
+placed, ``Constants`` evaluates them, and replaces names of constants in initial values.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from shmio.layout.model import DEFAULT_STRING, INTEGERS, MAX_DIMENSIONS, string_
 from shmio.layout.source.lexer import Cursor, Kind
 from shmio.layout.source.syntax import Bound, Bounds, Constant, ConstantDeclaration, Sum
 
-_LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1  # a DINT, as Siemens demands of bounds
+_LOWEST, _HIGHEST = -(1 << 31), (1 << 31) - 1  # range of a DINT, which Siemens requires of bounds
 _TYPED = INTEGERS | {"B", "W", "DW", "L"}
 _BASES = {"2": "01", "8": "01234567", "16": "0123456789ABCDEF"}
 
@@ -81,7 +81,7 @@ def bound(at: Cursor, what: str) -> Bound:
 
 
 def integer(at: Cursor, what: str) -> int:
-    """Read a literal whole number: no constant, no expression."""
+    """Read a whole number: a literal, not a constant or an expression."""
     token = at.token
     value = bound(at, what)
     if not isinstance(value, int):
@@ -120,11 +120,11 @@ def _number(at: Cursor, what: str) -> int:
     return value
 
 
-_MAX_DEFINITIONS = 32  # length of a chain of constants that are defined by constants
+_MAX_DEFINITIONS = 32  # maximum length of a chain of constants that refer to constants
 _HUGE = 1 << 64
-# Text in single quotes is kept; then "NAME", #NAME, and a value that is nothing but a name.
+# Alternatives: text in single quotes, which is kept; "NAME"; #NAME; a value that is only a name.
 _NAME = re.compile(r"""'(?:[^'$]|\$.)*'|"([^"]*)"|(?<![\w"])\#(\w+)|^\s*([^\W\d]\w*)\s*$""", re.DOTALL)
-_MAX_VALUE = 4096  # characters; longer initial values are data, not names
+_MAX_VALUE = 4096  # characters; a longer initial value contains no names
 _MAX_CONSTANT = 260  # characters of a constant's value: a STRING of full length
 
 
@@ -137,12 +137,12 @@ class BoundFault(ShmioError):  # noqa: N818  (the placer reports it; it never le
 
 
 class Constants:
-    """Constants visible in one place: the block's own, then those of all sources."""
+    """Constants visible to a declaration: the block's own, then those of all sources."""
 
     def __init__(self, declared: Iterable[ConstantDeclaration] = (), outer: Constants | None = None) -> None:
         self._declared = {declaration.name.lower(): declaration for declaration in declared}
         self._outer = outer
-        self._numbers: dict[str, int] = {}  # cache: constants may refer to each other often
+        self._numbers: dict[str, int] = {}  # cache, because constants may refer to each other often
 
     def find(self, name: str) -> ConstantDeclaration | None:
         """Return the constant with this name, in any case, or None."""

@@ -40,7 +40,7 @@ _SEPARATORS: Final = re.compile(r"[;,\t]")
 class Decoded:
     """Text of a source.
 
-    ``problem`` is a warning, or an error if ``fatal``, about the bytes at ``line`` and ``column``.
+    ``problem`` is a warning (an error if ``fatal``) about the bytes at ``line`` and ``column``.
     """
 
     text: str
@@ -64,7 +64,7 @@ def decode(data: bytes) -> Decoded:
     try:
         text = data.decode("cp1252")
     except UnicodeDecodeError:
-        text = data.decode("latin-1")  # five bytes have no character in Windows-1252
+        text = data.decode("latin-1")  # because five bytes have no character in Windows-1252
     return Decoded(text, _AS_WINDOWS, line, column)
 
 
@@ -74,7 +74,7 @@ def _place(before: str) -> tuple[int, int]:
 
 
 def foreign(file: str, data: bytes) -> str:
-    """Return what a file is and what to do instead; empty if it may be a source."""
+    """Return a message with the kind of the file and the remedy, or "" if it may be a source."""
     name = file.lower()
     head = data[:HEAD_BYTES]
     if head.startswith((_ZIP, _OLD_OFFICE)) or name.endswith((".xlsx", ".xls", ".ods")):

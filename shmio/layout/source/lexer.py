@@ -1,9 +1,9 @@
-"""Split source text into tokens, and walk over them with a cursor.
+"""Split source text into tokens, and read them with a cursor.
 
 The lexer knows one rule of the grammar: the text after ``TITLE =`` is free and ends with the line.
 Comments are not tokens: each is stored in the token before it on the same line. Invalid characters
-become a token of kind ``FAULT``, which matters only where the parser reads: the code of a function
-block may contain anything.
+become a token of kind ``FAULT``, which is an error only if the parser reads it: the code of a
+function block may contain anything.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Kind(Enum):
 
 @dataclass(slots=True)
 class Token:
-    """A piece of source; ``text`` is as written, but a quoted name has no quotes.
+    """A token; ``text`` is as written, but without the quotes of a quoted name.
 
     ``start`` and ``stop`` are character positions in the source, ``line`` and ``column`` count from 1.
     ``comment`` is the text of the comments that follow on the token's line.
@@ -147,7 +147,7 @@ def _attach(tokens: list[Token], line: int, comment: str) -> None:
 
 
 def _problem(kind: Kind, content: str) -> str:
-    """Return what is wrong with a token, or an empty string."""
+    """Return the error in a token, or ""."""
     if kind is Kind.PUNCT and content == "'":
         return "the string that begins here has no closing quote on its line"
     if kind is Kind.PUNCT and content == '"':
@@ -175,7 +175,7 @@ class SyntaxFault(ShmioError):  # noqa: N818  (the parser reports and goes on; i
 
 
 class Cursor:
-    """Walks over the tokens of one file; it never passes the last one, ``Kind.END``.
+    """Reads the tokens of one file in order; it never passes the last one, ``Kind.END``.
 
     A ``FAULT`` token is reported when the cursor reaches it, and never becomes the current token.
     """
@@ -185,7 +185,7 @@ class Cursor:
         self.report = report
         self._text = text
         self._tokens = tokens
-        self._absent: set[str] = set()  # keywords that do not follow any more: no second search
+        self._absent: set[str] = set()  # keywords that do not occur again: no second search
         self.index = 0
         self.token = tokens[0]
         self._pass_faults()
@@ -200,7 +200,7 @@ class Cursor:
         return Position(self.file, token.line, token.column)
 
     def at_end(self) -> bool:
-        """Return whether all tokens have been passed."""
+        """Return whether the current token is the last one."""
         return self.token.kind is Kind.END
 
     def fault(self, token: Token, message: str) -> SyntaxFault:
@@ -208,7 +208,7 @@ class Cursor:
         return SyntaxFault(self.at(token).error(message))
 
     def expected(self, what: str) -> SyntaxFault:
-        """Return an error for the caller to raise: the current token is not what was expected."""
+        """Return an error, for the caller to raise, about an unexpected current token."""
         return self.fault(self.token, f"expected {what}, found {self.token}")
 
     def advance(self) -> Token:
@@ -225,7 +225,7 @@ class Cursor:
         self.token = self._tokens[index]
 
     def skip_to(self, word: str) -> bool:
-        """Go to this keyword without reporting faults on the way.
+        """Go to this keyword without reporting faults before it.
 
         If the keyword does not follow, stay and return False.
         """
@@ -238,7 +238,7 @@ class Cursor:
         return False
 
     def skip_to_any(self, *words: str) -> None:
-        """Go to the next of these keywords, or to the end, without reporting faults on the way."""
+        """Go to the next of these keywords, or to the end, without reporting faults before it."""
         while self._tokens[self.index].kind is not Kind.END and not self._tokens[self.index].is_word(*words):
             self.index += 1
         self.rewind(self.index)
@@ -274,7 +274,7 @@ class Cursor:
             raise self.expected(word)
 
     def names_member(self) -> bool:
-        """Return whether the token after the current word shows it to be a name, not a keyword."""
+        """Return whether the next token shows that the current word is a name and not a keyword."""
         following = self._tokens[min(self.index + 1, len(self._tokens) - 1)]
         return self.token.kind is Kind.WORD and following.kind is Kind.PUNCT and following.text in (":", "{", ",")
 

@@ -135,12 +135,12 @@ class _Declarations:
         return tuple(members)
 
     def stops(self) -> bool:
-        """Return whether a list of members stops here although its end keyword is missing."""
+        """Return whether a list of members ends here although its end keyword is missing."""
         token = self.at.token
         return token.kind is Kind.END or (token.is_word(*_STOPS) and not self.at.names_member())
 
     def recovering(self, read: Callable[[], None]) -> None:
-        """Run one production; after a syntax error report it and skip to the end of the statement."""
+        """Call ``read``; report a syntax error, and skip to the end of the statement."""
         start = self.at.index
         try:
             read()
@@ -206,7 +206,7 @@ class _Declarations:
         return self.at.advance().text if self.interface else self.at.words(), position, False
 
     def body_type(self) -> Type:
-        """Read the type name that takes the place of a data block's body."""
+        """Read the name of a type that stands in place of a data block's body."""
         return self._type(0)
 
     def _type(self, depth: int) -> Type:
@@ -244,7 +244,7 @@ class _Declarations:
 
 @dataclass(slots=True)
 class _Header:
-    """Properties that are declared between a block's name and its body."""
+    """Properties between a block's name and its body."""
 
     optimized: bool = False
     protected: bool = False
@@ -278,7 +278,7 @@ class _Parser:
         return unit
 
     def resume(self) -> None:
-        """Skip to the beginning of the next declaration."""
+        """Go to the beginning of the next declaration."""
         while not self.at.at_end() and not self.at.token.is_word(*_TOP):
             self.at.advance()
 

@@ -37,7 +37,7 @@ class Constant:
 class Sum:
     """A constant expression: signed terms, each a product of factors.
 
-    It is flat, without nesting, so that no depth must be limited.
+    It is not nested, so that no depth must be limited.
     """
 
     terms: tuple[tuple[int, tuple[int | Constant, ...]], ...]
@@ -50,7 +50,7 @@ Bounds = tuple[tuple[Bound, Bound], ...]
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """Reference to a type by name: elementary, or a user type, whose name may be quoted.
+    """Reference to a type by name: an elementary type, or a user type, whose name may be quoted.
 
     ``length`` is the length of a string type.
     """
@@ -92,7 +92,7 @@ class Section(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A member of a structure; ``initial`` is source text; only function blocks set ``section``."""
+    """A member of a structure; ``initial`` is source text; ``section`` is of function blocks."""
 
     name: str
     type: Type

@@ -66,7 +66,7 @@ _LENGTHS = {
     "IEC_DCOUNTER": 12, "IEC_UDCOUNTER": 12, "IEC_LCOUNTER": 24, "IEC_ULCOUNTER": 24, "VREF": 12, "CONDITIONS": 52,
     "HSC_PERIOD": 12,
 }  # fmt: skip
-"""In bytes, from Siemens' help on system data types; a structure of odd length is padded as any other."""
+"""Sizes in bytes, from Siemens' help on system data types; odd sizes are padded as usual."""
 # fmt: off
 _REFUSED = {
     **dict.fromkeys((
@@ -104,5 +104,5 @@ def length(name: str) -> int:
 
 
 def refusal(name: str) -> str:
-    """Return why a system type cannot be placed; empty if the name is not a system type."""
+    """Return why a system type cannot be placed, or "" if the name is not that of a system type."""
     return _REFUSED.get(name.upper(), "")

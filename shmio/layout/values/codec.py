@@ -43,7 +43,7 @@ from shmio.layout.values import calendar
 Buffer = bytes | bytearray | memoryview
 Scalar = bool | int | float | str | None
 Value = Scalar | list["Value"]
-REAL_MAX = 3.4028235e38  # greatest 32-bit float, in its fewest digits
+REAL_MAX = 3.4028235e38  # greatest 32-bit float, in as few digits as possible
 MAX_TOD_MS = 86_399_999
 MAX_LTOD_NS = calendar.NS_PER_DAY - 1
 _MAX_S5_MS = 9_990_000
@@ -62,7 +62,7 @@ class ScalarCodec(Protocol):
         """Return the value at a byte offset, or None for bytes that are not a valid value."""
 
     def encode(self, value: object) -> bytes:
-        """Return the element's bytes; ValueRangeError if the type cannot hold the value."""
+        """Return the element's bytes; raise ValueRangeError if the value does not fit the type."""
 
 
 class RegisterCodec(Protocol):
@@ -121,7 +121,7 @@ class _Single:
 
 
 class _Array:
-    """Codec of an array of anything but BOOL; it unpacks numbers all at once."""
+    """Codec of an array of any type but BOOL; it unpacks all numbers at once."""
 
     def __init__(self, register: Register, byte_order: ByteOrder) -> None:
         element = register.element
@@ -144,7 +144,7 @@ class _Array:
 
     def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
         if self._row is not None and isinstance(value, list | tuple) and {float, int}.issuperset(map(type, value)):
-            with suppress(struct.error, OverflowError):  # the loop below finds the wrong element
+            with suppress(struct.error, OverflowError):  # the loop below reports the wrong element
                 frame[self._offset : self._stop] = self._row.pack(*value)
                 return
         image = bytearray(frame[self._offset : self._stop])
@@ -251,7 +251,7 @@ class _Number:
         self._struct = struct.Struct(order + code)
         self._limit = limit
         self._convert: Callable[[object, str], float] = _to_float if code in "fd" else _to_int
-        self._native = frozenset({int, float} if code in "fd" else {int})  # types that are packed as they are
+        self._native = frozenset({int, float} if code in "fd" else {int})  # types that need no conversion
 
     def decode(self, data: Buffer, offset: int) -> float | None:
         value: float = self._struct.unpack_from(data, offset)[0]
@@ -306,7 +306,7 @@ class _String:
         self._encoding, self._unit = encoding, unit
 
     def decode(self, data: Buffer, offset: int) -> str | None:
-        # The declared length counts: the maximum length in the data is 0 until the controller
+        # Use the declared length: the maximum length in the data is 0 until the controller
         # sets it.
         actual = self._head.unpack_from(data, offset)[1]
         if actual > self._length:
@@ -415,7 +415,7 @@ class _Moment:
         return calendar.format_moment(ns, self._digits)
 
     def encode(self, value: object) -> bytes:
-        """Return the bytes of an ISO text; ValueRangeError if the type cannot hold it."""
+        """Return the bytes of an ISO text; raise ValueRangeError if it does not fit the type."""
         ns = calendar.parse_moment(value) if isinstance(value, str) else None
         if ns is None:
             example = "2024-02-29" + ("" if self._digits is None else "T12:34:56.789")

@@ -52,7 +52,7 @@ _NAT = np.iinfo(np.int64).min
 
 
 class FrameCodec:
-    """Decodes frames of one layout; building it takes time, decoding is fast."""
+    """Decodes frames of one layout. Creating one is slow, decoding is fast."""
 
     def __init__(self, layout: Layout) -> None:
         registers = layout.registers
@@ -92,7 +92,7 @@ class FrameCodec:
         raw = np.ascontiguousarray(raw)
         if not self.dtype.names:
             return np.empty(len(raw), self.dtype)
-        record = np.empty(len(raw), self._plain_out)  # numpy is slow to make an array of thousands of fields
+        record = np.empty(len(raw), self._plain_out)  # creating thousands of fields is slow
         if self._plain_in.names:
             record[:] = raw.view(self._plain_in)[:, 0]
         out: Array = record.view(self.dtype)
@@ -236,7 +236,7 @@ def _dtl(raw: Bytes, order: str) -> Array:
 
 
 def _text(units: Array, actual: Array) -> Array:
-    """Replace the code points (…, length) after the actual length by NUL; all if it is invalid."""
+    """Replace code points (…, length) after the actual length by NUL; all if it is invalid."""
     length = units.shape[-1]
     inside = (np.arange(length) < actual[..., None]) & (actual <= length)[..., None]
     return np.ascontiguousarray(np.where(inside, units, 0).astype(np.uint32))
@@ -252,7 +252,7 @@ def _wide_text(words: Array, length: int) -> Array:
     points = _text(words[..., 2:], words[..., 1])
     if not ((points >= 0xD800) & (points <= 0xDFFF)).any():
         return points.view(f"U{length}")[..., 0]
-    # Surrogate pairs are rare and shorten the text: each text is converted by itself.
+    # Surrogate pairs shorten the text. They are rare, so such texts are converted one by one.
     flat = points.reshape(-1, length).astype("<u2")
     actual = np.where(words[..., 1] <= length, words[..., 1], 0).reshape(-1)
     texts = [bytes(row[:n]).decode("utf-16-le", "replace") for row, n in zip(flat, actual, strict=True)]

@@ -18,7 +18,7 @@ from shmio.layout.values import calendar
 from shmio.layout.values.codec import Scalar, Value, brief, nest, scalar_codec
 from shmio.layout.values.text import to_text
 
-MAX_LITERAL = 100  # characters, except of text
+MAX_LITERAL = 100  # characters, except for text
 
 _INTEGER = re.compile(r"([+-]?)(?:(2|8|16)#)?([0-9A-Fa-f]+(?:_[0-9A-Fa-f]+)*)")
 _REAL = re.compile(r"[+-]?[0-9]+(?:_[0-9]+)*(?:\.[0-9]+(?:_[0-9]+)*)?(?:[eE][+-]?[0-9]+)?")
@@ -90,7 +90,7 @@ _WRITTEN = {
     "LDT": "LDT",
     "DTL": "DTL",
 }
-"""The prefix under which people read a value of these types."""
+"""Prefix of the literal in which people read a value of these types."""
 
 
 def default_text(element: ElementType) -> str:
@@ -127,7 +127,7 @@ def scalar_literal(text: str, element: ElementType, byte_order: ByteOrder = "big
         wanted = "TRUE, FALSE, 1 or 0" if element.base == "BOOL" else f"a literal such as {default_text(element)}"
         raise ValueRangeError(f"{element.name}: expected {wanted}, found {brief(text)}")
     if element.base != "BOOL":
-        scalar_codec(element, byte_order).encode(value)  # checks the range
+        scalar_codec(element, byte_order).encode(value)  # only to check the range
     return value
 
 
@@ -158,7 +158,7 @@ def _read(text: str, element: ElementType) -> Scalar:
         return None if ns is None else _moment(ns, base)
     if base in _UNIT_NS:
         if not separator:
-            plain = _integer(text, None)  # a plain number, in the type's own unit
+            plain = _integer(text, None)  # a bare number, in the type's unit
             if plain is not None:
                 return plain
         ns = _duration(text) if base in _DURATIONS else _clock(text)

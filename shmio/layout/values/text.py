@@ -1,4 +1,4 @@
-"""Convert values to and from the text that wire version 1 carries.
+"""Convert values to and from the text of SimlogAPI version 1.
 
 A number's text is the shortest that reads back as the same value of the register's type: ``0.1``
 for a REAL. Reading also accepts numbers as Java prints them.
@@ -31,11 +31,11 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?
 _NON_FINITE = {"nan": math.nan} | {
     f"{sign}{word}": -math.inf if sign == "-" else math.inf for sign in ("", "+", "-") for word in ("inf", "infinity")
 }
-"""Texts of values that are no numbers, in lower case: case does not count."""
+"""Values by their texts that are not numbers, in lower case because case is ignored."""
 
 
 def wire_type(register: Register) -> WireType:
-    """Return version 1's word for the type of the register, or of its elements."""
+    """Return version 1's name for the type of the register, or of its elements."""
     base = register.element.base
     if base == "BOOL":
         return "bool"
@@ -70,7 +70,7 @@ def _real_text(value: Any) -> str:
 
 
 def shortest(value: float, element: ElementType) -> float:
-    """Return the float with the fewest digits that is the same REAL; an LREAL is unchanged."""
+    """Return the float with the fewest digits for the same REAL; an LREAL is unchanged."""
     return _shortest_real(value) if element.base == "REAL" and math.isfinite(value) else value
 
 

@@ -42,7 +42,7 @@ def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> 
         ValueRangeError: The value does not fit the register.
     """
     image = bytearray(register.size)
-    # With offset 0, the image needs to be no larger than the register.
+    # With offset 0, an image as large as the register suffices.
     codec(msgspec.structs.replace(register, offset=0), byte_order).encode_into(value, image)
     if register.partial:
         writes = merge(image, bits_of(register), [(0, register.size)])
@@ -66,7 +66,7 @@ def apply(write: Write, image: bytearray | memoryview) -> None:
 
 
 def bits_of(register: Register) -> bytes:
-    """Return a mask of the register's ``size`` bytes with the bits that :func:`encode` writes."""
+    """Return a mask of ``size`` bytes with the bits that :func:`encode` writes."""
     if register.partial:
         bits = (1 << register.count) - 1 << (register.bit or 0)
         return bits.to_bytes(register.size, "little")
@@ -126,7 +126,7 @@ def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
 def merge(image: bytes | bytearray, mask: bytes | bytearray, ranges: Iterable[tuple[int, int]]) -> list[Write]:
     """Return the fewest writes that copy the masked bits of an image to a block.
 
-    Only the bytes in the ``ranges`` (start, stop) are searched.
+    Only the bytes in the ``ranges`` (start, stop) are copied.
     """
     writes: list[Write] = []
     for start, stop in _joined(ranges):
@@ -183,7 +183,7 @@ def _fill_rows(mask: bytearray, register: Register) -> None:
 
 
 def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -> list[str]:
-    """Return the paths of the bits that writes set, in address order; only the first ``most``.
+    """Return the paths of the bits that writes set, in address order, at most ``most``.
 
     A register that is written in part is named by slices, elements, bytes or bits. A type without
     parts, such as REAL, is named as a whole. Bytes outside the block or of no register are skipped.
@@ -211,7 +211,7 @@ def path_at(layout: Layout, offset: int) -> str:
 
 
 def _overlapping(layout: Layout, start: int, stop: int) -> range:
-    """Return the indices of the registers that share a byte with a range."""
+    """Return the indices of the registers that have a byte in a range of bytes."""
     first = bisect_right(layout.registers, start, key=lambda register: register.offset + register.size)
     return range(first, bisect_left(layout.registers, stop, key=lambda register: register.offset))
 
