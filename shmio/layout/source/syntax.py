@@ -92,7 +92,7 @@ class Section(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A member of a structure; ``initial`` is source text; ``section`` is of function blocks."""
+    """A member of a structure; ``initial`` is source text; ``section`` is set in function blocks."""
 
     name: str
     type: Type
