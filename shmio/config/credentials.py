@@ -76,16 +76,20 @@ def _read_token(key: str, name: str) -> bytes:
     return digest(text)
 
 
-def read_password(name: str) -> str:
-    """Return shmio's password at an external broker: the file's first line.
+def read_password(name: str, key: str = _KEY) -> str:
+    """Return shmio's password at an external broker or server: the file's first line.
+
+    Args:
+        name: Path of the file.
+        key: The key that names it, for messages.
 
     Raises:
         ConfigError: The file is unusable or its first line is empty; the message never quotes it.
 
     """
-    password = _read_passwords(name).split("\n", 1)[0].rstrip("\r")
+    password = _read_passwords(name, key).split("\n", 1)[0].rstrip("\r")
     if not password:
-        raise ConfigError(f"{_KEY}: {name}: its first line, the password, is empty")
+        raise ConfigError(f"{key}: {name}: its first line, the password, is empty")
     return password
 
 
@@ -150,8 +154,8 @@ def _is_hash(secret: str) -> bool:
     return True
 
 
-def _read_passwords(name: str) -> str:
-    key = f"{_KEY}: {name}"
+def _read_passwords(name: str, key: str = _KEY) -> str:
+    key = f"{key}: {name}"
     data = _read_secret(key, name, MAX_PASSWORDS_BYTES + 1, instead="new passwords")
     if len(data) > MAX_PASSWORDS_BYTES:
         raise ConfigError(f"{key}: larger than {MAX_PASSWORDS_BYTES} bytes")

@@ -69,6 +69,12 @@ class Connector(ABC):
     makes the images.
     """
 
+    reads_optimized: ClassVar[bool] = False
+    """Whether it can read a data block with optimized access, whose values have names but no addresses."""
+
+    path_options: ClassVar[tuple[str, ...]] = ()
+    """Those of its keys that are paths of files or folders, which are relative to the configuration."""
+
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:
         """Create the connector without connecting it.

@@ -24,6 +24,7 @@ GROUP = "shmio.connectors"
 BUILT_IN = {
     "memory": "shmio.connectors.models.memory:Memory",
     "modbus": "shmio.connectors.modbus.connector:ModbusConnector",
+    "opcua": "shmio.connectors.opcua.connector:OpcUaConnector",
     "remote": "shmio.connectors.models.remote:Remote",
     "replay": "shmio.connectors.replay.source:Replay",
     "simulation": "shmio.connectors.models.simulation:Simulation",

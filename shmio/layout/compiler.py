@@ -38,9 +38,11 @@ _Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, Consta
 
 _OPTIMIZED = (
     "the block {name} has optimized access: its values have no fixed addresses and the classic S7 protocol cannot "
-    "read it; switch off 'Optimized block access' in the block's properties, and compile and load the block. "
-    "The offsets are those it would have with standard access"
+    "read it; switch off 'Optimized block access' in the block's properties, and compile and load the block; or read "
+    'it by OPC UA: connector = "opcua" with nodes = "siemens". The offsets are those it would have with standard '
+    "access"
 )
+_MARK = " has optimized access: "
 
 
 @dataclass(frozen=True)
@@ -213,6 +215,11 @@ class Program:
     def _is_optimized(self, block: BlockDeclaration) -> bool:
         instance_of = self._types.get(block.body.name.lower()) if isinstance(block.body, Named) else None
         return block.optimized or (instance_of is not None and instance_of.optimized)
+
+
+def is_of_access(warning: Diagnostic) -> bool:
+    """Return whether a warning says that a block has optimized access."""
+    return _MARK in warning.message
 
 
 def _double(first: _Declaration, second: _Declaration) -> Diagnostic:

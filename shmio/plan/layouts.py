@@ -28,11 +28,12 @@ class LayoutFiles:
         self.odd: list[str] = []
         """Warnings about keys that are probably mistakes; each begins with the key."""
 
-    def get(self, key: str, section: Source | Emulator, number: int | None) -> Layout:
+    def get(self, key: str, section: Source | Emulator, number: int | None, *, optimized: bool = False) -> Layout:
         """Return the layout of a section's data block.
 
         If the files declare several blocks, ``block`` or ``number`` chooses one, and errors in the
-        other blocks are ignored.
+        other blocks are ignored. ``optimized`` says that the section can use a block with optimized
+        access: then there is no warning about it.
 
         Raises:
             ConfigError: A file or block is missing, or no block is chosen.
@@ -41,13 +42,13 @@ class LayoutFiles:
         """
         paths, program = self._program(key, section)
         if section.block is None and len(program.blocks) <= 1:
-            return self._compile(key, section, paths, program, None)[0]
+            return self._compile(key, section, paths, program, None, optimized=optimized)[0]
         try:
             block = _choose(key, section, program.blocks, number)
         except ConfigError:
             program.compile(())  # raises errors in damaged sources first
             raise
-        return self._compile(key, section, paths, program, block.name)[0]
+        return self._compile(key, section, paths, program, block.name, optimized=optimized)[0]
 
     def all(self, key: str, section: Source | Emulator) -> tuple[Layout, ...]:
         """Return all layouts of a section's files.
@@ -69,21 +70,29 @@ class LayoutFiles:
         return paths, self._programs[paths]
 
     def _compile(
-        self, key: str, section: Source | Emulator, paths: object, program: compiler.Program, block: str | None
+        self,
+        key: str,
+        section: Source | Emulator,
+        paths: object,
+        program: compiler.Program,
+        block: str | None,
+        *,
+        optimized: bool = False,
     ) -> tuple[Layout, ...]:
         """Compile one block, or all blocks."""
         sizes = section.type_bytes
         which = paths, block and block.lower(), tuple(sorted(sizes.items()))
         if which not in self._compiled:
             try:
-                compiled = self._compiled[which] = program.compile(None if block is None else (block,), sizes)
-                self.warnings += [line for line in summarize(compiled.warnings) if line not in self.warnings]
+                self._compiled[which] = program.compile(None if block is None else (block,), sizes)
             except LayoutError as error:
                 self._compiled[which] = error
         found = self._compiled[which]
         if isinstance(found, LayoutError):
             raise found
         compiled = found
+        warnings = [one for one in compiled.warnings if not (optimized and compiler.is_of_access(one))]
+        self.warnings += [line for line in summarize(warnings) if line not in self.warnings]
         held = ", ".join(layout.name for layout in compiled.layouts)
         self.odd += [f"{key}.type_bytes: nothing in {held} has the type {name!r}" for name in compiled.unused]
         return compiled.layouts

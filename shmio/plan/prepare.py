@@ -182,7 +182,9 @@ def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) ->
 
 
 def peer(source: Source) -> str:
-    """Return the device of a checked source as host:port, as the host alone, or ""."""
+    """Return the device of a checked source as URL, as host:port, as the host alone, or ""."""
+    if url := source.options.get("url"):
+        return str(url)
     host, port = source.options.get("host"), source.options.get("port")
     return str(Address(host, port)) if host and port else str(host or "")
 

@@ -86,9 +86,14 @@ def _check_source(
         if options is not None:
             found.layouts[source.name], inputs[index] = _model(key, source, config, files)
         return
-    layout = files.get(key, source, source.options.get("dbNumber"))
-    if issubclass(connector, Connector) and connector.register_quality:
-        layout = layout.with_statuses()
+    optimized = issubclass(connector, Connector) and connector.reads_optimized
+    layout = files.get(key, source, source.options.get("dbNumber"), optimized=optimized)
+    if issubclass(connector, Connector):
+        if connector.register_quality:
+            layout = layout.with_statuses()
+        if options is not None and (paths := [name for name in connector.path_options if source.options[name]]):
+            source.options |= {name: str(config.path(source.options[name])) for name in paths}
+            options = msgspec.convert(source.options, connector.Options)
     found.layouts[source.name] = layout
     if options is None:  # its faults have been added, with those that the connector found
         options = _filled(connector.Options, source)

@@ -1,0 +1,539 @@
+"""The connector ``opcua``: its sessions in a thread, their values in an image, and writes."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import importlib.util
+import logging
+import threading
+import time
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar
+
+from shmio.config.credentials import read_password
+from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.opcua import siemens
+from shmio.connectors.opcua.address import Address, parse
+from shmio.connectors.opcua.decode import Sample
+from shmio.connectors.opcua.options import Credentials, OpcUaOptions
+from shmio.connectors.opcua.values import Fitting, MismatchError
+from shmio.connectors.register_image import RegisterImage
+from shmio.errors import ConfigError, ConnectorError, ValueRangeError
+from shmio.layout.model import Layout, Register, bit_positions
+from shmio.layout.values.codec import codec
+from shmio.layout.values.write import Write, apply, bits_of
+from shmio.model.statuses import (
+    BAD_NO_DATA,
+    BAD_NODE_ID_UNKNOWN,
+    BAD_OUT_OF_RANGE,
+    BAD_TYPE_MISMATCH,
+    describe,
+    quality_of,
+)
+from shmio.model.values import Quality
+
+if TYPE_CHECKING:
+    from shmio.connectors.opcua.session import Item, Session
+
+EXTRA: Final = "connector: opcua needs another library: pip install 'shmio[opcua]'"
+CONNECT_TIMEOUTS: Final = 3
+"""How many time-outs the whole of a connection may take."""
+CLOSE_S: Final = 0.5
+MAX_REPORTED: Final = 20
+"""Registers of a connection that are reported by name."""
+
+_Result = TypeVar("_Result")
+
+log = logging.getLogger("shmio.source")
+
+
+class _NodeWrite(NamedTuple):
+    """A write of a node: a whole value, or the elements of an index range."""
+
+    write: int
+    """Which of the writes needs it."""
+    item: Item
+    elements: str | None
+    sample: Sample
+
+
+class OpcUaConnector(Connector):
+    """Reads the nodes of a layout's registers by subscription, or by polling, and writes to them."""
+
+    Options = OpcUaOptions
+    can_write = True
+    register_quality = True
+    reads_optimized = True
+    path_options: ClassVar[tuple[str, ...]] = ("certificate", "key", "trusted", "password_file")
+
+    def __init__(self, options: OpcUaOptions, layout: Layout) -> None:
+        if importlib.util.find_spec("asyncua") is None:
+            raise ConfigError(EXTRA)
+        if layout.optimized and options.nodes != "siemens":
+            raise ConfigError(
+                f'layout: the block {layout.name} has optimized access: set nodes = "siemens" to read it by names'
+            )
+        self._options, self._layout = options, layout
+        self._addresses = [_address(options, layout, register) for register in layout.registers]
+        self._fittings = [Fitting(register) for register in layout.registers]
+        self._credentials = _credentials(options)
+        self._image = RegisterImage(layout) if layout.status_offset is not None else None
+        self._lock = threading.Lock()  # of the image, and of what is known of its values
+        self._latest: dict[int, Sample] = {}
+        self._reported: set[tuple[int, str]] = set()
+        self._link: _Link | None = None
+
+    @property
+    def timeout_s(self) -> float:
+        """The longest time that any hook blocks, in s."""
+        return CONNECT_TIMEOUTS * self._options.timeout / 1000
+
+    @property
+    def doubt(self) -> str:
+        """Why values may not change although they can be read; empty if there is no reason."""
+        return self._link.doubt if self._link is not None else ""
+
+    def describe(self) -> str:
+        """Return the peer and how it is read, for the log."""
+        options = self._options
+        how = f"{options.security}, {options.policy}" if options.security != "None" else "no security"
+        sessions = self._link.sessions if self._link is not None else []
+        subscribed = sum(session.subscriptions for session in sessions)
+        mode = f"{subscribed} subscriptions" if options.mode == "subscribe" else "polling"
+        return f"to {options.peer}, {len(self._addresses)} nodes, {mode}, sessions={len(sessions)}, {how}"
+
+    def connect(self) -> None:
+        """Open the sessions, and wait for the first value of each node as long as the time-out allows.
+
+        Raises:
+            ConnectorError: The server cannot be reached, or refuses the client.
+
+        """
+        self.close()
+        if self._image is None:
+            raise ConnectorError("the layout has no status area")
+        with self._lock:
+            self._latest.clear()
+            for index in range(len(self._addresses)):
+                self._image.fail(index, BAD_NO_DATA)
+        self._reported.clear()
+        link = self._link = _Link(self._options, self._credentials, self._addresses, self._deadbands(), self._deliver)
+        link.start()
+        try:
+            link.opened.result(self.timeout_s)
+        except concurrent.futures.TimeoutError:
+            self.close()
+            raise ConnectorError(f"no answer within {self.timeout_s * 1000:.0f} ms from {self._options.peer}") from None
+        except ConnectorError:
+            self.close()
+            raise
+
+    def read(self) -> bytes:
+        """Return the present image, if all sessions are certainly alive.
+
+        Raises:
+            ConnectorError: A session is lost, or may be.
+
+        """
+        link, image = self._link, self._image
+        if link is None or image is None:
+            raise ConnectorError(f"not connected to {self._options.peer}")
+        if self._options.mode == "poll":
+            link.call(link.poll)
+        link.check()
+        with self._lock:
+            return bytes(image)
+
+    def close(self) -> None:
+        """Close all sessions. It may be called at any time and more than once."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    # -- values --------------------------------------------------------------------------------------------------------
+
+    def _deadbands(self) -> list[float]:
+        return [
+            one.deadband / abs(one.scale[0]) if one.scale is not None else one.deadband
+            for one in self._layout.registers
+        ]
+
+    def _deliver(self, samples: list[tuple[Item, Sample]]) -> None:
+        """Store samples; the thread of the sessions calls it."""
+        assert self._image is not None  # noqa: S101 - for the type checker
+        with self._lock:
+            for item, sample in samples:
+                self._store(self._image, item, sample)
+
+    def _store(self, image: RegisterImage, item: Item, sample: Sample) -> None:
+        index = item.index
+        item.code = sample.code
+        if quality_of(sample.code) is Quality.BAD or not sample.kind:
+            code = sample.code or BAD_NO_DATA
+            image.fail(index, code, sample.source_ns)
+            if code & 0xFFFF0000 == BAD_NODE_ID_UNKNOWN:
+                self._report(index, f"the server reports {describe(code)}")
+            return
+        item.last = self._latest[index] = sample
+        try:
+            image.put(index, self._fittings[index].value(sample), sample.source_ns, sample.code)
+        except MismatchError as error:
+            image.fail(index, BAD_TYPE_MISMATCH, sample.source_ns)
+            self._report(index, f"{error}: correct its type in the layout")
+        except (ValueRangeError, ValueError, OverflowError):
+            image.fail(index, BAD_OUT_OF_RANGE, sample.source_ns)
+
+    def _report(self, index: int, what: str) -> None:
+        """Log a fault of a register once for each connection, the first ones by name."""
+        if (index, what) in self._reported:
+            return
+        self._reported.add((index, what))
+        if len(self._reported) <= MAX_REPORTED:
+            log.warning("%s: %s", self._layout.registers[index].path, what)
+        elif len(self._reported) == MAX_REPORTED + 1:
+            log.warning("more registers are bad: shmio get shows all")
+
+    # -- writing -------------------------------------------------------------------------------------------------------
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Write to the nodes, and read them back, so that the next image has the new values.
+
+        Raises:
+            WriteLostError: A session was lost before all writes had their answers.
+
+        """
+        link = self._link
+        if link is None or not link.ready:
+            raise WriteLostError(f"not connected to {self._options.peer}", [Lost.UNSENT] * len(writes))
+        outcomes: list[str | Lost] = [""] * len(writes)
+        steps: list[_NodeWrite] = []
+        for number, write in enumerate(writes):
+            try:
+                steps += self._steps(link, number, write)
+            except ValueError as error:
+                outcomes[number] = str(error)
+        try:
+            self._refuse_ranges(link, steps, outcomes)
+        except ConnectorError as error:
+            raise WriteLostError(str(error), [one or Lost.UNSENT for one in outcomes]) from None
+        steps = [step for step in steps if outcomes[step.write] == ""]
+        deadline_ns = time.monotonic_ns() + round(self.timeout_s * 1e9)
+        begun = link.confirmed = 0
+        try:
+            for batch in _batches(steps, link.per_write):
+                if time.monotonic_ns() > deadline_ns:
+                    raise ConnectorError(f"{self._options.peer} takes too long for the writes of a cycle: write less")
+                begun += len(batch)
+                codes = link.call(lambda batch=batch: link.write(batch))  # type: ignore[misc]
+                for step, code in zip(batch, codes, strict=True):
+                    if quality_of(code) is Quality.BAD:
+                        path = self._layout.registers[step.item.index].path
+                        outcomes[step.write] = f"{path}: the server refuses it: {describe(code)}"
+            if steps:
+                touched = list({step.item.index: step.item for step in steps}.values())
+                link.call(lambda: link.read_back(touched))
+        except ConnectorError as error:
+            self._mark_lost(outcomes, steps, begun, link)
+            raise WriteLostError(str(error), outcomes) from None
+        return [str(outcome) for outcome in outcomes]
+
+    def _refuse_ranges(self, link: _Link, steps: Sequence[_NodeWrite], outcomes: list[str | Lost]) -> None:
+        """Refuse writes of elements that the server would not take as such."""
+        for step in steps:
+            if step.elements is not None and not link.call(lambda step=step: link.has_ranges(step)):  # type: ignore[misc]
+                path = self._layout.registers[step.item.index].path
+                outcomes[step.write] = f"{path}: the server does not write single elements: write the whole array"
+
+    @staticmethod
+    def _mark_lost(outcomes: list[str | Lost], steps: Sequence[_NodeWrite], begun: int, link: _Link) -> None:
+        """Mark the writes without an answer: those begun may have been carried out."""
+        for step in steps[link.confirmed : begun]:
+            if outcomes[step.write] == "":
+                outcomes[step.write] = Lost.UNKNOWN
+        done = {step.write for step in steps[:begun]}
+        for step in steps[begun:]:
+            if outcomes[step.write] == "":
+                outcomes[step.write] = Lost.UNKNOWN if step.write in done else Lost.UNSENT
+
+    def _steps(self, link: _Link, number: int, write: Write) -> Iterator[_NodeWrite]:
+        """Yield the nodes' writes for a write; ValueError if it cannot be done."""
+        layout, touched = self._layout, False
+        covered, image = bytearray(layout.size), bytearray(layout.size)
+        apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
+        apply(write, image)
+        for index in _overlapping(layout, write):
+            register = layout.registers[index]
+            wanted = bits_of(register)
+            there = bytes(covered[register.offset : register.offset + register.size])
+            share = bytes(a & b for a, b in zip(there, wanted, strict=True))
+            if not any(share):
+                continue
+            touched = True
+            item = link.items[index]
+            if item.node is None:
+                raise ValueError(f"{register.path}: the server does not know its node")
+            value = codec(register, layout.byte_order).decode(image)
+            like, fitting = self._latest.get(index), self._fittings[index]
+            try:
+                if share == wanted:
+                    yield _NodeWrite(number, item, None, fitting.sample(value, like))
+                    continue
+                first, count = _elements(register, share)
+                flat: Any = value
+                sample = fitting.elements(flat[first : first + count], like)
+            except ValueError as error:
+                raise ValueError(f"{register.path}: {error}") from None
+            last = first + count - 1
+            yield _NodeWrite(number, item, f"{first}:{last}" if last > first else str(first), sample)
+        if not touched:
+            raise ValueError("no register of the layout is there")
+
+
+def _address(options: OpcUaOptions, layout: Layout, register: Register) -> Address:
+    """Return the node of a register; ConfigError."""
+    try:
+        if options.nodes == "siemens" and not register.address:
+            return siemens.node_address(layout, register)
+        return parse(register.address)
+    except ValueError as error:
+        raise ConfigError(f"layout: {register.path}: {error}") from None
+
+
+def _credentials(options: OpcUaOptions) -> Credentials:
+    """Read the files that the keys name; ConfigError."""
+    password = read_password(options.password_file, "password_file") if options.password_file else ""
+    if options.certificate is None or options.key is None:
+        return Credentials(password=password)
+    from shmio.connectors.opcua import trust  # noqa: PLC0415  its library is not needed without security
+
+    certificate, key = trust.read_identity(Path(options.certificate), Path(options.key))
+    uri = trust.application_uri(certificate)
+    if uri is None:
+        raise ConfigError(
+            f"certificate: {options.certificate}: no application URI in it; a certificate for OPC UA has one as an "
+            "alternative name, such as URI:urn:cell:shmio"
+        )
+    return Credentials(uri, (certificate, key), password)
+
+
+def _overlapping(layout: Layout, write: Write) -> Iterator[int]:
+    stop = write.offset + len(write.data)
+    for index, register in enumerate(layout.registers):
+        if register.offset < stop and write.offset < register.offset + register.size:
+            yield index
+
+
+def _elements(register: Register, share: bytes) -> tuple[int, int]:
+    """Return (first, count) of the elements that these bits are; ValueError if they are not whole elements in a row."""
+    if not register.dims:
+        raise ValueError("OPC UA cannot write a part of a value: write the whole register")
+    if len(register.dims) > 1:
+        raise ValueError("elements of an array with several dimensions cannot be written: write the whole array")
+    chosen: list[int] = []
+    whole = True
+    if register.type == "BOOL":
+        chosen = [place for place, (at, bit) in enumerate(bit_positions(register)) if share[at] >> bit & 1]
+    else:
+        for place in range(register.count):
+            start = place * register.element.stride
+            part = share[start : start + register.element.size]
+            if any(part):
+                chosen.append(place)
+                whole = whole and part == b"\xff" * len(part)
+    if not whole or not chosen or chosen[-1] - chosen[0] + 1 != len(chosen):
+        raise ValueError("OPC UA cannot write a part of an element: write the whole element")
+    return chosen[0], len(chosen)
+
+
+def _batches(steps: Sequence[_NodeWrite], most: int) -> Iterator[list[_NodeWrite]]:
+    """Yield the steps in requests: in order, of one session each, and with no node twice in a request."""
+    batch: list[_NodeWrite] = []
+    for step in steps:
+        full = len(batch) >= most or any(one.item is step.item for one in batch)
+        if batch and (full or batch[0].item.session != step.item.session):
+            yield batch
+            batch = []
+        batch.append(step)
+    if batch:
+        yield batch
+
+
+class _Link(threading.Thread):
+    """The sessions of one connection, in a thread with an event loop of its own."""
+
+    def __init__(
+        self,
+        options: OpcUaOptions,
+        credentials: Credentials,
+        addresses: Sequence[Address],
+        deadbands: Sequence[float],
+        deliver: Callable[[list[tuple[Item, Sample]]], None],
+    ) -> None:
+        super().__init__(name="opcua", daemon=True)
+        self._options, self._credentials, self._deliver = options, credentials, deliver
+        self._addresses, self._deadbands = addresses, deadbands
+        self._loop = asyncio.new_event_loop()
+        self._stopping = asyncio.Event()
+        self._closed = False
+        self._failure: ConnectorError | None = None
+        self.opened: concurrent.futures.Future[None] = concurrent.futures.Future()
+        self.sessions: list[Session] = []
+        self.items: list[Item] = []
+        self.confirmed = 0
+        """Values of the present writes whose answers have come."""
+
+    # -- for the poll thread -------------------------------------------------------------------------------------------
+
+    @property
+    def ready(self) -> bool:
+        """Whether all sessions are open, as far as is known."""
+        return self._failure is None and bool(self.sessions) and all(one.ready for one in self.sessions)
+
+    @property
+    def per_write(self) -> int:
+        """How many values a request may write."""
+        return min(one.per_write for one in self.sessions)
+
+    @property
+    def doubt(self) -> str:
+        """Why values may not change."""
+        from shmio.connectors.opcua.session import STATES  # noqa: PLC0415
+
+        for one in self.sessions:
+            if one.state:
+                name = STATES[one.state] if 0 <= one.state < len(STATES) else str(one.state)
+                return f"the server's state is {name}: values may not change until it is Running"
+        return ""
+
+    def check(self) -> None:
+        """Raise ConnectorError if a session is lost, or may be."""
+        if self._failure is not None:
+            raise self._failure
+        for one in self.sessions:
+            if reason := one.check():
+                raise ConnectorError(reason)
+
+    def call(self, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:
+        """Run a coroutine in the loop, and wait for its result.
+
+        Raises:
+            ConnectorError: The session is lost, or does not answer.
+
+        """
+        if self._failure is not None:
+            raise self._failure
+        limit_s = CONNECT_TIMEOUTS * self._options.timeout / 1000
+        future = asyncio.run_coroutine_threadsafe(self._guarded(work), self._loop)
+        try:
+            return future.result(limit_s)
+        except concurrent.futures.TimeoutError:
+            future.cancel()
+            raise ConnectorError(f"no answer within {limit_s * 1000:.0f} ms from {self._options.peer}") from None
+        except concurrent.futures.CancelledError:
+            raise self._failure or ConnectorError(f"the connection to {self._options.peer} was closed") from None
+
+    def close(self) -> None:
+        """End the thread; wait shortly if the sessions are in order, so that the server frees them."""
+        self._closed = True
+        healthy = self.ready
+        self._loop.call_soon_threadsafe(self._stopping.set) if self.is_alive() else None
+        if healthy:
+            self.join(CLOSE_S)
+
+    # -- in the loop ---------------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Run the sessions until they are lost or the link is closed."""
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # its errors are reported as reasons
+        try:
+            self._loop.run_until_complete(self._main())
+        except BaseException as error:  # noqa: BLE001  the poll thread reports it
+            self._lose(ConnectorError(f"the connection failed: {type(error).__name__}: {error}"))
+        finally:
+            self._loop.close()
+
+    async def _main(self) -> None:
+        from shmio.connectors.opcua.session import Item, Session  # noqa: PLC0415  a library that only sources need
+
+        options = self._options
+        self.items = [
+            Item(index, address, deadband, index // options.session_items)
+            for index, (address, deadband) in enumerate(zip(self._addresses, self._deadbands, strict=True))
+        ]
+        parts = [self.items[at : at + options.session_items] for at in range(0, len(self.items), options.session_items)]
+        sessions = [Session(options, self._credentials, part, self._deliver) for part in parts]
+        stopping = asyncio.create_task(self._stopping.wait())
+        try:
+            opening = asyncio.gather(*(one.open() for one in sessions))
+            await asyncio.wait((opening, stopping), return_when=asyncio.FIRST_COMPLETED)
+            if not opening.done():
+                opening.cancel()
+            await opening
+            self.sessions = sessions
+            lost = [one.failure for one in sessions]
+            await self._first_values(sessions, lost)
+            if not self.opened.done():
+                self.opened.set_result(None)
+            await asyncio.wait((*lost, stopping), return_when=asyncio.FIRST_COMPLETED)
+            for one in lost:
+                if one.done():
+                    self._lose(one.result())
+        except ConnectorError as error:
+            self._lose(error)
+        except asyncio.CancelledError:
+            self._lose(ConnectorError(f"the connection to {options.peer} was closed"))
+        finally:
+            stopping.cancel()
+            healthy = self._failure is None
+            await asyncio.gather(*(one.close(polite=healthy) for one in sessions), return_exceptions=True)
+            rest = [one for one in asyncio.all_tasks() if one is not asyncio.current_task()]
+            for task in rest:
+                task.cancel()
+            await asyncio.gather(*rest, return_exceptions=True)
+
+    async def _first_values(self, sessions: Sequence[Session], lost: Sequence[asyncio.Future[Any]]) -> None:
+        """Wait until each node has shown a value, or as long as an answer may take."""
+        if self._options.mode == "poll":
+            return
+        end_s = self._loop.time() + self._options.timeout / 1000
+        while any(one.waiting for one in sessions) and self._loop.time() < end_s and not self._stopping.is_set():
+            if any(one.done() for one in lost):
+                return
+            await asyncio.sleep(0.005)
+
+    def _lose(self, error: ConnectorError) -> None:
+        self._failure = self._failure or error
+        if not self.opened.done():
+            self.opened.set_exception(error)
+
+    async def _guarded(self, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:
+        try:
+            return await work()
+        except Exception as error:
+            if isinstance(error, ConnectorError) and not self.sessions:
+                raise
+            raise self.sessions[0].explained(error) from None
+
+    async def poll(self) -> None:
+        """Read all nodes of all sessions."""
+        await asyncio.gather(*(one.poll() for one in self.sessions))
+
+    async def write(self, batch: Sequence[_NodeWrite]) -> list[int]:
+        """Write a batch, which is of one session; return the status codes."""
+        session = self.sessions[batch[0].item.session]
+        codes = await session.write([(step.item, step.elements, step.sample) for step in batch])
+        self.confirmed += len(batch)
+        return codes
+
+    async def has_ranges(self, step: _NodeWrite) -> bool:
+        """Whether the server knows the elements of a write."""
+        assert step.elements is not None  # noqa: S101 - for the type checker
+        return await self.sessions[step.item.session].has_ranges(step.item, step.elements, len(step.sample.value))
+
+    async def read_back(self, items: Sequence[Item]) -> None:
+        """Read nodes that were written."""
+        for number, session in enumerate(self.sessions):
+            if own := [item for item in items if item.session == number]:
+                await session.read_back(own)

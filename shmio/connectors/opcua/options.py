@@ -1,0 +1,98 @@
+"""The keys of a source with ``connector = "opcua"``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal
+from urllib.parse import urlsplit
+
+import msgspec
+
+from shmio.config import Address
+
+DEFAULT_PORT: Final = 4840
+_Count = Annotated[int, msgspec.Meta(ge=1, le=100_000)]
+
+
+class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """Address of the server, and how to read it; ValueError for a wrong URL and for keys that contradict."""
+
+    url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
+    timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
+    """Milliseconds for each answer of the server, and for its silence."""
+    mode: Literal["subscribe", "poll"] = "subscribe"
+    nodes: Literal["addresses", "siemens"] = "addresses"
+    """Where node ids come from: the layout's addresses, or the names of a data block of an S7-1500."""
+    sampling_ms: Annotated[int, msgspec.Meta(ge=-1, le=3_600_000)] = 50
+    """How often the server samples a node; 0: as fast as it can; -1: as often as it publishes."""
+    publishing_ms: Annotated[int, msgspec.Meta(ge=1, le=3_600_000)] = 100
+    queue: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
+    """Samples of a node that the server keeps between two publications."""
+    max_items: _Count = 1000
+    """Most nodes of a subscription."""
+    session_items: _Count = 10_000
+    """Most nodes of a session."""
+    security: Literal["None", "Sign", "SignAndEncrypt"] = "None"
+    policy: Literal["Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss"] = "Basic256Sha256"
+    certificate: str | None = None
+    key: str | None = None
+    trusted: str | None = None
+    """Folder of trusted certificates."""
+    username: Annotated[str, msgspec.Meta(min_length=1, max_length=256)] | None = None
+    password_file: str | None = None
+    insecure: bool = False
+    """Allow a password over a channel without encryption beyond loopback."""
+
+    def __post_init__(self) -> None:
+        parts = urlsplit(self.url)
+        try:
+            port = parts.port
+        except ValueError:
+            port = 0
+        if parts.scheme != "opc.tcp" or not parts.hostname or port == 0 or "@" in parts.netloc:
+            raise ValueError(f"url: expected opc.tcp://HOST:PORT, without a user, found {self.url!r}")
+        secured = self.security != "None"
+        for name in ("certificate", "key", "trusted"):
+            if secured and getattr(self, name) is None:
+                raise ValueError(f"{name}: this key is needed with security = {self.security!r}")
+            if not secured and getattr(self, name) is not None:
+                raise ValueError(f'{name}: has no effect without security = "SignAndEncrypt" or "Sign"')
+        if (self.username is None) != (self.password_file is None):
+            raise ValueError("username: give both username and password_file, or neither")
+        if self.username and self.security != "SignAndEncrypt" and not self.address.loopback and not self.insecure:
+            raise ValueError(
+                "username: beyond loopback, a password needs security = 'SignAndEncrypt', or insecure = true beside it"
+            )
+
+    @property
+    def address(self) -> Address:
+        """Host and port of the server."""
+        parts = urlsplit(self.url)
+        return Address(parts.hostname or "", parts.port or DEFAULT_PORT)
+
+    @property
+    def full_url(self) -> str:
+        """The URL with its port."""
+        parts = urlsplit(self.url)
+        return self.url if parts.port else parts._replace(netloc=f"{parts.netloc}:{DEFAULT_PORT}").geturl()
+
+    @property
+    def peer(self) -> str:
+        """``host:port`` for messages."""
+        return str(self.address)
+
+
+@dataclass(frozen=True)
+class Credentials:
+    """What a client identifies itself with.
+
+    Attributes:
+        application_uri: The client's URI, which is also in its certificate.
+        identity: The client's certificate and its private key, of the library cryptography.
+        password: The user's password.
+
+    """
+
+    application_uri: str = "urn:shmio:client"
+    identity: tuple[Any, Any] | None = None
+    password: str = ""

@@ -1,0 +1,738 @@
+"""One session of an OPC UA server, with the nodes that it reads and the subscriptions for them.
+
+It uses asyncua for the channel, the security and the requests, but not its client's supervision: the
+session is lost with the first doubt, and never repaired. Then another session begins with objects of
+its own, so that nothing of the old one can be taken for the new one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import struct
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from asyncua import Client, ua
+from asyncua.client.ua_client import UASocketProtocol
+from asyncua.common.connection import TransportLimits
+from asyncua.common.utils import Buffer
+from asyncua.crypto import security_policies
+from asyncua.ua import ua_binary
+
+from shmio.connectors.opcua import decode
+from shmio.connectors.opcua.address import Address, BrowsePath
+from shmio.connectors.opcua.decode import FaultError, MalformedError, Publication, Sample
+from shmio.connectors.opcua.options import Credentials, OpcUaOptions
+from shmio.errors import ConnectorError
+from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, BAD_WAITING_FOR_INITIAL_DATA, GOOD, describe
+
+MAX_CHUNK_BYTES: Final = 65_535
+MAX_MESSAGE_BYTES: Final = 64 << 20
+MAX_PER_CALL: Final = 1_000
+"""Most nodes in a request; the server's own limit counts if it is lower."""
+MAX_PUBLISH_REQUESTS: Final = 20
+RETRY_S: Final = 10.0
+"""How often nodes that the server does not know are asked for again."""
+SESSION_TIMEOUT_MS: Final = 30_000
+CLOSE_S: Final = 1.0
+_CHANNEL_LIFETIME_MS: Final = 3_600_000
+_NAMESPACES, _STATE = 2255, 2259
+_LIMITS: Final = (11705, 11707, 11712, 11714)
+"""The server's limits of a call: nodes of a read, of a write, of browse paths, and monitored items."""
+_RUNNING: Final = 0
+STATES: Final = (
+    "Running",
+    "Failed",
+    "NoConfiguration",
+    "Suspended",
+    "Shutdown",
+    "Test",
+    "CommunicationFault",
+    "Unknown",
+)
+_AGAIN: Final = frozenset({0x80330000, 0x80340000})  # BadNodeIdInvalid, BadNodeIdUnknown
+_FILTERS: Final = frozenset({0x80430000, 0x80440000, 0x80450000, 0x808E0000})
+_BAD_TOO_MANY_PUBLISH_REQUESTS: Final = 0x80780000
+_BAD_TIMEOUT: Final = 0x800A0000
+
+log = logging.getLogger("shmio.source")
+
+
+@dataclass(eq=False)
+class Item:
+    """A node that is read, and what is known of it."""
+
+    index: int
+    address: Address
+    deadband: float
+    """Of the node's own numbers; 0: none."""
+    session: int
+    """Which of the sessions reads it."""
+    node: Any = None
+    """The node id; None if it is not resolved."""
+    code: int = BAD_WAITING_FOR_INITIAL_DATA
+    """Status code if the node cannot be read, or waits for its first value."""
+    subscription: Subscription | None = None
+    monitored: int = 0
+    """The server's number of the monitored item."""
+    last: Sample | None = None
+    """The last sample with a value."""
+    settles_ns: int = 0
+    """Until when samples from before the last write may come."""
+    written_ns: int = 0
+    """Source time of the value that was read after the last write."""
+    skipped: bool = False
+    """Whether a sample was skipped because it may be from before the last write."""
+
+
+@dataclass(eq=False)
+class Subscription:
+    """A subscription as the server made it."""
+
+    number: int
+    publishing_s: float
+    silent_s: float
+    """How long it may be silent."""
+    alive_ns: int
+    sequence: int = 0
+    items: list[Item] = field(default_factory=list)
+
+
+Deliver = Callable[[list[tuple[Item, Sample]]], None]
+
+
+class Session:
+    """A session, from its connection to its end. All methods are for the thread of its event loop."""
+
+    def __init__(
+        self, options: OpcUaOptions, credentials: Credentials, items: Sequence[Item], deliver: Deliver
+    ) -> None:
+        """Create the session without connecting.
+
+        Args:
+            options: The source's keys.
+            credentials: What the client identifies itself with.
+            items: What it reads.
+            deliver: Takes samples. A failed item has one without a value.
+
+        """
+        self._options, self._credentials, self._items, self._deliver = options, credentials, items, deliver
+        self._by_index = {item.index: item for item in items}
+        self._timeout_s = options.timeout / 1000
+        self._client: Any = None
+        self._protocol: Any = None
+        self._subscriptions: dict[int, Subscription] = {}
+        self._publishing = 0
+        self._wanted = 0
+        self._acknowledge: list[Any] = []
+        self._tasks: list[asyncio.Task[None]] = []
+        self._per_read = self._per_write = self._per_path = self._per_items = MAX_PER_CALL
+        self._answered_ns = time.monotonic_ns()
+        self.failure = asyncio.get_running_loop().create_future()
+        """Gets the reason if the session is lost."""
+        self.state = _RUNNING
+        """The server's state."""
+
+    # -- connection ----------------------------------------------------------------------------------------------------
+
+    async def open(self) -> None:
+        """Connect, resolve the nodes, and subscribe to them.
+
+        Raises:
+            ConnectorError: The server cannot be reached, or refuses it.
+
+        """
+        try:
+            await self._open()
+        except Exception as error:  # noqa: BLE001  whatever a server does, its session has failed
+            raise self.explained(error) from None
+
+    async def _open(self) -> None:
+        options = self._options
+        policy = await self._policy()
+        self._client = client = self._new_client()
+        if policy is not None:
+            client.security_policy = policy
+            client.uaclient.set_security(policy)
+        if options.username is not None:
+            client.set_user(options.username)
+            client.set_password(self._credentials.password)
+        await client.connect_socket()
+        self._protocol = client.uaclient.protocol
+        await client.send_hello()
+        await client.open_secure_channel()
+        await client.create_session()
+        try:
+            await client.activate_session(username=client._username, password=client._password)
+        except ua.UaStatusCodeError as error:
+            raise ConnectorError(_refused_user(error.code, options)) from None
+        client.uaclient.pre_request_hook = None
+        self._tasks.append(asyncio.create_task(self._renew()))
+        await self._ask_limits()
+        await self._resolve(self._items)
+        if options.mode == "subscribe":
+            await self._subscribe([item for item in self._items if item.node is not None])
+        self._report_failed(self._items)
+        self._answered_ns = time.monotonic_ns()
+        self._tasks += [asyncio.create_task(one()) for one in (self._probe, self._watch, self._retry)]
+
+    def _new_client(self) -> Any:
+        client = Client(self._options.full_url, timeout=self._timeout_s)
+        client.name = client.description = "shmio"
+        client.application_uri = self._credentials.application_uri
+        client.secure_channel_timeout = _CHANNEL_LIFETIME_MS
+        client.session_timeout = max(SESSION_TIMEOUT_MS, 10 * self._options.timeout)
+        client.max_messagesize = MAX_MESSAGE_BYTES
+        low = client.uaclient
+
+        def protocol() -> _Protocol:
+            made = _Protocol(
+                self._timeout_s, low.security_policy, TransportLimits(MAX_CHUNK_BYTES, MAX_CHUNK_BYTES, 0, 0)
+            )
+            made.on_connection_lost = self._lost
+            low.protocol = made
+            return made
+
+        low._make_protocol = protocol
+        return client
+
+    async def _policy(self) -> Any:
+        """Return the security policy with the server's certificate; None for no security."""
+        options = self._options
+        if options.security == "None" or self._credentials.identity is None or options.trusted is None:
+            return None
+        from shmio.connectors.opcua.trust import check_server  # noqa: PLC0415  not needed without security
+
+        kind = getattr(security_policies, f"SecurityPolicy{options.policy}")
+        mode = getattr(ua.MessageSecurityMode, options.security)
+        asking = self._new_client()
+        low = asking.uaclient
+        try:
+            await asking.connect_socket()
+            low.protocol.on_connection_lost = None
+            await asking.send_hello()
+            await asking.open_secure_channel()
+            endpoints = await asking.get_endpoints()
+        finally:
+            if low.protocol is not None and low.protocol.transport is not None:
+                low.protocol.transport.abort()
+        offered = {(one.SecurityPolicyUri.rpartition("#")[2], one.SecurityMode.name): one for one in endpoints}
+        for one in endpoints:
+            if one.SecurityPolicyUri == kind.URI and one.SecurityMode == mode and one.ServerCertificate:
+                host = urlsplit(options.url).hostname or ""
+                certificate = check_server(bytes(one.ServerCertificate), Path(options.trusted), host)
+                return kind(certificate, *self._credentials.identity, mode)
+        names = ", ".join(sorted({f"{name} with {how}" if name != "None" else "None" for name, how in offered}))
+        raise ConnectorError(
+            f"the server does not offer policy {options.policy} with security {options.security}; it offers: {names}"
+        )
+
+    async def _renew(self) -> None:
+        """Renew the channel before it expires."""
+        while True:
+            await asyncio.sleep(0.75 * max(1.0, self._client.secure_channel_timeout / 1000))
+            try:
+                await self._client.open_secure_channel(renew=True)
+                self._client.uaclient.revolve_security_token()
+            except Exception as error:  # noqa: BLE001  whatever it is, the channel will not last
+                self.fail(self.explained(error))
+                return
+
+    def _lost(self, error: Exception | None) -> None:
+        reason = getattr(self._protocol, "reason", "")
+        peer = self._options.peer
+        self.fail(ConnectorError(reason or f"{peer} closed the connection{f': {error}' if error else ''}"))
+
+    def fail(self, error: ConnectorError) -> None:
+        """End the session; the first error counts."""
+        if not self.failure.done():
+            self.failure.set_result(error)
+
+    async def close(self, *, polite: bool) -> None:
+        """End the session; if ``polite``, tell the server."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._client is None:
+            return
+        low = self._client.uaclient
+        if polite and self._protocol is not None and self._protocol.transport is not None:
+            with contextlib.suppress(Exception):
+                async with asyncio.timeout(CLOSE_S):
+                    await low.session.close_session(True)
+                    await low.close_secure_channel()
+        if not self.failure.done():
+            self.failure.cancel()
+        protocol = low.protocol
+        if protocol is not None and protocol.transport is not None:
+            transport = protocol.transport
+            if polite:
+                transport.close()
+                await asyncio.sleep(0)
+            transport.abort()
+        await asyncio.sleep(0)
+
+    def explained(self, error: BaseException) -> ConnectorError:
+        """Return the error of a connection as a ConnectorError with a text for the operator."""
+        options, peer = self._options, self._options.peer
+        reason = getattr(self._protocol, "reason", "")
+        if isinstance(error, ConnectorError):
+            return ConnectorError(_explained_code(error.code, options)) if isinstance(error, FaultError) else error
+        if self.failure.done() and not self.failure.cancelled():
+            return self.failure.result()
+        if reason:
+            return ConnectorError(reason)
+        if isinstance(error, TimeoutError):
+            return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
+        if isinstance(error, ConnectionRefusedError):
+            return ConnectorError(f"connection refused by {peer}")
+        if isinstance(error, ua.UaStatusCodeError):
+            return ConnectorError(_explained_code(error.code, options))
+        if isinstance(error, OSError):
+            closed = isinstance(error, ConnectionError)
+            return ConnectorError(f"{peer} closed the connection" if closed else f"{peer} cannot be reached: {error}")
+        if isinstance(error, ua.UaError | ValueError | struct.error | TypeError | AttributeError | LookupError):
+            return ConnectorError(f"{peer} sent what is not OPC UA, or not what was asked for: {str(error)[:200]}")
+        return ConnectorError(f"{peer}: {type(error).__name__}: {str(error)[:200]}")
+
+    # -- requests ------------------------------------------------------------------------------------------------------
+
+    async def _answer(self, request: Any) -> bytes:
+        """Send a request; return the body of its answer, which comes within the time-out."""
+        if self._protocol is None:
+            raise ConnectionError
+        future = self._protocol._send_request(request, self._timeout_s)
+        body = await asyncio.wait_for(future, self._timeout_s)
+        self._answered_ns = time.monotonic_ns()
+        return bytes(body)
+
+    async def _samples(self, nodes: Sequence[Any]) -> list[Sample]:
+        """Read the values of nodes; each request has as many as the server takes."""
+        parts = [nodes[at : at + self._per_read] for at in range(0, len(nodes), self._per_read)]
+
+        async def read(part: Sequence[Any]) -> list[Sample]:
+            ids = [ua.ReadValueId(node, ua.AttributeIds.Value) for node in part]
+            request = ua.ReadRequest()
+            request.Parameters = ua.ReadParameters(0, ua.TimestampsToReturn.Both, ids)
+            found = decode.read_response(await self._answer(request))
+            if len(found) != len(part):
+                raise MalformedError
+            return found
+
+        return [sample for found in await asyncio.gather(*map(read, parts)) for sample in found]
+
+    async def _ask_limits(self) -> None:
+        """Learn how many nodes the server takes in a call."""
+        found = await self._samples([ua.NodeId(one) for one in _LIMITS])
+        limits = [
+            min(one.value, MAX_PER_CALL)
+            if one.kind == decode.UINT32 and one.dims is None and one.value
+            else MAX_PER_CALL
+            for one in found
+        ]
+        self._per_read, self._per_write, self._per_path, self._per_items = limits
+
+    async def _resolve(self, items: Iterable[Item]) -> None:
+        """Find the node of each address."""
+        (found,) = await self._samples([ua.NodeId(_NAMESPACES)])
+        names: list[str] = found.value if found.kind == decode.STRING and found.dims is not None else []
+        paths: list[tuple[Item, BrowsePath]] = []
+        for item in items:
+            address = item.address
+            if isinstance(address, BrowsePath):
+                paths.append((item, address))
+            elif isinstance(address.namespace, int):
+                item.node = ua.NodeId(address.identifier, address.namespace)
+            elif address.namespace in names:
+                item.node = ua.NodeId(address.identifier, names.index(address.namespace))
+            else:
+                item.node, item.code = None, BAD_NODE_ID_UNKNOWN
+        for at in range(0, len(paths), self._per_path):
+            await self._translate(paths[at : at + self._per_path])
+
+    async def _translate(self, paths: Sequence[tuple[Item, BrowsePath]]) -> None:
+        asked = []
+        for _, path in paths:
+            steps = [
+                ua.RelativePathElement(ua.NodeId(33), False, True, ua.QualifiedName(name, space))
+                for space, name in path.steps
+            ]
+            asked.append(ua.BrowsePath(ua.NodeId(84), ua.RelativePath(steps)))
+        results = await self._client.uaclient.session.translate_browsepaths_to_nodeids(asked)
+        if len(results) != len(paths):
+            raise MalformedError
+        for (item, _), result in zip(paths, results, strict=True):
+            code, targets = result.StatusCode.value, result.Targets or []
+            item.node = None
+            if code >> 30 or not targets:
+                item.code = BAD_NODE_ID_UNKNOWN
+            elif targets[0].RemainingPathIndex != 0xFFFF_FFFF:
+                item.code = BAD_NODE_ID_UNKNOWN  # the rest of the path is in another server
+            else:
+                target = targets[0].TargetId
+                item.node = ua.NodeId(target.Identifier, target.NamespaceIndex)
+
+    # -- reading -------------------------------------------------------------------------------------------------------
+
+    async def poll(self) -> None:
+        """Read all nodes and deliver their samples."""
+        items = [item for item in self._items if item.node is not None]
+        self._deliver(list(zip(items, await self._samples([item.node for item in items]), strict=True)))
+
+    async def read_back(self, items: Sequence[Item]) -> None:
+        """Read nodes after they were written, and deliver their samples before any other."""
+        found = await self._samples([item.node for item in items])
+        now_ns = time.monotonic_ns()
+        for item, sample in zip(items, found, strict=True):
+            if item.subscription is not None:
+                settle_s = 2 * (item.subscription.publishing_s + max(0, self._options.sampling_ms) / 1000) + 0.2
+                item.settles_ns, item.written_ns = now_ns + round(settle_s * 1e9), sample.source_ns
+        self._deliver(list(zip(items, found, strict=True)))
+
+    async def has_ranges(self, item: Item, elements: str, count: int) -> bool:
+        """Whether the server reads just these elements of an array.
+
+        A server that does not know index ranges may ignore them, and replace the whole array.
+        """
+        request = ua.ReadRequest()
+        asked = ua.ReadValueId(item.node, ua.AttributeIds.Value, elements)
+        request.Parameters = ua.ReadParameters(0, ua.TimestampsToReturn.Neither, [asked])
+        (found,) = decode.read_response(await self._answer(request))
+        return found.code >> 30 == 0 and found.dims == (count,)
+
+    async def write(self, values: Sequence[tuple[Item, str | None, Sample]]) -> list[int]:
+        """Write values, or with an index range elements of arrays; return the server's status code of each.
+
+        At most :attr:`per_write` of them, and no node twice.
+        """
+        request = ua.WriteRequest()
+        for item, elements, sample in values:
+            value = ua.DataValue(_variant(sample), StatusCode=None)
+            request.Parameters.NodesToWrite.append(ua.WriteValue(item.node, ua.AttributeIds.Value, elements, value))
+        reader = ua_binary.struct_from_binary(ua.WriteResponse, Buffer(await self._answer(request)))
+        reader.ResponseHeader.ServiceResult.check()
+        if len(reader.Results) != len(values):
+            raise MalformedError
+        return [int(code.value) for code in reader.Results]
+
+    @property
+    def per_write(self) -> int:
+        """How many values a request may write."""
+        return self._per_write
+
+    @property
+    def ready(self) -> bool:
+        """Whether the connection is open, as far as is known."""
+        return self._protocol is not None and self._protocol.transport is not None and not self.failure.done()
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a node has shown no value yet."""
+        return any(item.code == BAD_WAITING_FOR_INITIAL_DATA for item in self._items)
+
+    @property
+    def subscriptions(self) -> int:
+        """Number of subscriptions."""
+        return len(self._subscriptions)
+
+    def check(self) -> str:
+        """Return why the session may be dead, or an empty text. Any thread may call it."""
+        now_ns = time.monotonic_ns()
+        options = self._options
+        for one in tuple(self._subscriptions.values()):
+            if now_ns - one.alive_ns > one.silent_s * 1e9:
+                return f"no answer within {one.silent_s * 1000:.0f} ms from {options.peer}: a subscription is silent"
+        # A probe is sent every half of a time-out, and is to be answered within one.
+        if now_ns - self._answered_ns > 3 * options.timeout * 1_000_000:
+            return f"no answer within {3 * options.timeout} ms from {options.peer}"
+        return ""
+
+    # -- subscriptions -------------------------------------------------------------------------------------------------
+
+    async def _subscribe(self, items: Sequence[Item]) -> None:
+        most = self._options.max_items
+        for at in range(0, len(items), most):
+            await self._fill(await self._new_subscription(), items[at : at + most])
+
+    async def _new_subscription(self) -> Subscription:
+        options = self._options
+        publishing_ms = float(options.publishing_ms)
+        count = max(1, int(options.timeout / 2 / publishing_ms))
+        lifetime = max(3 * count, math.ceil(max(10 * options.timeout, SESSION_TIMEOUT_MS) / publishing_ms))
+        asked = ua.CreateSubscriptionParameters(publishing_ms, lifetime, count, 0, True, 0)
+        request = ua.CreateSubscriptionRequest()
+        request.Parameters = asked
+        answer = ua_binary.struct_from_binary(ua.CreateSubscriptionResponse, Buffer(await self._answer(request)))
+        answer.ResponseHeader.ServiceResult.check()
+        made = answer.Parameters
+        revised_ms = made.RevisedPublishingInterval
+        if not 0 < revised_ms < 86_400_000 or not 0 < made.RevisedMaxKeepAliveCount < 1 << 31:
+            raise MalformedError
+        keep_alive_s = revised_ms * made.RevisedMaxKeepAliveCount / 1000
+        if keep_alive_s > 2 * self._timeout_s:
+            log.warning(
+                "the server sends signs of life only every %.3g s: a loss may be noticed as late as that", keep_alive_s
+            )
+        one = Subscription(
+            int(made.SubscriptionId), revised_ms / 1000, keep_alive_s + self._timeout_s, time.monotonic_ns()
+        )
+        self._subscriptions[one.number] = one
+        self._wanted = min(2 * len(self._subscriptions) + 1, MAX_PUBLISH_REQUESTS)
+        self._publish()
+        return one
+
+    async def _fill(self, subscription: Subscription, items: Sequence[Item], *, filters: bool = True) -> None:
+        """Create monitored items; those that the server refuses have its status code."""
+        unfiltered: list[Item] = []
+        for at in range(0, len(items), self._per_items):
+            part = items[at : at + self._per_items]
+            request = ua.CreateMonitoredItemsRequest()
+            request.Parameters = ua.CreateMonitoredItemsParameters(
+                subscription.number, ua.TimestampsToReturn.Both, [self._monitor(item, filters) for item in part]
+            )
+            for item in part:
+                item.subscription = subscription
+            answer = ua_binary.struct_from_binary(ua.CreateMonitoredItemsResponse, Buffer(await self._answer(request)))
+            answer.ResponseHeader.ServiceResult.check()
+            if len(answer.Results) != len(part):
+                raise MalformedError
+            for item, result in zip(part, answer.Results, strict=True):
+                code = int(result.StatusCode.value)
+                if code >> 30 == 0:
+                    item.monitored = int(result.MonitoredItemId)
+                    subscription.items.append(item)
+                elif filters and item.deadband and code & 0xFFFF0000 in _FILTERS:
+                    unfiltered.append(item)
+                else:
+                    item.subscription, item.code = None, code
+        if unfiltered:
+            await self._fill(subscription, unfiltered, filters=False)
+
+    def _monitor(self, item: Item, filters: bool) -> Any:
+        chosen = None
+        if filters and item.deadband:
+            chosen = ua.DataChangeFilter(ua.DataChangeTrigger.StatusValue, 1, item.deadband)
+        wanted = ua.MonitoringParameters(
+            item.index, float(self._options.sampling_ms), chosen, self._options.queue, True
+        )
+        return ua.MonitoredItemCreateRequest(
+            ua.ReadValueId(item.node, ua.AttributeIds.Value), ua.MonitoringMode.Reporting, wanted
+        )
+
+    def _publish(self) -> None:
+        """Keep as many publish requests with the server as are wanted."""
+        while self._publishing < self._wanted and self.ready:
+            request = ua.PublishRequest()
+            request.Parameters.SubscriptionAcknowledgements, self._acknowledge = self._acknowledge, []
+            future = self._protocol._send_request(request, 0)
+            self._publishing += 1
+            future.add_done_callback(self._published)
+
+    def _published(self, future: asyncio.Future[Any]) -> None:
+        self._publishing -= 1
+        lost = not future.cancelled() and future.exception() is not None  # asking keeps asyncio from complaining
+        if future.cancelled() or self.failure.done():
+            return
+        if lost and not self.ready:
+            self.fail(self.explained(future.exception() or ConnectionError()))
+            return
+        try:
+            self._take(decode.publish_response(bytes(future.result())))
+        except FaultError as error:
+            if error.code == _BAD_TOO_MANY_PUBLISH_REQUESTS and self._publishing:
+                self._wanted = self._publishing
+            elif error.code != _BAD_TIMEOUT:
+                self.fail(self.explained(error))
+                return
+        except Exception as error:  # noqa: BLE001  what a server sends must end nothing but its session
+            self.fail(self.explained(error))
+            return
+        try:
+            self._publish()
+        except Exception as error:  # noqa: BLE001
+            self.fail(self.explained(error))
+
+    def _take(self, found: Publication) -> None:
+        one = self._subscriptions.get(found.subscription)
+        if one is None:
+            return
+        one.alive_ns = self._answered_ns = time.monotonic_ns()
+        if found.closed:
+            raise ConnectorError(f"{self._options.peer} ended a subscription: {describe(found.closed)}")
+        if found.keep_alive:
+            return
+        if one.sequence and found.sequence != one.sequence % 0xFFFF_FFFF + 1:
+            raise ConnectorError(f"a message of {self._options.peer} is missing: values may be lost")
+        one.sequence = found.sequence
+        self._acknowledge.append(ua.SubscriptionAcknowledgement(one.number, found.sequence))
+        taken: list[tuple[Item, Sample]] = []
+        for index, sample in found.values:
+            item = self._by_index.get(index)
+            if item is None or item.subscription is not one:
+                continue
+            if item.settles_ns and self._is_from_before(item, sample):
+                item.skipped = True
+                continue
+            taken.append((item, sample))
+        if taken:
+            self._deliver(taken)
+
+    def _is_from_before(self, item: Item, sample: Sample) -> bool:
+        """Whether a sample may be from before the item's last write."""
+        if time.monotonic_ns() > item.settles_ns:
+            return False
+        if sample.source_ns and item.written_ns:
+            return sample.source_ns < item.written_ns
+        return item.last is not None and sample.value != item.last.value
+
+    # -- supervision ---------------------------------------------------------------------------------------------------
+
+    async def _probe(self) -> None:
+        """Ask for the server's state, so that its silence is noticed and the session does not expire."""
+        while True:
+            try:
+                (found,) = await self._samples([ua.NodeId(_STATE)])
+            except Exception as error:  # noqa: BLE001
+                self.fail(self.explained(error))
+                return
+            if found.kind == decode.INT32 and found.dims is None:
+                self.state = found.value
+            await asyncio.sleep(self._timeout_s / 2)
+
+    async def _watch(self) -> None:
+        """Notice silence, and read again what was written when its older samples have come."""
+        while True:
+            await asyncio.sleep(min(0.1, self._timeout_s / 4))
+            if reason := self.check():
+                self.fail(ConnectorError(reason))
+                return
+            now_ns = time.monotonic_ns()
+            settled = [item for item in self._items if item.settles_ns and now_ns > item.settles_ns]
+            again = [item for item in settled if item.skipped]
+            for item in settled:
+                item.settles_ns, item.skipped = 0, False
+            if again:
+                try:
+                    self._deliver(list(zip(again, await self._samples([item.node for item in again]), strict=True)))
+                except Exception as error:  # noqa: BLE001
+                    self.fail(self.explained(error))
+                    return
+
+    async def _retry(self) -> None:
+        """Ask again for nodes that the server did not know."""
+        while True:
+            await asyncio.sleep(RETRY_S)
+            unknown = [item for item in self._items if item.node is None or item.code & 0xFFFF0000 in _AGAIN]
+            if not unknown:
+                continue
+            try:
+                await self._resolve(unknown)
+                if self._options.mode == "subscribe":
+                    await self._subscribe_again([item for item in unknown if item.node is not None])
+            except Exception as error:  # noqa: BLE001
+                self.fail(self.explained(error))
+                return
+
+    async def _subscribe_again(self, items: Sequence[Item]) -> None:
+        there = await self._samples([item.node for item in items]) if items else []
+        known = [item for item, one in zip(items, there, strict=True) if one.code & 0xFFFF0000 not in _AGAIN]
+        for item in known:
+            if item.subscription is not None:
+                request = ua.DeleteMonitoredItemsRequest()
+                request.Parameters = ua.DeleteMonitoredItemsParameters(item.subscription.number, [item.monitored])
+                await self._answer(request)
+                item.subscription.items.remove(item)
+                item.subscription = None
+            item.code = BAD_WAITING_FOR_INITIAL_DATA
+        at = 0
+        for one in [*self._subscriptions.values()]:
+            room = max(0, self._options.max_items - len(one.items))
+            if part := known[at : at + room]:
+                await self._fill(one, part)
+            at += room
+        await self._subscribe(known[at:])
+        self._report_failed(known)
+
+    def _report_failed(self, items: Iterable[Item]) -> None:
+        """Deliver the status of items that cannot be read."""
+        failed = [item for item in items if item.code not in (GOOD, BAD_WAITING_FOR_INITIAL_DATA)]
+        if failed:
+            self._deliver([(item, Sample(0, None, None, item.code, 0)) for item in failed])
+
+
+class _Protocol(UASocketProtocol):
+    """Receives what the server sends, and bounds it."""
+
+    reason = ""
+    """Why it closed the connection."""
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes; close the connection if a message is too large."""
+        super().data_received(data)
+        left = self.receive_buffer
+        too_long = left is not None and len(left) >= 8 and int.from_bytes(left[4:8], "little") > MAX_CHUNK_BYTES + 64
+        if (too_long or self._connection._incoming_size > MAX_MESSAGE_BYTES) and self.transport is not None:
+            self.reason = "the server sent what is not OPC UA, or a message that is too large"
+            self.transport.abort()
+
+
+def _variant(sample: Sample) -> Any:
+    """Return a sample as the library writes it."""
+    kind = ua.VariantType(sample.kind)
+
+    def there(value: Any) -> Any:
+        if kind == ua.VariantType.LocalizedText:
+            return ua.LocalizedText(value)
+        if kind == ua.VariantType.DateTime:
+            return ua.datetime.fromtimestamp(0, ua.timezone.utc) + ua.timedelta(microseconds=value // 1000)
+        if isinstance(value, decode.Extension):
+            return ua.ExtensionObject(ua_binary.nodeid_from_binary(Buffer(value.encoding)), value.body)
+        return value
+
+    if sample.dims is None:
+        return ua.Variant(there(sample.value), kind)
+    flat = [there(one) for one in _flat(sample.value)]
+    return ua.Variant(flat, kind, list(sample.dims) if len(sample.dims) > 1 else None, is_array=True)
+
+
+def _flat(values: list[Any]) -> list[Any]:
+    return [inner for one in values for inner in (_flat(one) if isinstance(one, list) else [one])]
+
+
+def _refused_user(code: int, options: OpcUaOptions) -> str:
+    if options.username is None:
+        return f"the server does not admit clients without a user ({describe(code)}): set username and password_file"
+    return f"the server refuses the user {options.username!r} ({describe(code)}): check username and password_file"
+
+
+def _explained_code(code: int, options: OpcUaOptions) -> str:
+    name = describe(code)
+    if code & 0xFFFF0000 in (0x801A0000, 0x80120000, 0x80130000) and options.security != "None":
+        return f"the server refuses this client's certificate ({name}): let the server trust {options.certificate}"
+    if code & 0xFFFF0000 in (0x80560000, 0x80770000, 0x80DB0000):  # sessions, subscriptions, monitored items
+        return f"the server has no more room ({name}): close other clients, or read less"
+    if code & 0xFFFF0000 in (0x80540000, 0x80550000):
+        return f"the server refuses security {options.security} ({name}): set security and policy to what it offers"
+    return f"the server refuses it: {name}"
+
+
+def bound_decoding() -> None:
+    """Make the library refuse arrays of nothing, which could be of any length in a short message."""
+    original = ua_binary.unpack_uatype_array
+
+    def unpack(vtype: Any, data: Any) -> Any:
+        if vtype == ua.VariantType.Null:
+            raise MalformedError
+        return original(vtype, data)
+
+    ua_binary.unpack_uatype_array = unpack
+
+
+bound_decoding()

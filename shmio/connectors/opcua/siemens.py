@@ -1,0 +1,43 @@
+"""Node ids of the members of a data block in the OPC UA server of an S7-1500.
+
+The server has all data blocks in the namespace ``http://www.siemens.com/simatic-s7-opcua``. The node
+of a member is a text with the names of the block and of the members in quotes, ``"DB201"."Robot_800"
+."Axs1_Pos"``; an index of an array of structures follows its name: ``"Axes"[2]."Vel"``. An array of
+an elementary type is one node. Source: Siemens, "Communication" function manual, section "Addressing
+nodes". It makes no difference whether the block is optimized.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from shmio.connectors.opcua.address import NodeAddress
+from shmio.layout.model import Layout, Register
+from shmio.layout.topic import decode_segment
+
+NAMESPACE: Final = "http://www.siemens.com/simatic-s7-opcua"
+_INDEX: Final = re.compile(r"-?[0-9]+")
+
+
+def node_address(layout: Layout, register: Register) -> NodeAddress:
+    """Return the node of a register of a data block.
+
+    A path tells an array's index and a member whose name is a number apart only by that: such a name
+    must be given with its address in a tag table.
+    """
+    parts: list[str] = [f'"{layout.name}"']
+    indices: list[str] = []
+    for segment in register.path.split("/"):
+        if _INDEX.fullmatch(segment):
+            indices.append(segment)
+            continue
+        parts[-1] += _bracketed(indices)
+        indices = []
+        parts.append(f'"{decode_segment(segment)}"')
+    parts[-1] += _bracketed(indices)
+    return NodeAddress(NAMESPACE, ".".join(parts))
+
+
+def _bracketed(indices: list[str]) -> str:
+    return f"[{','.join(indices)}]" if indices else ""

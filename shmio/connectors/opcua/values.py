@@ -1,0 +1,250 @@
+"""Fits values of OPC UA nodes to registers, and values of registers to nodes.
+
+A node's type decides how its value is read, so that the nodes of an S7-1500 (a DATE is a UInt16, a
+DATE_AND_TIME eight bytes, a DTL a structure), those of shmio's own server (dates are texts) and those
+of other servers all fit. Siemens' mapping: "Communication" function manual, table "SIMATIC and OPC UA
+data types".
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from shmio.connectors.opcua import decode as ua
+from shmio.connectors.opcua.decode import Extension, Sample
+from shmio.errors import ValueRangeError
+from shmio.layout.model import INTEGERS, Register
+from shmio.layout.values import calendar
+from shmio.layout.values.codec import Scalar, Value, flatten, nest, scalar_codec
+
+_INTEGERS: Final = {ua.SBYTE: 8, ua.BYTE: 8, ua.INT16: 16, ua.UINT16: 16, ua.INT32: 32, ua.UINT32: 32, ua.INT64: 64,
+                    ua.UINT64: 64, ua.STATUS_CODE: 32}  # fmt: skip
+_UNSIGNED: Final = frozenset({ua.BYTE, ua.UINT16, ua.UINT32, ua.UINT64, ua.STATUS_CODE})
+_FLOATS: Final = frozenset({ua.FLOAT, ua.DOUBLE})
+_NUMBERS: Final = _FLOATS | _INTEGERS.keys()
+_TEXTS: Final = frozenset({
+    ua.STRING, ua.XML, ua.GUID, ua.NODE_ID, ua.EXPANDED_NODE_ID, ua.QUALIFIED_NAME, ua.LOCALIZED_TEXT
+})  # fmt: skip
+_OF_BYTES: Final = {"DATE_AND_TIME": 8, "POINTER": 6, "ANY": 10}
+"""Types that a server without them has as arrays of bytes, with their sizes."""
+_CHARACTERS: Final = frozenset({"BYTE", "USINT", "CHAR"})
+_DTL: Final = struct.Struct("<HBBBBBBI")
+_DTL_THERE: Final = struct.Struct(">HBBBBBBI")
+_DEFAULTS: Final = {
+    "BOOL": ua.BOOLEAN, "BYTE": ua.BYTE, "USINT": ua.BYTE, "SINT": ua.SBYTE, "WORD": ua.UINT16, "UINT": ua.UINT16,
+    "INT": ua.INT16, "DWORD": ua.UINT32, "UDINT": ua.UINT32, "DINT": ua.INT32, "LWORD": ua.UINT64, "ULINT": ua.UINT64,
+    "LINT": ua.INT64, "REAL": ua.FLOAT, "LREAL": ua.DOUBLE, "TIME": ua.INT32, "LTIME": ua.INT64,
+    "TIME_OF_DAY": ua.UINT32, "LTOD": ua.UINT64, "STRING": ua.STRING, "WSTRING": ua.STRING, "LDT": ua.DATE_TIME,
+}  # fmt: skip
+"""The type of a node that has shown no value yet; none where servers differ."""
+
+
+class MismatchError(ValueError):
+    """The type of a node does not fit its register."""
+
+
+class Fitting:
+    """Converts between the values of a node and those of its register."""
+
+    def __init__(self, register: Register) -> None:
+        self._register = register
+        self._base = register.element.base
+        self._kind = -1
+        self._element: Callable[[Any], Scalar] | None = None
+        self._raw = scalar_codec(register.element, "big") if self._base != "BOOL" else None
+
+    def value(self, sample: Sample) -> Value:
+        """Return the register's value for a sample.
+
+        Raises:
+            MismatchError: The type does not fit.
+            ValueRangeError: The register cannot hold the value.
+
+        """
+        register = self._register
+        kind, found, dims = sample.kind, sample.value, sample.dims
+        if kind != self._kind:
+            self._kind, self._element = kind, self._converter(kind)
+        if not register.dims and dims is None and self._element is not None:
+            return self._element(found)
+        if kind == ua.BYTE_STRING and self._base in _CHARACTERS and register.dims:
+            kind, found, dims = ua.BYTE, list(found), (len(found),)
+            element = self._converter(ua.BYTE)
+        elif self._base in _OF_BYTES and (kind == ua.BYTE_STRING or (kind == ua.BYTE and dims is not None)):
+            found, dims = self._groups(bytes(found), dims)
+            element = self._bytes
+            if not register.dims and len(found) == 1:
+                return element(found[0])
+        else:
+            element = self._element
+        if element is None or (dims is None) == bool(register.dims):
+            raise MismatchError(f"the node is {_named(sample)}, which does not fit {_type(register)}")
+        if len(found) != register.count or (dims and len(dims) > 1 and dims != register.shape):
+            raise MismatchError(f"the node is {_named(sample)}, but the register is {_type(register)}")
+        return nest([element(one) for one in found], register.shape) if register.dims else element(found[0])
+
+    def _groups(self, data: bytes, dims: tuple[int, ...] | None) -> tuple[list[bytes], tuple[int, ...] | None]:
+        """Split bytes into elements; return them with the dimensions that are left."""
+        size = _OF_BYTES[self._base]
+        if len(data) % size:
+            raise MismatchError(f"the node has {len(data)} bytes, which does not fit {_type(self._register)}")
+        return [data[at : at + size] for at in range(0, len(data), size)], (dims or ())[:-1] or (len(data) // size,)
+
+    def _bytes(self, data: bytes) -> Scalar:
+        return self._decoded(data)
+
+    def _decoded(self, data: bytes) -> Scalar:
+        """Return the value of an element's bytes as a controller has them."""
+        assert self._raw is not None  # noqa: S101 - for the type checker
+        value = self._raw.decode(data, 0)
+        if value is None:
+            raise ValueRangeError(f"{self._base}: {data.hex()} is no valid value")
+        return value
+
+    def _converter(self, kind: int) -> Callable[[Any], Scalar] | None:
+        """Return the function for elements of a node's type; None if that does not fit."""
+        base, scale = self._base, self._register.scale
+        if base == "BOOL":
+            return bool if kind == ua.BOOLEAN else None
+        if base in INTEGERS or base in ("REAL", "LREAL"):
+            whole = base in INTEGERS
+            if kind not in _NUMBERS or (whole and kind in _FLOATS and scale is None):
+                return None
+            if scale is None:
+                return _same
+            factor, offset = scale
+            return (lambda number: _rounded(number * factor + offset)) if whole else (
+                lambda number: float(number * factor + offset)
+            )  # fmt: skip
+        if base in ("TIME", "LTIME", "TIME_OF_DAY", "LTOD", "S5TIME"):
+            if base == "S5TIME" and kind == ua.UINT16:  # the controller's own format
+                return lambda word: self._decoded(word.to_bytes(2, "big"))
+            if kind in _INTEGERS:
+                return _same
+            return _rounded if kind in _FLOATS and base == "TIME" else None
+        if base in ("STRING", "WSTRING"):
+            return str if kind in _TEXTS else None
+        if base in ("CHAR", "WCHAR"):
+            if kind == ua.STRING:
+                return str
+            return chr if kind == (ua.BYTE if base == "CHAR" else ua.UINT16) else None
+        if kind == ua.STRING:
+            return str
+        if kind == ua.DATE_TIME and base in ("DATE", "DATE_AND_TIME", "LDT", "DTL"):
+            return self._moment
+        if base == "DATE" and kind == ua.UINT16:
+            return lambda days: calendar.format_day(calendar.DATE_EPOCH_DAYS + days)
+        if base == "DTL" and kind == ua.EXTENSION:
+            return self._dtl
+        return None
+
+    def _moment(self, ns: int) -> str:
+        if ns < 0 or ns > calendar.LAST_NS:
+            raise ValueRangeError(f"{self._base}: the time is before 1970 or after 2262")
+        if self._base == "DATE":
+            return calendar.format_day(ns // calendar.NS_PER_DAY)
+        return calendar.format_moment(ns, 3 if self._base == "DATE_AND_TIME" else 9)
+
+    def _dtl(self, found: Extension) -> Scalar:
+        if len(found.body) != _DTL.size:
+            raise MismatchError(f"the node is a structure of {len(found.body)} bytes, a DTL has {_DTL.size}")
+        return self._decoded(_DTL_THERE.pack(*_DTL.unpack(found.body)))
+
+    # -- writing -------------------------------------------------------------------------------------------------------
+
+    def sample(self, value: Value, like: Sample | None) -> Sample:
+        """Return a whole value of the register as the node takes it.
+
+        Args:
+            value: The value.
+            like: The last value that the node has shown; None if there is none.
+
+        Raises:
+            ValueError: The node cannot hold the value, or its type is unknown.
+
+        """
+        register = self._register
+        flat: list[Any] = list(flatten(value, register.shape, register.path)) if register.dims else [value]
+        kind = like.kind if like is not None and like.kind else _DEFAULTS.get(self._base, 0)
+        if not kind:
+            raise ValueError(f"the node has shown no value yet, so that its type for a {register.type} is unknown")
+        if self._base in _OF_BYTES and kind in (ua.BYTE, ua.BYTE_STRING):
+            data = b"".join(self._encoded(one) for one in flat)
+            dims = None if kind == ua.BYTE_STRING else (len(data),) if not register.dims else (*register.shape, 8)
+            return Sample(kind, data if kind == ua.BYTE_STRING else list(data), dims, 0, 0)
+        if kind == ua.BYTE_STRING and self._base in _CHARACTERS:
+            return Sample(kind, b"".join(self._encoded(one) for one in flat), None, 0, 0)
+        there = [self._there(one, kind, like) for one in flat]
+        return Sample(kind, there if register.dims else there[0], register.shape if register.dims else None, 0, 0)
+
+    def elements(self, values: list[Any], like: Sample | None) -> Sample:
+        """Return consecutive elements of an array as the node takes them; ValueError."""
+        kind = like.kind if like is not None and like.kind else _DEFAULTS.get(self._base, 0)
+        if not kind or kind == ua.BYTE_STRING or self._base in _OF_BYTES:
+            raise ValueError("the node has no single elements: write the whole array")
+        return Sample(kind, [self._there(one, kind, like) for one in values], (len(values),), 0, 0)
+
+    def _encoded(self, value: Any) -> bytes:
+        assert self._raw is not None  # noqa: S101 - for the type checker
+        return self._raw.encode(value)
+
+    def _there(self, value: Any, kind: int, like: Sample | None) -> Any:
+        """Return an element as a node of this type takes it."""
+        base, scale = self._base, self._register.scale
+        if kind == ua.BOOLEAN and base == "BOOL":
+            return bool(value)
+        if base == "S5TIME" and kind == ua.UINT16:
+            return int.from_bytes(self._encoded(value), "big")
+        if (base == "CHAR" and kind == ua.BYTE) or (base == "WCHAR" and kind == ua.UINT16):
+            return ord(value)
+        if base == "DATE" and kind == ua.UINT16:
+            return (calendar.parse_moment(value) or 0) // calendar.NS_PER_DAY - calendar.DATE_EPOCH_DAYS
+        if base == "DTL" and kind == ua.EXTENSION and like is not None:
+            known = like.value[0] if isinstance(like.value, list) else like.value
+            return Extension(known.encoding, _DTL.pack(*_DTL_THERE.unpack(self._encoded(value))))
+        if kind == ua.DATE_TIME and isinstance(value, str) and (ns := calendar.parse_moment(value)) is not None:
+            if ns % 1000:
+                raise ValueError(f"{value} is more precise than the microseconds that can be written")
+            return ns
+        if kind in (ua.STRING, ua.LOCALIZED_TEXT) and isinstance(value, str):
+            return value
+        if kind not in _NUMBERS or not isinstance(value, int | float) or isinstance(value, bool):
+            raise ValueError(f"a {self._register.type} cannot be written to a node of type {ua.NAMES[kind]}")
+        number = value if scale is None else (value - scale[1]) / scale[0]
+        return float(number) if kind in _FLOATS else _whole(number, kind)
+
+
+def _same(value: Any) -> Scalar:
+    return value
+
+
+def _rounded(number: float) -> Scalar:
+    if not math.isfinite(number):
+        raise ValueRangeError(f"{number} is no whole number")
+    return round(number)
+
+
+def _whole(number: float, kind: int) -> int:
+    bits = _INTEGERS[kind]
+    least, most = (0, (1 << bits) - 1) if kind in _UNSIGNED else (-(1 << bits - 1), (1 << bits - 1) - 1)
+    if not math.isfinite(number) or not least <= round(number) <= most:
+        raise ValueError(f"{number} does not fit the node's {ua.NAMES[kind]}")
+    return round(number)
+
+
+def _named(sample: Sample) -> str:
+    name = ua.NAMES[sample.kind] if sample.kind < len(ua.NAMES) else f"type {sample.kind}"
+    return name if sample.dims is None else f"{name}[{','.join(map(str, sample.dims))}]"
+
+
+def _type(register: Register) -> str:
+    return register.type + (f"[{','.join(map(str, register.shape))}]" if register.dims else "")
+
+
+def bits_of_elements(register: Register) -> Iterator[tuple[int, int]]:
+    """Yield (first byte, number of bytes) of each element of an array of anything but BOOL."""
+    for place in range(register.count):
+        yield register.offset + place * register.element.stride, register.element.size

@@ -1,0 +1,88 @@
+"""The common conformance suites, run with the OPC UA connector against a server made with asyncua."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import pytest
+
+from shmio.connectors.base import Connector
+from shmio.connectors.opcua.connector import OpcUaConnector
+from shmio.connectors.opcua.options import OpcUaOptions
+from shmio.layout.model import Layout
+from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import codec
+from shmio.segment import Write
+from shmio.testing.conformance import Run
+from shmio.testing.proxy import FaultProxy
+from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
+from tests.unit.connectors.opcua.device import Device, framing
+
+WORDS = 50
+
+
+def layout() -> Layout:
+    tags: dict[str, object] = {"counted": {"type": f"ARRAY[1..{WORDS}] OF UDINT", "address": "ns=2;s=counted"}}
+    tags |= {f"spare/{place}": {"type": "BYTE", "address": f"ns=2;s=spare{place}"} for place in range(SPARE)}
+    tags["fixed"] = {"type": "UINT", "address": "/Objects/2:Device/2:fixed"}
+    return place_tags("device", tags).with_statuses()
+
+
+class OpcUaRig:
+    """The server behind a proxy."""
+
+    def __init__(self, proxy: FaultProxy, mode: Literal["subscribe", "poll"]) -> None:
+        self.proxy = proxy
+        self.layout = layout()
+        self._mode = mode
+        by_path = {register.path: register for register in self.layout.registers}
+        self._counted = codec(by_path["counted"], "little")
+        self.spare = by_path["spare/0"].offset
+        self.flags = self.spare
+        self.refused = Write(by_path["fixed"].offset, 0, b"\1\0")
+
+    def connector(self) -> Connector:
+        options = OpcUaOptions(
+            url=f"opc.tcp://{self.proxy.address}", timeout=200, mode=self._mode, sampling_ms=5, publishing_ms=10
+        )
+        return OpcUaConnector(options, self.layout)
+
+    def generation(self, raw: bytes) -> int:
+        counted = self._counted.decode(raw)
+        assert isinstance(counted, list)
+        numbers = {one for one in counted if isinstance(one, int)}
+        assert len(numbers) == 1, "an array with elements of different moments"
+        return numbers.pop()
+
+
+@pytest.fixture(scope="module")
+def device() -> Iterator[Device]:
+    with Device() as device:
+        device.ask("add", "counted", "UInt32", [0] * WORDS)
+        device.ask("add", "fixed", "UInt16", 7, False)
+        for place in range(SPARE):
+            device.ask("add", f"spare{place}", "Byte", 0)
+        device.ask("count", "counted", WORDS, 0.004)
+        yield device
+
+
+class TestOpcUa(WriteConformance):
+    @pytest.fixture(params=["subscribe", "poll"])
+    def rig(self, request: pytest.FixtureRequest, device: Device) -> Iterator[OpcUaRig]:
+        for place in range(SPARE):
+            device.ask("set", f"spare{place}", "Byte", 0)
+        with FaultProxy(device.address, framing=framing) as proxy:
+            yield OpcUaRig(proxy, request.param)
+
+    def test_several_writes_in_one_command(self, run: Run, writer: Writer, rig: WriteRig) -> None:
+        """A command for several nodes has an outcome for each of them."""
+        frame = writer.written(Write(rig.spare, 0, b"ab"), Write(rig.spare + 4, 0, b"\x42"))
+        assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
+
+    def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
+        """OPC UA has no bits of a number: the write is refused, and changes nothing."""
+        writer.written(Write(rig.spare, 0, b"\x0f"))
+        end = writer.write(Write(rig.spare, 1, b"\0"))
+        assert "write the whole register" in end.text
+        assert run.good().raw[rig.spare] == 0x0F

@@ -1,0 +1,127 @@
+"""An OPC UA server made with asyncua, as a program: it takes commands on standard input, a JSON list a line.
+
+Usage: server.py PORT [CERTIFICATE KEY]; with a certificate it has accounts, and an encrypted endpoint alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from asyncua import Server, ua
+from asyncua.crypto.permission_rules import User, UserRole
+
+PASSWORD = "secret password"
+
+
+class Accounts:
+    """One account."""
+
+    def get_user(self, _server: Any, username: str = "", password: str = "", certificate: Any = None) -> User | None:
+        return User(UserRole.User, name=username) if (username, password) == ("operator", PASSWORD) else None
+
+
+class Device:
+    """The nodes and what happens to them."""
+
+    def __init__(self, server: Server) -> None:
+        self.server = server
+        self.counting: asyncio.Task[None] | None = None
+
+    def node(self, name: str) -> Any:
+        return self.server.get_node(ua.NodeId(name, 2))
+
+    async def add(self, name: str, kind: str, value: Any, writable: bool = True) -> None:
+        """Add a variable below Objects/2:Device."""
+        parent = self.node("Device")
+        variant = _variant(kind, value)
+        made = await parent.add_variable(ua.NodeId(name, 2), f"2:{name}", variant)
+        if writable:
+            await made.set_writable()
+
+    async def set(self, name: str, kind: str, value: Any, code: int = 0, source_s: float = 0) -> None:
+        data = ua.DataValue(_variant(kind, value), ua.StatusCode(code))
+        if source_s:
+            data.SourceTimestamp = ua.datetime.fromtimestamp(source_s, ua.timezone.utc)
+        await self.node(name).write_value(data)
+
+    async def get(self, name: str) -> Any:
+        return await self.node(name).read_value()
+
+    async def remove(self, name: str) -> None:
+        await self.server.delete_nodes([self.node(name)])
+
+    async def count(self, name: str, size: int, period_s: float) -> None:
+        """Count up in all elements of an array."""
+
+        async def run() -> None:
+            number = 0
+            while True:
+                number += 1
+                await self.node(name).write_value(ua.Variant([number] * size, ua.VariantType.UInt32))
+                await asyncio.sleep(period_s)
+
+        self.counting = asyncio.create_task(run())
+
+    async def clients(self) -> int:
+        """Return the number of sessions of clients."""
+        return len(self.server.iserver._external_sessions)
+
+
+def _variant(kind: str, value: Any) -> ua.Variant:
+    variant = ua.VariantType[kind]
+    if kind == "ExtensionObject":
+        value = ua.ExtensionObject(ua.NodeId("encoding", 2), bytes.fromhex(value))
+    if kind == "ByteString":
+        value = bytes.fromhex(value)
+    if kind == "LocalizedText":
+        value = ua.LocalizedText(value)
+    if kind == "DateTime":
+        value = ua.datetime.fromisoformat(value)
+    if kind == "Guid":
+        value = ua.uuid.UUID(value)
+    return ua.Variant(value, variant, is_array=isinstance(value, list))
+
+
+def answer(result: Any) -> None:
+    sys.stdout.write(json.dumps(result, default=str) + "\n")
+    sys.stdout.flush()
+
+
+async def main(port: str, certificate: str = "", key: str = "") -> None:
+    secured = bool(certificate)
+    server = Server(user_manager=Accounts() if secured else None)
+    await server.init()
+    server.set_endpoint(f"opc.tcp://127.0.0.1:{port}")
+    await server.set_application_uri("urn:test:server")
+    if secured:
+        server.set_security_policy([
+            ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt, ua.SecurityPolicyType.Aes256Sha256RsaPss_Sign,
+        ])  # fmt: skip
+        await server.load_certificate(Path(certificate))
+        await server.load_private_key(Path(key))
+        server.set_identity_tokens([ua.UserNameIdentityToken])
+    else:
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    await server.register_namespace("http://test/device")
+    await server.nodes.objects.add_object(ua.NodeId("Device", 2), "2:Device")
+    device = Device(server)
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    async with server:
+        answer("ready")
+        while line := await reader.readline():
+            name, *given = json.loads(line)
+            try:
+                answer(await getattr(device, name)(*given))
+            except Exception as error:  # noqa: BLE001
+                answer(f"failed: {error!r}")
+        if device.counting is not None:
+            device.counting.cancel()
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))
