@@ -496,6 +496,7 @@ class _Link(threading.Thread):
     async def _first_values(self, sessions: Sequence[Session], lost: Sequence[asyncio.Future[Any]]) -> None:
         """Wait until each node has shown a value, or as long as an answer may take."""
         if self._options.mode == "poll":
+            await self._guarded(self.poll)
             return
         end_s = self._loop.time() + self._options.timeout / 1000
         while any(one.waiting for one in sessions) and self._loop.time() < end_s and not self._stopping.is_set():

@@ -38,7 +38,8 @@ class Device:
         """Add a variable below Objects/2:Device."""
         parent = self.node("Device")
         variant = _variant(kind, value)
-        made = await parent.add_variable(ua.NodeId(name, 2), f"2:{name}", variant)
+        of_type = ua.NodeId(22) if kind == "ExtensionObject" else None
+        made = await parent.add_variable(ua.NodeId(name, 2), f"2:{name}", variant, None, of_type)
         if writable:
             await made.set_writable()
 
@@ -65,6 +66,10 @@ class Device:
                 await asyncio.sleep(period_s)
 
         self.counting = asyncio.create_task(run())
+
+    async def state(self, number: int) -> None:
+        """Change the server's state."""
+        await self.server.get_node(ua.NodeId(2259, 0)).write_value(ua.Variant(number, ua.VariantType.Int32))
 
     async def clients(self) -> int:
         """Return the number of sessions of clients."""

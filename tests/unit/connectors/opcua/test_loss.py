@@ -1,0 +1,227 @@
+"""Servers that die, hang or send anything but OPC UA: the source notices within its time-outs."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+
+import pytest
+
+from shmio.connectors.base import Lost, WriteLostError
+from shmio.errors import ConnectorError
+from shmio.layout.values.write import Write
+from shmio.testing.proxy import FaultProxy
+from tests.unit.connectors.opcua.device import Device, framing
+from tests.unit.connectors.opcua.harness import PATIENCE_S, Source, connected, until
+
+TIMEOUT_MS = 300
+MODES = pytest.mark.parametrize("mode", ["subscribe", "poll"])
+TAGS = {"count": "UDINT"}
+
+
+def lost(source: Source) -> str:
+    """Wait until there is no image any more; return the reason."""
+    found: list[str] = []
+
+    def fails() -> bool:
+        try:
+            source.connector.read()
+        except ConnectorError as error:
+            found.append(str(error))
+        return bool(found)
+
+    until(fails, "the loss")
+    return found[0]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def nodes(device: Device) -> None:
+    device.ask("add", "count", "UInt32", 7)
+
+
+@MODES
+def test_a_frozen_server_is_noticed_and_found_again(device: Device, mode: str) -> None:
+    with connected(device.url, TAGS, timeout=TIMEOUT_MS, mode=mode) as source:
+        assert source.value("count") == 7
+        device.freeze()
+        try:
+            begun = time.monotonic()
+            assert "no answer within" in lost(source)
+            assert time.monotonic() - begun < 10 * TIMEOUT_MS / 1000
+            with pytest.raises(ConnectorError, match="no answer within"):
+                source.connector.connect()
+        finally:
+            device.thaw()
+        source.connector.close()
+        source.connector.connect()
+        assert source.value("count") == 7
+
+
+def test_a_killed_server_is_noticed_and_found_again() -> None:
+    with Device() as device, ExitStack() as stack:
+        device.ask("add", "count", "UInt32", 7)
+        sources = [
+            stack.enter_context(connected(device.url, TAGS, timeout=TIMEOUT_MS, mode=mode))
+            for mode in ("subscribe", "poll")
+        ]
+        assert [source.value("count") for source in sources] == [7, 7]
+        device.kill()
+        for source in sources:
+            lost(source)
+            with pytest.raises(ConnectorError, match="connection refused"):
+                source.connector.connect()
+        device.restart()
+        device.ask("add", "count", "UInt32", 8)
+        for source in sources:
+            source.connector.connect()
+            assert source.value("count") == 8
+
+
+def test_a_lost_publication_ends_the_session(device: Device) -> None:
+    """The server's messages are numbered; without one of them, values may be missing."""
+    with (
+        FaultProxy(device.address, framing=framing) as proxy,
+        connected(f"opc.tcp://{proxy.address}", TAGS) as source,
+    ):
+        proxy.edit(lambda frame: None, frames=1)
+        device.ask("set", "count", "UInt32", 9)
+        assert lost(source)
+    device.ask("set", "count", "UInt32", 7)
+
+
+def test_writes_without_a_connection_are_unsent(device: Device) -> None:
+    source = Source(device.url, TAGS)
+    with pytest.raises(WriteLostError) as raised:
+        source.connector.write([Write(0, 0, bytes(4))])
+    assert raised.value.outcomes == (Lost.UNSENT,)
+
+
+def test_threads_end(device: Device) -> None:
+    before = threading.active_count()
+    for _ in range(5):
+        with connected(device.url, TAGS) as source:
+            source.connector.read()
+    until(lambda: threading.active_count() <= before, "the end of the threads")
+
+
+# -- hostile peers -----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def peer(behave: Callable[[socket.socket], None]) -> Iterator[str]:
+    """Listen, and treat each client like this."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            while True:
+                try:
+                    client, _ = listener.accept()
+                except OSError:
+                    return
+                with client, suppress(OSError):
+                    client.settimeout(PATIENCE_S)
+                    behave(client)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"opc.tcp://127.0.0.1:{listener.getsockname()[1]}"
+        listener.shutdown(socket.SHUT_RDWR)
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+
+
+def silence(client: socket.socket) -> None:
+    while client.recv(65536):
+        pass
+
+
+def sends(data: bytes) -> Callable[[socket.socket], None]:
+    def behave(client: socket.socket) -> None:
+        client.recv(65536)
+        client.sendall(data)
+        silence(client)
+
+    return behave
+
+
+def endless(data: bytes) -> Callable[[socket.socket], None]:
+    def behave(client: socket.socket) -> None:
+        client.recv(65536)
+        while True:
+            client.sendall(data)
+
+    return behave
+
+
+def trickle(client: socket.socket) -> None:
+    never = threading.Event()
+    client.recv(65536)
+    for byte in b"ACKF\x1c\0\0\0" * 1000:
+        client.sendall(bytes([byte]))
+        never.wait(0.05)
+
+
+ACK = b"ACKF" + struct.pack("<IIIIII", 28, 0, 65535, 65535, 0, 0)
+HOSTILE = {
+    "silence": silence,
+    "closes at once": lambda client: None,
+    "HTTP": sends(b"HTTP/1.1 400 Bad Request\r\n\r\n"),
+    "zeros": sends(bytes(4096)),
+    "ones": sends(b"\xff" * 4096),
+    "a huge chunk": endless(b"ACKF" + struct.pack("<I", 0xFFFFFFF0) + bytes(1 << 16)),
+    "a tiny chunk": sends(b"ACKF" + struct.pack("<I", 0)),
+    "an error": sends(b"ERRF" + struct.pack("<IIi", 16, 0x80830000, -1)),
+    "acknowledges without end": endless(ACK),
+    "no bytes allowed": sends(b"ACKF" + struct.pack("<IIIIII", 28, 0, 1, 1, 1, 1)),
+    "a trickle": trickle,
+    "acknowledge, then chunks without end": endless(
+        ACK + b"MSGC" + struct.pack("<IIIII", 65000, 0, 0, 1, 1) + bytes(65000 - 24)
+    ),
+}
+
+
+@pytest.mark.parametrize("behave", HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_peer_is_refused_in_time_and_costs_little(behave: Callable[[socket.socket], None]) -> None:
+    with peer(behave) as url:
+        source = Source(url, TAGS, timeout=TIMEOUT_MS)
+        tracemalloc.start()
+        try:
+            begun = time.monotonic()
+            with pytest.raises(ConnectorError) as raised:
+                source.connector.connect()
+            assert time.monotonic() - begun < source.connector.timeout_s + 5
+            assert str(raised.value)
+            assert tracemalloc.get_traced_memory()[1] < 64 << 20
+        finally:
+            tracemalloc.stop()
+            source.connector.close()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_damaged_answers_never_become_values(device: Device, seed: int) -> None:
+    """A byte of each of the server's chunks is changed; what is read is right, or nothing is."""
+    from random import Random
+
+    random = Random(seed)
+
+    def damage(frame: bytes) -> bytes:
+        at = random.randrange(8, len(frame))
+        return frame[:at] + bytes([frame[at] ^ (1 << random.randrange(8))]) + frame[at + 1 :]
+
+    with FaultProxy(device.address, framing=framing) as proxy:
+        source = Source(f"opc.tcp://{proxy.address}", TAGS, timeout=TIMEOUT_MS)
+        proxy.edit(damage)
+        with suppress(ConnectorError):
+            source.connector.connect()
+            for _ in range(20):
+                source.connector.read()
+        source.connector.close()
+        proxy.pass_all()
+        source.connector.connect()
+        assert source.value("count") == 7
+        source.connector.close()

@@ -1,0 +1,49 @@
+// Serves the nodes that a file describes, as an S7-1500 names them; prints its port, and ends with its standard input.
+// Usage: node opcua_server.js PORT FOLDER NODES.json; a node is {"id", "type", "value", "writable"}.
+'use strict';
+
+const fs = require('fs');
+const opcua = require('node-opcua-server');
+const { DataType, MessageSecurityMode, SecurityPolicy, VariantArrayType } = require('node-opcua-client');
+const { OPCUACertificateManager } = require('node-opcua-certificate-manager');
+
+const [port, folder, file] = process.argv.slice(2);
+
+async function main() {
+  const certificates = new OPCUACertificateManager({ rootFolder: folder, automaticallyAcceptUnknownCertificate: true });
+  await certificates.initialize();
+  const server = new opcua.OPCUAServer({
+    port: Number(port),
+    hostname: '127.0.0.1',
+    securityModes: [MessageSecurityMode.None],
+    securityPolicies: [SecurityPolicy.None],
+    serverCertificateManager: certificates,
+    disableDiscovery: true,
+  });
+  await server.initialize();
+  const space = server.engine.addressSpace;
+  space.registerNamespace('http://test/other');
+  const names = space.registerNamespace('http://www.siemens.com/simatic-s7-opcua');
+  const device = names.addObject({ organizedBy: space.rootFolder.objects, browseName: 'PLC', nodeId: 's=PLC' });
+  for (const { id, type, value, writable } of JSON.parse(fs.readFileSync(file))) {
+    const dataType = DataType[type];
+    const array = Array.isArray(value) && type !== 'Int64'; // one is [high, low]
+    const held = type === 'DateTime' ? new Date(value) : value;
+    const variant = { dataType, arrayType: array ? VariantArrayType.Array : VariantArrayType.Scalar, value: held };
+    names.addVariable({
+      componentOf: device, browseName: id, nodeId: `s=${id}`, dataType,
+      valueRank: array ? 1 : -1, arrayDimensions: array ? [value.length] : undefined,
+      accessLevel: writable ? 'CurrentRead | CurrentWrite' : 'CurrentRead',
+      value: variant,
+    });
+  }
+  await server.start();
+  console.log(JSON.stringify({ port: Number(port), index: names.index }));
+  process.stdin.resume();
+  process.stdin.on('end', async () => {
+    await server.shutdown(0);
+    process.exit(0);
+  });
+}
+
+main().catch((error) => { console.error(error); process.exit(1); });
