@@ -8,6 +8,7 @@ import importlib.util
 import logging
 import threading
 import time
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar
@@ -29,6 +30,7 @@ from shmio.model.statuses import (
     BAD_NODE_ID_UNKNOWN,
     BAD_OUT_OF_RANGE,
     BAD_TYPE_MISMATCH,
+    BAD_WAITING_FOR_INITIAL_DATA,
     describe,
     quality_of,
 )
@@ -117,7 +119,7 @@ class OpcUaConnector(Connector):
         with self._lock:
             self._latest.clear()
             for index in range(len(self._addresses)):
-                self._image.fail(index, BAD_NO_DATA)
+                self._image.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
         self._reported.clear()
         link = self._link = _Link(self._options, self._credentials, self._addresses, self._deadbands(), self._deliver)
         link.start()
@@ -207,6 +209,7 @@ class OpcUaConnector(Connector):
         link = self._link
         if link is None or not link.ready:
             raise WriteLostError(f"not connected to {self._options.peer}", [Lost.UNSENT] * len(writes))
+        deadline_ns = time.monotonic_ns() + round(self.timeout_s * 1e9)
         outcomes: list[str | Lost] = [""] * len(writes)
         steps: list[_NodeWrite] = []
         for number, write in enumerate(writes):
@@ -215,34 +218,37 @@ class OpcUaConnector(Connector):
             except ValueError as error:
                 outcomes[number] = str(error)
         try:
-            self._refuse_ranges(link, steps, outcomes)
+            self._refuse_ranges(link, steps, outcomes, deadline_ns)
         except ConnectorError as error:
             raise WriteLostError(str(error), [one or Lost.UNSENT for one in outcomes]) from None
         steps = [step for step in steps if outcomes[step.write] == ""]
-        deadline_ns = time.monotonic_ns() + round(self.timeout_s * 1e9)
         begun = link.confirmed = 0
         try:
             for batch in _batches(steps, link.per_write):
                 if time.monotonic_ns() > deadline_ns:
                     raise ConnectorError(f"{self._options.peer} takes too long for the writes of a cycle: write less")
                 begun += len(batch)
-                codes = link.call(lambda batch=batch: link.write(batch))  # type: ignore[misc]
+                codes = link.call(lambda batch=batch: link.write(batch), deadline_ns)  # type: ignore[misc]
                 for step, code in zip(batch, codes, strict=True):
                     if quality_of(code) is Quality.BAD:
                         path = self._layout.registers[step.item.index].path
                         outcomes[step.write] = f"{path}: the server refuses it: {describe(code)}"
             if steps:
                 touched = list({step.item.index: step.item for step in steps}.values())
-                link.call(lambda: link.read_back(touched))
+                link.call(lambda: link.read_back(touched), deadline_ns)
         except ConnectorError as error:
             self._mark_lost(outcomes, steps, begun, link)
             raise WriteLostError(str(error), outcomes) from None
         return [str(outcome) for outcome in outcomes]
 
-    def _refuse_ranges(self, link: _Link, steps: Sequence[_NodeWrite], outcomes: list[str | Lost]) -> None:
+    def _refuse_ranges(
+        self, link: _Link, steps: Sequence[_NodeWrite], outcomes: list[str | Lost], deadline_ns: int
+    ) -> None:
         """Refuse writes of elements that the server would not take as such."""
         for step in steps:
-            if step.elements is not None and not link.call(lambda step=step: link.has_ranges(step)):  # type: ignore[misc]
+            if step.elements is None:
+                continue
+            if not link.call(lambda step=step: link.has_ranges(step), deadline_ns):  # type: ignore[misc]
                 path = self._layout.registers[step.item.index].path
                 outcomes[step.write] = f"{path}: the server does not write single elements: write the whole array"
 
@@ -318,11 +324,11 @@ def _credentials(options: OpcUaOptions) -> Credentials:
     return Credentials(uri, (certificate, key), password)
 
 
-def _overlapping(layout: Layout, write: Write) -> Iterator[int]:
-    stop = write.offset + len(write.data)
-    for index, register in enumerate(layout.registers):
-        if register.offset < stop and write.offset < register.offset + register.size:
-            yield index
+def _overlapping(layout: Layout, write: Write) -> range:
+    """Return the indices of the registers that share a byte with a write."""
+    registers, stop = layout.registers, write.offset + len(write.data)
+    first = bisect_right(registers, write.offset, key=lambda register: register.offset + register.size)
+    return range(first, bisect_left(registers, stop, key=lambda register: register.offset))
 
 
 def _elements(register: Register, share: bytes) -> tuple[int, int]:
@@ -415,8 +421,12 @@ class _Link(threading.Thread):
             if reason := one.check():
                 raise ConnectorError(reason)
 
-    def call(self, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:
+    def call(self, work: Callable[[], Coroutine[Any, Any, _Result]], deadline_ns: int | None = None) -> _Result:
         """Run a coroutine in the loop, and wait for its result.
+
+        Args:
+            work: Creates the coroutine.
+            deadline_ns: When to stop waiting, ns of CLOCK_MONOTONIC; the time-out of a hook by default.
 
         Raises:
             ConnectorError: The session is lost, or does not answer.
@@ -425,6 +435,8 @@ class _Link(threading.Thread):
         if self._failure is not None:
             raise self._failure
         limit_s = CONNECT_TIMEOUTS * self._options.timeout / 1000
+        if deadline_ns is not None:
+            limit_s = max(0.0, (deadline_ns - time.monotonic_ns()) / 1e9)
         future = asyncio.run_coroutine_threadsafe(self._guarded(work), self._loop)
         try:
             return future.result(limit_s)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import ipaddress
+import logging
 import re
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,6 +29,8 @@ MAX_FILES: Final = 1000
 MAX_REJECTED: Final = 100
 _SUFFIXES: Final = frozenset({".der", ".cer", ".crt", ".pem"})
 _MIN_KEY_BITS: Final = 2048
+
+log = logging.getLogger("shmio.source")
 
 
 def read_identity(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.RSAPrivateKey]:
@@ -106,6 +109,7 @@ def _reject(certificate: x509.Certificate, data: bytes, trusted: Path) -> str:
             if sum(1 for _ in rejected.iterdir()) >= MAX_REJECTED:
                 return f"{text}; it cannot be stored, because {rejected} has {MAX_REJECTED} files: delete old ones"
             file.write_bytes(data)
+            log.warning("%s; if it is the right one: mv '%s' '%s/'", text, file, trusted)  # a reason may be cut off
     except OSError as error:
         return f"{text}, and cannot be stored in {rejected}: {error.strerror}"
     return f"{text}; if it is the right one: mv '{file}' '{trusted}/'"

@@ -15,10 +15,7 @@ from shmio.errors import ConnectorError
 ITEM_OK = 0xFF
 ACCESS_DENIED, OUT_OF_RANGE, NO_SUCH_TYPE, OTHER_SIZE, NO_SUCH_OBJECT = 0x03, 0x05, 0x06, 0x07, 0x0A
 
-_NO_OPTIMIZED = (
-    "clear 'Optimized block access' in the block's attributes, compile and load, or read it with connector = \"opcua\" "
-    'and nodes = "siemens"'
-)
+_NO_OPTIMIZED = "clear 'Optimized block access' of the block, compile and load, or read it by OPC UA"
 _ACCESS_DENIED = (
     "access denied {where}: enable 'Permit access with PUT/GET communication' and 'Full access' in the CPU's "
     f"protection settings; if they are, {_NO_OPTIMIZED}"

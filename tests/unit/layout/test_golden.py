@@ -53,4 +53,4 @@ def test_db201_as_printed() -> None:
     assert [warning.line for warning in spaced] == [7, 11, 12, 13, 14, 15, 29, 30]
     (optimized,) = set(compiled.warnings) - set(spaced)
     assert "Optimized block access" in optimized.message
-    assert "OPC UA" not in optimized.message, "shmio does not read by OPC UA"
+    assert 'connector = "opcua"' in optimized.message
