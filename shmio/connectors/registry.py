@@ -26,6 +26,7 @@ BUILT_IN = {
     "modbus": "shmio.connectors.modbus.connector:ModbusConnector",
     "opcua": "shmio.connectors.opcua.connector:OpcUaConnector",
     "remote": "shmio.connectors.models.remote:Remote",
+    "rosbridge": "shmio.connectors.ros.rosbridge:RosbridgeConnector",
     "replay": "shmio.connectors.replay.source:Replay",
     "simulation": "shmio.connectors.models.simulation:Simulation",
     "s7": "shmio.connectors.s7.connector:S7Connector",

@@ -1,0 +1,173 @@
+"""Addresses of fields: ``TOPIC TYPE FIELD``, such as ``/joint_states sensor_msgs/JointState position[name=j1]``.
+
+A field is a path of names with dots. Behind the name of a sequence, ``[2]`` is its third element,
+and ``[name=j1]`` the element at the place where the sequence ``name`` has ``j1``. The sequence with
+the names is in the same message as the other, or in one that contains it. A sequence without
+brackets at the end of a path is a whole array.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, TYPE, plain
+from shmio.model.statuses import BAD_INDEX_RANGE_NO_DATA, BAD_NOT_FOUND, BAD_TYPE_MISMATCH
+
+MAX_STEPS: Final = 8
+EXAMPLE: Final = "expected TOPIC TYPE FIELD, such as /joint_states sensor_msgs/JointState position[name=joint_1]"
+_TOPIC: Final = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+")
+_STEP: Final = re.compile(
+    r"(?P<name>[A-Za-z][A-Za-z0-9_]*)"
+    r"(?:\[(?:(?P<index>[0-9]{1,5})|(?P<key>[A-Za-z][A-Za-z0-9_]*)=(?P<value>[^\[\]]{1,256}))\])?(?:\.(?=.)|$)"
+)
+
+
+class FieldError(Exception):
+    """A message has no such field, or not now; ``code`` is the status of the register."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+
+
+class Step(NamedTuple):
+    """A field's name, and which element of the sequence is meant.
+
+    ``place`` is its index; ``key`` is (sequence of names, name). A step has at most one of them.
+    """
+
+    name: str
+    place: int | None = None
+    key: tuple[str, str] | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether the step chooses no element."""
+        return self.place is None and self.key is None
+
+
+class Address(NamedTuple):
+    """A field of a topic's messages.
+
+    Attributes:
+        topic: The topic's full name.
+        type: The messages' type as given.
+        steps: The path of the field.
+        text: The path as text, for messages.
+
+    """
+
+    topic: str
+    type: str
+    steps: tuple[Step, ...]
+    text: str
+
+
+def parse(text: str) -> Address:
+    """Read an address.
+
+    Raises:
+        ValueError: It is no address; the message says what one looks like.
+
+    """
+    parts = text.split(None, 2)
+    if len(parts) != 3:
+        raise ValueError(f"{text!r} is no address; {EXAMPLE}" if parts else f"its `address` is missing; {EXAMPLE}")
+    topic, kind, field = parts[0], parts[1], parts[2].strip()
+    if not _TOPIC.fullmatch(topic) or len(topic) > 256:
+        raise ValueError(f"{topic!r} is no topic: write its full name, such as /joint_states")
+    if not TYPE.fullmatch(kind):
+        raise ValueError(f"{kind!r} is no message type: write such as sensor_msgs/JointState")
+    return Address(topic, kind, _steps(field), field)
+
+
+def _steps(field: str) -> tuple[Step, ...]:
+    steps: list[Step] = []
+    at = 0
+    while at < len(field):
+        found = _STEP.match(field, at)
+        if found is None:
+            raise ValueError(
+                f"{field!r}: this field is wrong from character {at + 1} on; write such as pose.position.x, "
+                "position[0] or position[name=joint_1]"
+            )
+        index = None if found["index"] is None else int(found["index"])
+        steps.append(Step(found["name"], index, (found["key"], found["value"]) if found["key"] else None))
+        at = found.end()
+    if not 1 <= len(steps) <= MAX_STEPS:
+        raise ValueError(f"{field[:40]!r}…: expected 1 to {MAX_STEPS} names in a field")
+    return tuple(steps)
+
+
+def leaf_type(address: Address) -> str:
+    """Return the type of an address's field, with ``[]`` for a whole sequence.
+
+    Raises:
+        KeyError: The message type is unknown.
+        ValueError: The type has no such field.
+
+    """
+    kind = plain(address.type)
+    scopes: list[str] = []
+    if kind not in DEFINITIONS:
+        raise KeyError(kind)
+    for step in address.steps:
+        if kind in PRIMITIVES or kind.endswith("[]"):
+            what = f"a {kind}" if kind in PRIMITIVES else "a sequence: choose an element, as in [0]"
+            raise ValueError(f"{address.text}: what {step.name!r} is looked up in is {what}")
+        fields = DEFINITIONS[kind]
+        if step.name not in fields:
+            raise ValueError(f"{address.text}: {kind} has no field {step.name!r}; it has {', '.join(fields)}")
+        scopes.append(kind)
+        kind = fields[step.name]
+        if step.whole:
+            continue
+        if not kind.endswith("[]"):
+            raise ValueError(f"{address.text}: {step.name!r} is a {kind} and not a sequence: leave out the brackets")
+        if step.key and not any(DEFINITIONS[scope].get(step.key[0]) == "string[]" for scope in scopes):
+            raise ValueError(f"{address.text}: {scopes[-1]} has no sequence of names {step.key[0]!r}")
+        kind = kind[:-2]
+    if kind.removesuffix("[]") not in PRIMITIVES:
+        inside = ", ".join(DEFINITIONS[kind.removesuffix("[]")])
+        raise ValueError(f"{address.text} is a {kind}, not a value: name one of its fields: {inside}")
+    return kind
+
+
+def extract(message: Any, address: Address) -> Any:
+    """Return the value of an address's field in a message.
+
+    Raises:
+        FieldError: The message does not have it.
+
+    """
+    scopes: list[Any] = []
+    found = message
+    for step in address.steps:
+        if not isinstance(found, dict) or step.name not in found:
+            raise FieldError(BAD_NOT_FOUND, f"{address.text}: the message has no field {step.name!r}")
+        scopes.append(found)
+        found = found[step.name]
+        if step.whole:
+            continue
+        if not isinstance(found, list):
+            raise FieldError(BAD_TYPE_MISMATCH, f"{address.text}: {step.name!r} is not a sequence")
+        index = step.place if step.place is not None else place_of(scopes, step, address)
+        if index >= len(found):
+            raise FieldError(BAD_INDEX_RANGE_NO_DATA, f"{address.text}: {step.name!r} is shorter")
+        found = found[index]
+    return found
+
+
+def place_of(scopes: Sequence[Any], step: Step, address: Address) -> int:
+    """Return the index that a step with a name means, given the messages around it; FieldError."""
+    assert step.key is not None  # noqa: S101 - for the type checker
+    sequence, name = step.key
+    for scope in reversed(scopes):
+        names = scope.get(sequence)
+        if isinstance(names, list):
+            if name not in names:
+                raise FieldError(BAD_NOT_FOUND, f"{address.text}: {sequence!r} does not have {name!r}")
+            return names.index(name)
+    raise FieldError(BAD_NOT_FOUND, f"{address.text}: the message has no sequence {sequence!r}")

@@ -1,0 +1,211 @@
+"""Turns writes of registers into messages, with all fields of a message together.
+
+A message takes the fields that are not written from the last message of its topic. Without one, a
+command must write all registers of the topic at once, so that no field is made up.
+"""
+
+from __future__ import annotations
+
+import copy
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from shmio.connectors.ros.addresses import Address, FieldError, extract, place_of
+from shmio.connectors.ros.messages import DEFINITIONS, conforms, default, plain
+from shmio.connectors.ros.topics import Topic, Topics
+from shmio.errors import ValueRangeError
+from shmio.layout.model import Register, bit_positions
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.write import Write, apply, bits_of
+from shmio.model.statuses import BAD_NO_DATA
+
+_MISSING: Final = object()
+"""An element of a sequence that no register gives."""
+
+
+class Publication:
+    """A message to publish, and the writes that it carries out."""
+
+    def __init__(self, topic: Topic) -> None:
+        self.topic = topic
+        self.message: Any = None
+        self.writes: set[int] = set()
+        self.values: dict[int, Value] = {}
+        self.refusal = ""
+
+
+def plan(topics: Topics, writes: Sequence[Write]) -> tuple[list[Publication], list[str]]:
+    """Turn writes into messages.
+
+    Returns:
+        The messages in their order, and for each write "" or why it is refused. A write that is
+        refused is part of no message.
+
+    """
+    drafts: list[Publication] = []
+    outcomes = [""] * len(writes)
+    open_drafts: dict[str, Publication] = {}
+    for number, write in enumerate(writes):
+        try:
+            found = list(_touched(topics, write, open_drafts))
+        except ValueError as error:
+            outcomes[number] = str(error)
+            continue
+        for index, value in found:
+            topic = topics.by_name[topics.addresses[index].topic]
+            draft = open_drafts.get(topic.name)
+            if draft is None or index in draft.values:  # both values of a pulse are published
+                draft = open_drafts[topic.name] = Publication(topic)
+                drafts.append(draft)
+            draft.values[index] = value
+            draft.writes.add(number)
+    while True:
+        bases = {draft.topic.name: draft.topic.message for draft in drafts}
+        for draft in drafts:
+            try:
+                draft.message = bases[draft.topic.name] = _message(topics, draft, bases[draft.topic.name])
+            except ValueError as error:
+                draft.refusal = str(error)
+                break
+        else:
+            return drafts, outcomes
+        for number in draft.writes:
+            outcomes[number] = outcomes[number] or draft.refusal
+        drafts = [one for one in drafts if not any(outcomes[number] for number in one.writes)]
+
+
+def _touched(topics: Topics, write: Write, open_drafts: Mapping[str, Publication]) -> Iterator[tuple[int, Value]]:
+    """Yield the registers that a write sets, with their values; ValueError."""
+    layout, touched = topics.layout, False
+    covered, image = bytearray(layout.size), bytearray(layout.size)
+    apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
+    registers, stop = layout.registers, write.offset + len(write.data)
+    first = bisect_right(registers, write.offset, key=lambda register: register.offset + register.size)
+    for index in range(first, bisect_left(registers, stop, key=lambda register: register.offset)):
+        register = registers[index]
+        wanted = bits_of(register)
+        there = covered[register.offset : register.offset + register.size]
+        share = bytes(a & b for a, b in zip(there, wanted, strict=True))
+        if not any(share):
+            continue
+        touched = True
+        topic = topics.by_name[topics.addresses[index].topic]
+        if not topic.writable or topics.fittings[index].kind is None:
+            raise ValueError(f"{register.path}: to publish on {topic.name}, set `writable = true` in the tag table")
+        if share != wanted:
+            if not _whole_elements(register, share):
+                raise ValueError(f"{register.path}: a message has no parts of a value: write the whole register")
+            codec(register, layout.byte_order).encode_into(_present(topics, index, topic, open_drafts), image)
+        apply(write, image)
+        yield index, codec(register, layout.byte_order).decode(image)
+    if not touched:
+        raise ValueError("no register of the layout is there")
+
+
+def _present(topics: Topics, index: int, topic: Topic, open_drafts: Mapping[str, Publication]) -> Value:
+    """Return the present value of an array of which elements are written; ValueError."""
+    draft = open_drafts.get(topic.name)
+    if draft is not None and index in draft.values:
+        return draft.values[index]
+    try:
+        return topics.fittings[index].value(extract(topic.message, topics.addresses[index]))
+    except (FieldError, ValueRangeError):
+        path = topics.layout.registers[index].path
+        raise ValueError(f"{path}: the last message does not have the other elements: write the whole array") from None
+
+
+def _whole_elements(register: Register, share: bytes) -> bool:
+    """Return whether these bits of a register are whole elements of an array."""
+    if not register.dims:
+        return False
+    if register.type == "BOOL":
+        own = bytearray(len(share))
+        for at, bit in bit_positions(register):
+            own[at] |= 1 << bit
+        return any(a & b for a, b in zip(own, share, strict=True))
+    size, stride = register.element.size, register.element.stride
+    parts = (share[place * stride : place * stride + size] for place in range(register.count))
+    return all(part in (bytes(size), b"\xff" * size) for part in parts)
+
+
+def _message(topics: Topics, draft: Publication, base: Any) -> Any:
+    """Return the message of a publication.
+
+    Raises:
+        ValueError: It cannot be expressed.
+
+    """
+    topic, layout = draft.topic, topics.layout
+    kind = plain(topic.type)
+    fields = {}
+    for index in topic.registers:
+        if index in draft.values:
+            try:
+                fields[index] = topics.fittings[index].field(draft.values[index])
+            except ValueError as error:
+                raise ValueError(f"{layout.registers[index].path}: {error}") from None
+    missing = [layout.registers[index].path for index in topic.registers if index not in fields]
+    if base is not None and conforms(base, kind):
+        message = copy.deepcopy(base)
+        try:
+            for index, value in fields.items():
+                _assign(message, kind, topics.addresses[index], value, grow=False)
+            return message
+        except FieldError as error:
+            if missing:
+                raise ValueError(f"the last message of {topic.name} does not fit: {error}") from None
+    if missing:
+        shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
+        raise ValueError(
+            f"there was no complete message on {topic.name} yet: write all its registers in one command, also {shown}"
+        )
+    message = default(kind)
+    try:
+        for index, value in fields.items():
+            _assign(message, kind, topics.addresses[index], value, grow=True)
+    except FieldError as error:
+        raise ValueError(str(error)) from None
+    named = {address.steps[-1] for address in map(topics.addresses.__getitem__, fields) if address.steps[-1].key}
+    if not conforms(message, kind) or not all(_full(message, step.name, step.key[0]) for step in named if step.key):
+        raise ValueError(f"the registers of {topic.name} leave elements of a sequence without a value")
+    return message
+
+
+def _full(message: Any, name: str, sequence: str) -> bool:
+    """Return whether a sequence at the top of a message is as long as that of its names."""
+    if name not in message or sequence not in message:
+        return True
+    return len(message[name]) == len(message[sequence])
+
+
+def _assign(message: Any, kind: str, address: Address, value: Any, *, grow: bool) -> None:
+    """Set a field; ``grow`` lengthens sequences, and adds names. FieldError if it is not there."""
+    scopes: list[Any] = []
+    found = message
+    for step in address.steps:
+        scopes.append(found)
+        kind = DEFINITIONS[kind][step.name]
+        last = step is address.steps[-1]
+        if step.whole:
+            if last:
+                found[step.name] = value
+                return
+            found = found[step.name]
+            continue
+        kind, sequence = kind[:-2], found[step.name]
+        if step.key and grow:
+            names = next(scope[step.key[0]] for scope in reversed(scopes) if step.key[0] in scope)
+            if step.key[1] not in names:
+                names.append(step.key[1])
+        index = step.place if step.place is not None else place_of(scopes, step, address)
+        if index >= len(sequence):
+            if not grow:
+                raise FieldError(BAD_NO_DATA, f"{address.text}: {step.name!r} is shorter")
+            sequence.extend([_MISSING] * (index + 1 - len(sequence)))
+        if last:
+            sequence[index] = value
+            return
+        if sequence[index] is _MISSING:
+            sequence[index] = default(kind)
+        found = sequence[index]

@@ -1,0 +1,184 @@
+"""The connector ``rosbridge``: subscribes to topics of a rosbridge server, and publishes commands."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import time
+from collections.abc import Sequence
+from typing import Annotated, Any, Final
+from urllib.parse import urlsplit
+
+import msgspec
+
+from shmio.config import Address
+from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.ros.commands import Publication, plan
+from shmio.connectors.ros.messages import finite
+from shmio.connectors.ros.options import TopicOptions
+from shmio.connectors.ros.topics import Topics
+from shmio.connectors.ros.websocket import Link, decode
+from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.model import Layout
+from shmio.layout.values.write import Write
+
+DEFAULT_PORT: Final = 9090
+FIRST_S: Final = 0.2
+"""How long a new connection waits for the first messages."""
+
+
+class RosbridgeOptions(TopicOptions, frozen=True, kw_only=True):
+    """Address of the server, and how to read it; ValueError for a wrong URL."""
+
+    url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
+    max_message_bytes: Annotated[int, msgspec.Meta(ge=1000, le=1 << 26)] = 1 << 20
+    """The largest message that is accepted."""
+    throttle_ms: Annotated[int, msgspec.Meta(ge=0, le=3_600_000)] = 0
+    """The shortest time between two messages of a topic that the server sends."""
+
+    def __post_init__(self) -> None:
+        parts = urlsplit(self.url)
+        try:
+            port = parts.port
+        except ValueError:
+            port = 0
+        if parts.scheme != "ws" or not parts.hostname or port == 0 or "@" in parts.netloc:
+            raise ValueError(f"url: expected ws://HOST:PORT, found {self.url!r}")
+
+    @property
+    def address(self) -> Address:
+        """Host and port of the server."""
+        parts = urlsplit(self.url)
+        return Address(parts.hostname or "", parts.port or DEFAULT_PORT)
+
+    @property
+    def full_url(self) -> str:
+        """The URL with its port."""
+        parts = urlsplit(self.url)
+        return self.url if parts.port else parts._replace(netloc=f"{parts.netloc}:{DEFAULT_PORT}").geturl()
+
+
+class RosbridgeConnector(Connector):
+    """Reads fields of topics through a rosbridge server, and publishes commands."""
+
+    Options = RosbridgeOptions
+    can_write = True
+    register_quality = True
+
+    def __init__(self, options: RosbridgeOptions, layout: Layout) -> None:
+        if importlib.util.find_spec("websockets") is None:
+            raise ConfigError("connector: rosbridge needs another library: pip install 'shmio[rosbridge]'")
+        self._options = options
+        self._topics = Topics(layout, options, known_types=False)
+        self._numbers = itertools.count(1)
+        self._link: Link | None = None
+
+    @property
+    def timeout_s(self) -> float:
+        """The longest time that any hook blocks, in s."""
+        return 3 * self._options.timeout / 1000
+
+    def describe(self) -> str:
+        """Return the peer and what is read, for the log."""
+        return f"to {self._options.address}, {len(self._topics.by_name)} topics by rosbridge"
+
+    def connect(self) -> None:
+        """Open the connection, and subscribe to all topics.
+
+        Raises:
+            ConnectorError: The server cannot be reached.
+
+        """
+        self.close()
+        self._topics.reset()
+        options = self._options
+        link = self._link = Link(options.full_url, options.address, options.timeout / 1000, options.max_message_bytes)
+        try:
+            for topic in self._topics.by_name.values():
+                link.send(
+                    op="subscribe", id=f"subscribe:{topic.name}", topic=topic.name, type=topic.type, queue_length=1,
+                    throttle_rate=options.throttle_ms,
+                )  # fmt: skip
+                if topic.writable:
+                    link.send(op="advertise", id=f"advertise:{topic.name}", topic=topic.name, type=topic.type)
+            link.wait_newest(set(self._topics.by_name), time.monotonic() + min(FIRST_S, options.timeout / 1000))
+            link.check()
+        except ConnectorError:
+            self.close()
+            raise
+
+    def read(self) -> bytes:
+        """Return the image of the newest messages, if the server is certainly alive.
+
+        Raises:
+            ConnectorError: The connection is lost, or the server is silent.
+
+        """
+        link = self._link
+        if link is None:
+            raise ConnectorError(f"not connected to {self._options.address}")
+        link.check()
+        self._pull(link)
+        return self._topics.image(time.monotonic_ns())
+
+    def _pull(self, link: Link) -> None:
+        for name, received in link.newest().items():
+            self._topics.take(name, decode(received.json), received.monotonic_ns, received.utc_ns)
+
+    def close(self) -> None:
+        """Close the connection. It may be called at any time and more than once."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Publish messages, each confirmed when the server sends it back.
+
+        Raises:
+            WriteLostError: The server did not send a message back, or the connection was lost.
+
+        """
+        link = self._link
+        if link is None:
+            raise WriteLostError(f"not connected to {self._options.address}", [Lost.UNSENT] * len(writes))
+        self._pull(link)
+        publications, refusals = plan(self._topics, writes)
+        outcomes: list[str | Lost] = list(refusals)
+        until_s = time.monotonic() + self._options.timeout / 1000
+        for place, publication in enumerate(publications):
+            try:
+                link.check()
+                refusal = self._publish(link, publication, until_s)
+            except ConnectorError as error:
+                _mark_lost(outcomes, publications, place)
+                raise WriteLostError(str(error), outcomes) from None
+            for number in publication.writes:
+                outcomes[number] = outcomes[number] or refusal
+        return [str(outcome) for outcome in outcomes]
+
+    def _publish(self, link: Link, publication: Publication, until_s: float) -> str:
+        message, topic = publication.message, publication.topic
+        if not finite(message):
+            return "JSON has neither NaN nor infinity: write a finite number"
+        return link.publish(topic.name, self._stampless(message, publication), f"write:{next(self._numbers)}", until_s)
+
+    def _stampless(self, message: Any, publication: Publication) -> Any:
+        """Return the message without its stamp, which the server then sets, unless a register has it."""
+        addresses = (self._topics.addresses[index] for index in publication.topic.registers)
+        stamped = any(len(one.steps) > 1 and one.steps[0].name == "header" and one.steps[1].name == "stamp"
+                      for one in addresses)  # fmt: skip
+        if "header" not in message or stamped:
+            return message
+        return message | {"header": {name: one for name, one in message["header"].items() if name != "stamp"}}
+
+
+def _mark_lost(outcomes: list[str | Lost], publications: Sequence[Publication], place: int) -> None:
+    """Mark the writes without an answer; the message at ``place`` may have been published."""
+    done = {number for publication in publications[:place] for number in publication.writes}
+    for number in publications[place].writes:
+        if outcomes[number] == "":
+            outcomes[number] = Lost.UNKNOWN
+    for publication in publications[place + 1 :]:
+        for number in publication.writes:
+            if outcomes[number] == "":
+                outcomes[number] = Lost.UNKNOWN if number in done else Lost.UNSENT

@@ -1,0 +1,195 @@
+"""The topics of a layout: the last message of each, and the image that they give."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from typing import Any, Final
+
+from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.ros.addresses import Address, FieldError, extract, leaf_type, parse
+from shmio.connectors.ros.messages import plain
+from shmio.connectors.ros.options import TopicOptions
+from shmio.connectors.ros.values import Fitting
+from shmio.errors import ConfigError, ConnectorError, ValueRangeError
+from shmio.layout.model import Layout
+from shmio.model.statuses import (
+    BAD_DECODING_ERROR,
+    BAD_OUT_OF_RANGE,
+    BAD_TIMEOUT,
+    BAD_WAITING_FOR_INITIAL_DATA,
+    GOOD,
+)
+
+MAX_REPORTED: Final = 20
+"""Faults of a connection that are reported by name."""
+MAX_SEC: Final = 1 << 33
+
+log = logging.getLogger("shmio.source")
+
+
+class Topic:
+    """A topic, the registers with its fields, and its last message."""
+
+    def __init__(self, name: str, kind: str) -> None:
+        self.name, self.type = name, kind
+        self.registers: list[int] = []
+        self.writable = False
+        self.latched = False
+        self.message: Any = None
+        """The last message; None before the first, and after one that cannot be read."""
+        self.received_ns = 0
+        """When it was received, ns of CLOCK_MONOTONIC; 0: never."""
+        self.utc_ns = 0
+        self.fault = GOOD
+        """Why the topic has no good values at present; GOOD if there is no reason."""
+        self.changed = False
+        self.shown = GOOD
+        """The fault that the image shows."""
+
+    def reset(self) -> None:
+        """Forget the last message."""
+        self.message, self.received_ns, self.utc_ns, self.fault = None, 0, 0, GOOD
+        self.changed, self.shown = False, GOOD
+
+
+class Topics:
+    """All topics of a layout."""
+
+    def __init__(self, layout: Layout, options: TopicOptions, *, known_types: bool) -> None:
+        """Read the addresses of a layout.
+
+        Args:
+            layout: The layout of the source's block.
+            options: What counts as a good value.
+            known_types: Whether only the types of ``messages.py`` can be read.
+
+        Raises:
+            ConfigError: An address is wrong, or does not fit its register.
+
+        """
+        self.layout = layout
+        self.by_name: dict[str, Topic] = {}
+        self.addresses: list[Address] = []
+        self.fittings: list[Fitting] = []
+        self._max_age_ns = options.max_age * 1_000_000
+        self._stamps = options.time == "stamp"
+        self._image = RegisterImage(layout) if layout.status_offset is not None else None
+        self._reported: set[tuple[int, str]] = set()
+        for index in range(len(layout.registers)):
+            self._add(index, known_types)
+        for name in options.latched:
+            if name not in self.by_name:
+                raise ConfigError(f"latched: no register has the topic {name!r}")
+            self.by_name[name].latched = True
+
+    def _add(self, index: int, known_types: bool) -> None:
+        register = self.layout.registers[index]
+        try:
+            address = parse(register.address)
+            try:
+                kind = leaf_type(address)
+            except KeyError as error:
+                if known_types or register.writable:
+                    what = "be read" if known_types else "be written; shmio reads it if writable is left out"
+                    raise ValueError(f"the message type {error.args[0]} is not one of those that can {what}") from None
+                kind = None
+            topic = self.by_name.setdefault(address.topic, Topic(address.topic, address.type))
+            if plain(topic.type) != plain(address.type):
+                raise ValueError(f"another register says that {topic.name} is a {topic.type}, not a {address.type}")
+            self.fittings.append(Fitting(register, kind))
+        except ValueError as error:
+            raise ConfigError(f"layout: {register.path}: {error}") from None
+        self.addresses.append(address)
+        topic.registers.append(index)
+        topic.writable = topic.writable or register.writable
+
+    def reset(self) -> None:
+        """Forget all messages; all registers wait again."""
+        self._reported.clear()
+        for topic in self.by_name.values():
+            topic.reset()
+            self._fail(topic, BAD_WAITING_FOR_INITIAL_DATA)
+
+    def take(self, name: str, message: Any, received_ns: int, utc_ns: int) -> None:
+        """Take the newest message of a topic; None if one came that cannot be read."""
+        topic = self.by_name.get(name)
+        if topic is None:
+            return
+        topic.message, topic.received_ns, topic.utc_ns = message, received_ns, utc_ns
+        topic.changed = True
+
+    def image(self, now_ns: int) -> bytes:
+        """Return the image of the last messages.
+
+        Args:
+            now_ns: The time of CLOCK_MONOTONIC in ns.
+
+        """
+        if self._image is None:
+            raise ConnectorError("the layout has no status area")
+        for topic in self.by_name.values():
+            fault = topic.fault or self._fault(topic, now_ns)
+            if fault != GOOD:
+                if topic.shown != fault:
+                    self._fail(topic, fault)
+            elif topic.changed or topic.shown != GOOD:
+                self._put(self._image, topic)
+            topic.changed = False
+        return bytes(self._image)
+
+    def _fault(self, topic: Topic, now_ns: int) -> int:
+        if not topic.received_ns:
+            return BAD_WAITING_FOR_INITIAL_DATA
+        if topic.message is None:
+            return BAD_DECODING_ERROR
+        if self._max_age_ns and not topic.latched and not topic.writable:
+            return BAD_TIMEOUT if now_ns - topic.received_ns > self._max_age_ns else GOOD
+        return GOOD
+
+    def _fail(self, topic: Topic, code: int) -> None:
+        topic.shown = code
+        if self._image is not None:
+            for index in topic.registers:
+                self._image.fail(index, code, self._source_ns(topic))
+
+    def _put(self, image: RegisterImage, topic: Topic) -> None:
+        topic.shown = GOOD
+        source_ns = self._source_ns(topic)
+        for index in topic.registers:
+            try:
+                image.put(index, self.fittings[index].value(extract(topic.message, self.addresses[index])), source_ns)
+            except FieldError as error:
+                image.fail(index, error.code, source_ns)
+                self.report(index, str(error))
+            except (ValueRangeError, OverflowError):
+                image.fail(index, BAD_OUT_OF_RANGE, source_ns)
+
+    def _source_ns(self, topic: Topic) -> int:
+        return (stamp_ns(topic.message) if self._stamps else 0) or topic.utc_ns
+
+    def report(self, index: int, what: str) -> None:
+        """Log a fault of a register once for each connection, the first ones by name."""
+        if len(self._reported) > MAX_REPORTED or (index, what) in self._reported:
+            return
+        self._reported.add((index, what))
+        if len(self._reported) <= MAX_REPORTED:
+            log.warning("%s: %s", self.layout.registers[index].path, what)
+        else:
+            log.warning("more registers are bad: shmio get shows all")
+
+    def waiting(self) -> Iterable[str]:
+        """Yield the topics without a message."""
+        return (topic.name for topic in self.by_name.values() if not topic.received_ns)
+
+
+def stamp_ns(message: Any) -> int:
+    """Return the time in a message's header, ns since 1970; 0 if there is none."""
+    header = message.get("header") if isinstance(message, dict) else None
+    stamp = header.get("stamp") if isinstance(header, dict) else None
+    if not isinstance(stamp, dict):
+        return 0
+    sec, nanosec = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs"))
+    if type(sec) is not int or type(nanosec) is not int or not (0 <= sec < MAX_SEC and 0 <= nanosec < 10**9):
+        return 0
+    return sec * 10**9 + nanosec

@@ -1,0 +1,263 @@
+"""A connection of the rosbridge protocol: JSON over a WebSocket, received in a thread of its own.
+
+The protocol is rosbridge v2: ROSBRIDGE_PROTOCOL.md of rosbridge_suite.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import struct
+import threading
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
+
+from shmio.config import Address
+from shmio.errors import ConnectorError
+from shmio.logs import printable
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+CLOSE_S: Final = 0.2
+MAX_REPORTED: Final = 20
+_SEND_TIMEOUT: Final = struct.Struct("@ll")
+
+log = logging.getLogger("shmio.source")
+
+
+class Received(NamedTuple):
+    """The newest message of a topic, as JSON."""
+
+    json: msgspec.Raw
+    monotonic_ns: int
+    utc_ns: int
+
+
+class _Envelope(msgspec.Struct):
+    """What all operations have; ``msg`` is a message, or the text of a status."""
+
+    op: str
+    topic: str = ""
+    id: str | int | None = None
+    level: str = ""
+    msg: msgspec.Raw = msgspec.Raw(b"null")
+
+
+_envelope = msgspec.json.Decoder(_Envelope)
+
+
+class Link:
+    """A connection to a rosbridge server."""
+
+    def __init__(self, url: str, peer: Address, timeout_s: float, max_bytes: int) -> None:
+        """Connect.
+
+        Raises:
+            ConnectorError: The server cannot be reached, or is no WebSocket.
+
+        """
+        from websockets.exceptions import WebSocketException  # noqa: PLC0415  the library is optional
+        from websockets.sync.client import connect  # noqa: PLC0415
+
+        self._peer, self._timeout_s = peer, timeout_s
+        self._closed_errors = (WebSocketException, OSError)
+        self._condition = threading.Condition()
+        self._newest: dict[str, Received] = {}
+        self._expected: tuple[str, str, Any] | None = None  # (topic, id, message)
+        self._outcome: str | None = None
+        self._failure = ""
+        self._reported = 0
+        self._pong: threading.Event | None = None
+        self._pinged_ns = self.heard_ns = time.monotonic_ns()
+        try:
+            channel = socket.create_connection((peer.host, peer.port), timeout_s)
+        except TimeoutError:
+            raise ConnectorError(f"no answer within {timeout_s * 1000:.0f} ms from {peer}") from None
+        except OSError as error:
+            raise ConnectorError(f"cannot connect to {peer}: {error.strerror or error}") from None
+        try:
+            channel.settimeout(None)  # the thread waits for ever, and a send as long as the option below says
+            channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            whole, part = divmod(timeout_s, 1)
+            channel.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT.pack(int(whole), int(part * 1e6)))
+            self._socket: ClientConnection = connect(
+                url, sock=channel, open_timeout=timeout_s, close_timeout=CLOSE_S, max_size=max_bytes, max_queue=64,
+                ping_interval=None, compression=None, proxy=None, user_agent_header="shmio",
+            )  # fmt: skip
+        except TimeoutError:
+            channel.close()
+            raise ConnectorError(f"no answer within {timeout_s * 1000:.0f} ms from {peer}") from None
+        except self._closed_errors as error:
+            channel.close()
+            raise ConnectorError(f"{peer} did not open a WebSocket: {printable(str(error))[:200]}") from None
+        self._thread = threading.Thread(target=self._receive, name="rosbridge", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Close the connection."""
+        with contextlib.suppress(*self._closed_errors):
+            self._socket.close()
+        self._socket.close_socket()
+        self._thread.join(CLOSE_S)
+
+    def send(self, **message: Any) -> None:
+        """Send an operation; ConnectorError."""
+        try:
+            self._socket.send(msgspec.json.encode(message).decode())
+        except self._closed_errors as error:
+            raise ConnectorError(self._failure or f"the connection to {self._peer} was lost: {_why(error)}") from None
+
+    def newest(self) -> Mapping[str, Received]:
+        """Return what has been received since the last call."""
+        with self._condition:
+            found, self._newest = self._newest, {}
+        return found
+
+    def wait_newest(self, topics: set[str], until_s: float) -> None:
+        """Wait until all topics have a message, at most until a time of CLOCK_MONOTONIC in s."""
+        with self._condition:
+            self._condition.wait_for(
+                lambda: self._failure or topics <= self._newest.keys(), max(0.0, until_s - time.monotonic())
+            )
+
+    def check(self) -> None:
+        """Raise ConnectorError if the connection is lost, or the server is silent."""
+        if self._failure:
+            raise ConnectorError(self._failure)
+        now_ns, timeout_ns = time.monotonic_ns(), round(self._timeout_s * 1e9)
+        if self._pong is not None:
+            if self._pong.is_set():
+                self.heard_ns, self._pong = max(self.heard_ns, self._pinged_ns), None
+            elif now_ns - self._pinged_ns > timeout_ns:
+                raise ConnectorError(f"no answer within {self._timeout_s * 1000:.0f} ms from {self._peer}")
+        elif now_ns - max(self.heard_ns, self._pinged_ns) > timeout_ns // 2:
+            try:
+                self._pong, self._pinged_ns = self._socket.ping(), now_ns
+            except self._closed_errors as error:
+                raise ConnectorError(f"the connection to {self._peer} was lost: {_why(error)}") from None
+
+    # -- confirmation --------------------------------------------------------------------------------------------------
+
+    def publish(self, topic: str, message: Any, number: str, until_s: float) -> str:
+        """Publish a message, and wait until the server sends it back to this subscriber.
+
+        Args:
+            topic: The topic.
+            message: The message.
+            number: The id of the operation.
+            until_s: When to stop waiting, s of CLOCK_MONOTONIC.
+
+        Returns:
+            "" or why the server refused it.
+
+        Raises:
+            ConnectorError: Nothing is known of the message.
+
+        """
+        with self._condition:
+            self._expected, self._outcome = (topic, number, message), None
+        try:
+            self.send(op="publish", id=number, topic=topic, msg=message)
+            return self._await_outcome(topic, until_s)
+        finally:
+            with self._condition:
+                self._expected = None
+
+    def _await_outcome(self, topic: str, until_s: float) -> str:
+        with self._condition:
+            self._condition.wait_for(
+                lambda: self._outcome is not None or self._failure, max(0.0, until_s - time.monotonic())
+            )
+            if self._outcome is not None:
+                return self._outcome
+        raise ConnectorError(
+            self._failure or f"no answer from {self._peer}: it did not send back what was published on {topic}"
+        )
+
+    def _receive(self) -> None:
+        """Receive until the connection ends; runs in the thread."""
+        failure = f"{self._peer} closed the connection"
+        try:
+            for data in self._socket:
+                if isinstance(data, bytes):
+                    raise ConnectorError(f"{self._peer} sent a binary message, which was not asked for")
+                self._take(data)
+        except ConnectorError as error:
+            failure = str(error)
+        except self._closed_errors as error:
+            failure = f"the connection to {self._peer} was lost: {_why(error)}"
+        except Exception:
+            log.exception("a message of %s could not be handled", self._peer)
+            failure = f"a message of {self._peer} could not be handled: see the log"
+        with self._condition:
+            self._failure = failure
+            self._condition.notify_all()
+        self._socket.close_socket()
+
+    def _take(self, text: str) -> None:
+        try:
+            envelope = _envelope.decode(text)
+        except (msgspec.MsgspecError, RecursionError, UnicodeEncodeError):
+            raise ConnectorError(f"{self._peer} sent a message that is not of the rosbridge protocol") from None
+        self.heard_ns = time.monotonic_ns()
+        if envelope.op == "publish":
+            self._take_message(envelope)
+        elif envelope.op == "status":
+            self._take_status(envelope)
+
+    def _take_message(self, envelope: _Envelope) -> None:
+        json = envelope.msg.copy()
+        with self._condition:
+            self._newest[envelope.topic] = Received(json, self.heard_ns, time.time_ns())
+            if self._expected is not None and self._expected[0] == envelope.topic:
+                message = decode(json)
+                if message is not None and _contains(message, self._expected[2]):
+                    self._outcome, self._expected = "", None
+            self._condition.notify_all()
+
+    def _take_status(self, envelope: _Envelope) -> None:
+        found = decode(envelope.msg)
+        text = printable(found if isinstance(found, str) else "")[:300]
+        with self._condition:
+            if envelope.level == "error" and self._expected is not None and self._expected[1] == envelope.id:
+                self._outcome, self._expected = (
+                    f"the server refuses it: {text}" if text else "the server refuses it",
+                    None,
+                )
+                self._condition.notify_all()
+                return
+        self._reported += 1
+        if envelope.level in ("error", "warning") and self._reported <= MAX_REPORTED:
+            log.warning("%s reports: %s", self._peer, text)
+
+
+def decode(json: msgspec.Raw) -> Any:
+    """Return a message of JSON; None if it is wrong, or is no message."""
+    try:
+        return msgspec.json.decode(json)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+        return None
+
+
+def _contains(found: Any, expected: Any) -> bool:
+    """Return whether a message has all fields of the one that was published, and their values."""
+    if isinstance(expected, dict):
+        return isinstance(found, dict) and all(
+            name in found and _contains(found[name], value) for name, value in expected.items()
+        )
+    if isinstance(expected, list):
+        return (
+            isinstance(found, list)
+            and len(found) == len(expected)
+            and all(_contains(one, other) for one, other in zip(found, expected, strict=True))
+        )
+    return bool(found == expected)
+
+
+def _why(error: BaseException) -> str:
+    return printable(str(error))[:200] or type(error).__name__

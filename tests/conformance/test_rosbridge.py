@@ -1,0 +1,91 @@
+"""The common conformance suites, run with the rosbridge connector against a server made with Node's ws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from shmio.connectors.base import Connector
+from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
+from shmio.layout.model import Layout
+from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import codec
+from shmio.segment import Write
+from shmio.testing.conformance import Rig, Run
+from shmio.testing.proxy import FaultProxy
+from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
+from tests.unit.connectors.ros.bridge import Bridge, framing
+
+COUNTS = 20
+ARRAY = {"layout": {"dim": [], "data_offset": 0}}
+
+
+def layout() -> Layout:
+    tags: dict[str, object] = {
+        "counted": {"type": f"ARRAY[1..{COUNTS}] OF LREAL", "address": "/counted std_msgs/Float64MultiArray data"}
+    }
+    tags |= {
+        f"spare/{at}": {"type": "BYTE", "address": f"/spare std_msgs/Int16MultiArray data[{at}]", "writable": True}
+        for at in range(SPARE)
+    }
+    tags["fixed"] = {"type": "INT", "address": "/fixed std_msgs/msg/Int16 data", "writable": True}
+    return place_tags("device", tags).with_statuses()
+
+
+class RosbridgeRig:
+    """The server behind a proxy."""
+
+    def __init__(self, proxy: FaultProxy) -> None:
+        self.proxy = proxy
+        self.layout = layout()
+        by_path = {register.path: register for register in self.layout.registers}
+        self._counted = codec(by_path["counted"], "little")
+        self.spare = self.flags = by_path["spare/0"].offset
+        self.refused = Write(by_path["fixed"].offset, 0, b"\1\0")
+
+    def connector(self) -> Connector:
+        return RosbridgeConnector(RosbridgeOptions(url=f"ws://{self.proxy.address}", timeout=200), self.layout)
+
+    def generation(self, raw: bytes) -> int:
+        counted = self._counted.decode(raw)
+        assert isinstance(counted, list)
+        numbers = {one for one in counted if isinstance(one, float)}
+        assert len(numbers) == 1, "an array with elements of different moments"
+        return int(numbers.pop())
+
+
+@pytest.fixture(scope="module")
+def bridge() -> Iterator[Bridge]:
+    with Bridge() as bridge:
+        bridge.ask("refuse", "/fixed", "it is fixed")
+        bridge.ask("count", "/counted", COUNTS, 4)
+        yield bridge
+
+
+class TestRosbridge(WriteConformance):
+    @pytest.fixture
+    def rig(self, bridge: Bridge) -> Iterator[RosbridgeRig]:
+        bridge.ask("publish", "/spare", ARRAY | {"data": [0] * SPARE})
+        with FaultProxy(bridge.address, framing=framing) as proxy:
+            yield RosbridgeRig(proxy)
+
+    def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Rig) -> None:
+        """A message has no answer of its own: what is late on an old connection is never seen on the next."""
+        run.good()
+        rig.proxy.hold()
+        run.bad()
+        rig.proxy.release()
+        run.good()
+
+    def test_several_writes_in_one_command(self, run: Run, writer: Writer, rig: WriteRig) -> None:
+        """A command for several fields of a message is one message."""
+        frame = writer.written(Write(rig.spare, 0, b"ab"), Write(rig.spare + 4, 0, b"\x42"))
+        assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
+
+    def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
+        """A message has no bits of a number: the write is refused, and changes nothing."""
+        writer.written(Write(rig.spare, 0, b"\x0f"))
+        end = writer.write(Write(rig.spare, 1, b"\0"))
+        assert "write the whole register" in end.text
+        assert run.good().raw[rig.spare] == 0x0F
