@@ -1,0 +1,76 @@
+"""A connector with a tag table, and what its images say."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from shmio.connectors.base import Connector
+from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
+from shmio.layout.model import Layout
+from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.write import encode
+from shmio.model.statuses import StatusArea
+
+PATIENCE_S = 20.0
+_NEVER = threading.Event()
+
+
+def layout_of(tags: Mapping[str, tuple[str, str] | dict[str, Any]]) -> Layout:
+    """Return a layout; a tag is (type, address), or as in a table."""
+    given = {path: {"type": tag[0], "address": tag[1]} if isinstance(tag, tuple) else tag for path, tag in tags.items()}
+    return place_tags("robot", given).with_statuses()
+
+
+class Source:
+    """A connector, and the values and statuses of its last image."""
+
+    def __init__(self, connector: Connector, layout: Layout) -> None:
+        self.connector, self.layout = connector, layout
+        self._area = StatusArea(layout)
+        self.image = b""
+
+    def read(self) -> None:
+        self.image = self.connector.read()
+
+    def value(self, path: str) -> Value:
+        register = self.layout.registers[self.layout.by_path[path]]
+        return codec(register, self.layout.byte_order).decode(self.image)
+
+    def code(self, path: str) -> int:
+        return self._area.get(self.image, self.layout.by_path[path]).code
+
+    def source_ns(self, path: str) -> int:
+        return self._area.get(self.image, self.layout.by_path[path]).source_ns
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Read images until one satisfies a condition."""
+        end_s = time.monotonic() + PATIENCE_S
+        while True:
+            self.read()
+            if condition():
+                return
+            assert time.monotonic() < end_s, "not seen in time"
+            _NEVER.wait(0.002)
+
+    def write(self, **values: Value) -> list[str]:
+        """Write registers in one command; return the outcome of each."""
+        writes = []
+        for path, value in values.items():
+            writes += encode(self.layout.registers[self.layout.by_path[path]], value, self.layout.byte_order)
+        return self.connector.write(writes)
+
+
+@contextmanager
+def connected(url: str, tags: Mapping[str, tuple[str, str] | dict[str, Any]], **options: Any) -> Iterator[Source]:
+    layout = layout_of(tags)
+    connector = RosbridgeConnector(RosbridgeOptions(url=url, **{"timeout": 1000} | options), layout)
+    try:
+        connector.connect()
+        yield Source(connector, layout)
+    finally:
+        connector.close()

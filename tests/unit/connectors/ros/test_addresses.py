@@ -1,0 +1,72 @@
+"""The addresses of fields, and how they find values in messages."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.connectors.ros.addresses import Address, FieldError, Step, extract, leaf_type, parse
+from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, conforms, default
+
+_NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,8}", fullmatch=True)
+_KEYS = st.tuples(_NAMES, st.text("abj_-. /=ü1", min_size=1, max_size=9))
+_STEPS = st.one_of(
+    _NAMES.map(Step),
+    st.tuples(_NAMES, st.integers(0, 99_999)).map(lambda one: Step(*one)),
+    st.tuples(_NAMES, _KEYS).map(lambda one: Step(one[0], None, one[1])),
+)
+_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["a", "b", "name"]), inner, max_size=3),
+    max_leaves=12,
+)
+
+
+def _text(step: Step) -> str:
+    if step.key:
+        return f"{step.name}[{step.key[0]}={step.key[1]}]"
+    return step.name if step.place is None else f"{step.name}[{step.place}]"
+
+
+@given(st.lists(_STEPS, min_size=1, max_size=8))
+def test_an_address_is_read_as_it_was_meant(steps: list[Step]) -> None:
+    assert parse(f" /a/b_1   std_msgs/msg/Thing  {'.'.join(map(_text, steps))} ").steps == tuple(steps)
+
+
+@given(st.text(max_size=60) | st.text("/ab.[]=0 _M", max_size=40).map(lambda end: f"/t std_msgs/M {end}"))
+def test_any_other_text_is_refused(text: str) -> None:
+    try:
+        address = parse(text)
+    except ValueError:
+        return
+    assert ".".join(map(_text, address.steps)) == address.text
+
+
+@given(_JSON, st.sampled_from(["a", "a.b", "a[0]", "a[1].b[0]", "a[name=x]", "a.b[name=]x", "b[a=1].a"]))
+def test_no_message_breaks_the_extraction(message: Any, field: str) -> None:
+    try:
+        address = parse(f"/t std_msgs/M {field}")
+    except ValueError:
+        return
+    with suppress(FieldError):
+        extract(message, address)
+
+
+@pytest.mark.parametrize("kind", DEFINITIONS)
+def test_each_field_of_each_type_is_found_in_its_default(kind: str) -> None:
+    assert conforms(default(kind), kind)
+    for name, inner in DEFINITIONS[kind].items():
+        address = Address("/t", kind, (Step(name),), name)
+        assert extract(default(kind), address) == default(inner)
+        if inner.removesuffix("[]") in PRIMITIVES:
+            assert leaf_type(address) == inner
+
+
+def test_names_of_a_message_around() -> None:
+    message = {"joint_names": ["a", "b"], "points": [{"positions": [1.0, 2.0]}]}
+    address = parse("/t trajectory_msgs/JointTrajectory points[0].positions[joint_names=b]")
+    assert (extract(message, address), leaf_type(address)) == (2.0, "float64")
