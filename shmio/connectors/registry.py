@@ -17,7 +17,7 @@ from shmio.connectors.base import Computed, Connector, Replayed
 from shmio.errors import ConfigError
 
 if TYPE_CHECKING:
-    from importlib.metadata import EntryPoints
+    from importlib.metadata import EntryPoint, EntryPoints
 
 GROUP = "shmio.connectors"
 
@@ -44,12 +44,32 @@ def _offered() -> EntryPoints:
     return entry_points(group=GROUP)
 
 
+def clash(name: str) -> str:
+    """Return which packages offer a connector of this name that is taken, with the remedy; "" if none do."""
+    packages = sorted({_package(point) for point in _offered() if point.name == name})
+    if name in BUILT_IN and packages:
+        return (
+            f"{name!r} is a connector of shmio, and {' and '.join(packages)} {'offer' if packages[1:] else 'offers'} "
+            f"another one of this name: rename the entry point, or pip uninstall {' '.join(packages)}"
+        )
+    if len(packages) > 1:
+        return (
+            f"{' and '.join(packages)} each offer a connector {name!r}: pip uninstall all but the one that you mean, "
+            "or rename an entry point"
+        )
+    return ""
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else f"the package of {point.value}"
+
+
 def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
     """Import a connector by name.
 
     Raises:
-        ConfigError: There is no such connector, it cannot be imported, or it is not a connector
-            class.
+        ConfigError: There is no such connector, several packages offer it, it cannot be imported,
+            or it is not a connector class.
 
     """
     if name in BUILT_IN:
@@ -59,6 +79,8 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
         points = [point for point in _offered() if point.name == name]
         if not points:
             raise ConfigError(f"no connector {name!r}; there are: {', '.join(names())}{meant(name, names())}")
+        if len(points) > 1:
+            raise ConfigError(clash(name) or f"the package {_package(points[0])} offers {name!r} twice")
         try:
             found = points[0].load()
         except Exception as error:

@@ -114,6 +114,9 @@ def _check_source(
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
     """Add the faults of a source's connector keys; ``index`` is the source's index in the file."""
     key = f"source[{index}]"
+    if what := registry.clash(connector):
+        faults.add(f"{key}.connector: {what}")
+        return
     try:
         known = [field.encode_name for field in msgspec.structs.fields(registry.options_type(connector))]
     except ConfigError as error:

@@ -1,0 +1,82 @@
+"""Finding connectors: the built-in ones, and those of installed packages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.supervisor import main
+from shmio.connectors import registry
+from shmio.errors import ConfigError
+
+CONFIG = """
+[instance]
+name = "{instance}"
+[[source]]
+name = "cell"
+connector = "{connector}"
+layout = "tags.toml"
+{keys}
+"""
+Offer = Callable[[str, str], None]
+Check = Callable[..., str]
+
+
+@pytest.fixture
+def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Offer:
+    """Install the metadata of a package that offers a connector."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(folder)
+
+    def install(package: str, name: str) -> None:
+        info = folder / f"{package}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        points = f"[shmio.connectors]\n{name} = shmio.connectors.modbus.connector:ModbusConnector\n"
+        (info / "entry_points.txt").write_text(points)
+
+    return install
+
+
+@pytest.fixture
+def check(tmp_path: Path, instance: str, capsys: pytest.CaptureFixture[str]) -> Check:
+    """Check a configuration with one source; return the errors."""
+
+    def run(connector: str, keys: str) -> str:
+        (tmp_path / "tags.toml").write_text('registers.speed = { type = "REAL", address = "holding 0" }')
+        config = tmp_path / "supervisor.toml"
+        config.write_text(CONFIG.format(instance=instance, connector=connector, keys=keys))
+        status = main(["check", "-c", str(config)])
+        errors = capsys.readouterr().err
+        assert (status == 0) == (not errors)
+        return errors
+
+    return run
+
+
+def test_a_package_offers_a_connector(offer: Offer, check: Check) -> None:
+    offer("alpha", "fieldbus")
+    assert "fieldbus" in registry.names()
+    assert check("fieldbus", 'host = "127.0.0.1"') == ""
+    assert "did you mean" in check("fieldbuss", "")
+
+
+def test_a_package_with_the_name_of_a_built_in_connector(offer: Offer, check: Check) -> None:
+    """It never replaces the built-in one, and ``check`` says so."""
+    offer("alpha", "modbus")
+    error = check("modbus", 'host = "127.0.0.1"')
+    assert "source[0].connector: 'modbus' is a connector of shmio, and alpha offers another one" in error
+    assert "pip uninstall alpha" in error
+    assert registry.load("modbus").__module__ == "shmio.connectors.modbus.connector"
+    assert check("memory", "") == "", "other connectors are not concerned"
+
+
+def test_two_packages_with_the_same_connector(offer: Offer, check: Check) -> None:
+    offer("beta", "fieldbus")
+    offer("alpha", "fieldbus")
+    assert "alpha and beta each offer a connector 'fieldbus'" in check("fieldbus", 'host = "127.0.0.1"')
+    with pytest.raises(ConfigError, match="alpha and beta"):
+        registry.load("fieldbus")
