@@ -76,6 +76,10 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         help="source files of data blocks (.db, .udt, .scl), optionally after a plc.ini",
     )
+    text = "write a package with a connector of your own, which works and has tests; change its protocol"
+    new = verb("new-connector", text, command="new_connector:new_connector")
+    new.add_argument("connector", metavar="NAME", help='what connector = "NAME" in a configuration will be')
+    new.add_argument("-o", dest="directory", type=Path, metavar="FOLDER", help="a new folder (default: shmio-NAME)")
     return parser
 
 

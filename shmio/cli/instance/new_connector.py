@@ -1,0 +1,82 @@
+"""``shmio-supervisor new-connector``: write a package with a connector that works, for the user to change."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Final
+
+from shmio.connectors.registry import BUILT_IN, names
+from shmio.errors import ConfigError
+from shmio.logs import printable
+
+MAX_LENGTH: Final = 40
+_NAME = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*", re.ASCII)
+_FILES: Final = {
+    "README.md": "README.md",
+    "docs/{name}.md": "docs.md",
+    "pyproject.toml": "pyproject.toml",
+    "src/{module}/__init__.py": "__init__.py",
+    "src/{module}/client.py": "client.py",
+    "src/{module}/connector.py": "connector.py",
+    "src/{module}/py.typed": "py.typed",
+    "supervisor.toml": "supervisor.toml",
+    "tags.toml": "tags.toml",
+    "tests/conftest.py": "conftest.py",
+    "tests/device.py": "device.py",
+    "tests/test_{part}.py": "test_fieldbus.py",
+}
+"""Templates, by the path in the new folder. The connector in the templates is called fieldbus."""
+
+
+def new_connector(arguments: argparse.Namespace) -> int:
+    """Write the package into a new folder."""
+    name: str = arguments.connector
+    _check_name(name)
+    folder: Path = arguments.directory or Path(f"shmio-{name.replace('_', '-')}")
+    if os.path.lexists(folder):
+        raise ConfigError(f"{folder} is there already and is left as it is; choose another by -o FOLDER, or remove it")
+    for path, content in package(name).items():
+        file = folder / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(content, encoding="utf-8")
+        print(printable(f"wrote {file}"))
+    print(printable(f"next: cd {folder}, then pip install -e '.[test]', then pytest; README.md says what to replace"))
+    return 0
+
+
+def package(name: str) -> dict[str, str]:
+    """Return the files of a new package, by path."""
+    part = name.replace("-", "_")
+    module = f"shmio_{part}"
+    letters = "".join(word.capitalize() for word in part.split("_"))
+    words = [
+        ("shmio_fieldbus", module),
+        ("shmio-fieldbus", f"shmio-{name.replace('_', '-')}"),
+        ("Fieldbus", letters),
+        ("fieldbus-example", f"{name[:30].rstrip('-_')}-example"),
+        ("test_fieldbus", f"test_{part}"),
+        ("fieldbus", name),
+    ]
+    swap = re.compile("|".join(old for old, _ in words))
+    templates = resources.files("shmio.cli") / "connector_template"
+    files = {}
+    for path, template in _FILES.items():
+        text = (templates / f"{template}.template").read_text(encoding="utf-8")
+        files[path.format(name=name, module=module, part=part)] = swap.sub(lambda found: dict(words)[found[0]], text)
+    return files
+
+
+def _check_name(name: str) -> None:
+    if len(name) > MAX_LENGTH or not _NAME.fullmatch(name):
+        raise ConfigError(
+            f"{name[:MAX_LENGTH]!r} is no name for a connector: use lower-case letters and digits, between them '-' "
+            f"or '_', at most {MAX_LENGTH}, such as my-bus"
+        )
+    if name in BUILT_IN:
+        raise ConfigError(f"{name!r} is a connector of shmio: choose another name")
+    if name in names():
+        raise ConfigError(f"an installed package offers a connector {name!r}: choose another name, or pip uninstall it")
