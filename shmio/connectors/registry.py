@@ -26,6 +26,7 @@ BUILT_IN = {
     "modbus": "shmio.connectors.modbus.connector:ModbusConnector",
     "opcua": "shmio.connectors.opcua.connector:OpcUaConnector",
     "remote": "shmio.connectors.models.remote:Remote",
+    "ros2": "shmio.connectors.ros.dds:Ros2Connector",
     "rosbridge": "shmio.connectors.ros.rosbridge:RosbridgeConnector",
     "replay": "shmio.connectors.replay.source:Replay",
     "simulation": "shmio.connectors.models.simulation:Simulation",

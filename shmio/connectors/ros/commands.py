@@ -11,6 +11,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
+from shmio.connectors.base import Lost
 from shmio.connectors.ros.addresses import Address, FieldError, extract, place_of
 from shmio.connectors.ros.messages import DEFINITIONS, conforms, default, plain
 from shmio.connectors.ros.topics import Topic, Topics
@@ -73,6 +74,24 @@ def plan(topics: Topics, writes: Sequence[Write]) -> tuple[list[Publication], li
         for number in draft.writes:
             outcomes[number] = outcomes[number] or draft.refusal
         drafts = [one for one in drafts if not any(outcomes[number] for number in one.writes)]
+
+
+def mark_lost(outcomes: list[str | Lost], publications: Sequence[Publication], place: int) -> None:
+    """Mark the writes without an answer; the message at ``place`` may have been published."""
+    done = {number for publication in publications[:place] for number in publication.writes}
+    for number in publications[place].writes:
+        if outcomes[number] == "":
+            outcomes[number] = Lost.UNKNOWN
+    for publication in publications[place + 1 :]:
+        for number in publication.writes:
+            if outcomes[number] == "":
+                outcomes[number] = Lost.UNKNOWN if number in done else Lost.UNSENT
+
+
+def stamped(topics: Topics, topic: Topic) -> bool:
+    """Return whether a register has the stamp of a topic's header."""
+    paths = ([step.name for step in topics.addresses[index].steps[:2]] for index in topic.registers)
+    return ["header", "stamp"] in paths
 
 
 def _touched(topics: Topics, write: Write, open_drafts: Mapping[str, Publication]) -> Iterator[tuple[int, Value]]:

@@ -13,7 +13,7 @@ import msgspec
 
 from shmio.config import Address
 from shmio.connectors.base import Connector, Lost, WriteLostError
-from shmio.connectors.ros.commands import Publication, plan
+from shmio.connectors.ros.commands import Publication, mark_lost, plan, stamped
 from shmio.connectors.ros.messages import finite
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.topics import Topics
@@ -150,7 +150,7 @@ class RosbridgeConnector(Connector):
                 link.check()
                 refusal = self._publish(link, publication, until_s)
             except ConnectorError as error:
-                _mark_lost(outcomes, publications, place)
+                mark_lost(outcomes, publications, place)
                 raise WriteLostError(str(error), outcomes) from None
             for number in publication.writes:
                 outcomes[number] = outcomes[number] or refusal
@@ -164,21 +164,6 @@ class RosbridgeConnector(Connector):
 
     def _stampless(self, message: Any, publication: Publication) -> Any:
         """Return the message without its stamp, which the server then sets, unless a register has it."""
-        addresses = (self._topics.addresses[index] for index in publication.topic.registers)
-        stamped = any(len(one.steps) > 1 and one.steps[0].name == "header" and one.steps[1].name == "stamp"
-                      for one in addresses)  # fmt: skip
-        if "header" not in message or stamped:
+        if "header" not in message or stamped(self._topics, publication.topic):
             return message
         return message | {"header": {name: one for name, one in message["header"].items() if name != "stamp"}}
-
-
-def _mark_lost(outcomes: list[str | Lost], publications: Sequence[Publication], place: int) -> None:
-    """Mark the writes without an answer; the message at ``place`` may have been published."""
-    done = {number for publication in publications[:place] for number in publication.writes}
-    for number in publications[place].writes:
-        if outcomes[number] == "":
-            outcomes[number] = Lost.UNKNOWN
-    for publication in publications[place + 1 :]:
-        for number in publication.writes:
-            if outcomes[number] == "":
-                outcomes[number] = Lost.UNKNOWN if number in done else Lost.UNSENT

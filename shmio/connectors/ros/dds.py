@@ -1,0 +1,190 @@
+"""The connector ``ros2``: subscribes to topics of ROS 2 by DDS, without an installation of ROS."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import msgspec
+
+from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.ros.commands import Publication, mark_lost, plan, stamped
+from shmio.connectors.ros.options import TopicOptions
+from shmio.connectors.ros.topics import Topics
+from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.model import Layout
+from shmio.layout.values.write import Write
+from shmio.model.statuses import BAD_NO_COMMUNICATION, GOOD
+
+if TYPE_CHECKING:
+    from shmio.connectors.ros.participant import Participant
+
+POLL_S: Final = 0.005
+"""How often discovery is looked at while the connector waits for a first publisher."""
+
+log = logging.getLogger("shmio.source")
+
+
+class Ros2Options(TopicOptions, frozen=True, kw_only=True):
+    """Domain and network interface, and how to read topics; ValueError for keys that contradict."""
+
+    domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
+    """``ROS_DOMAIN_ID`` of the robot."""
+    interface: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.:@-]{1,40}$")] = "lo"
+    """The network interface; lo: this host only."""
+    peers: Annotated[
+        list[Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.:-]{1,253}$")]], msgspec.Meta(max_length=100)
+    ] = msgspec.field(default_factory=list)
+    """Hosts that are asked without multicast."""
+    reliability: Literal["best_effort", "reliable"] = "best_effort"
+    """What is requested of publishers."""
+    max_message_bytes: Annotated[int, msgspec.Meta(ge=1000, le=1 << 26)] = 1 << 20
+    """Larger messages are dropped."""
+
+    def __post_init__(self) -> None:
+        if self.interface == "lo" and self.peers:
+            raise ValueError("peers: other hosts need an interface: set interface to the name of one, such as eth0")
+
+
+class Ros2Connector(Connector):
+    """Reads fields of ROS 2 topics as a DDS participant, and publishes commands."""
+
+    Options = Ros2Options
+    can_write = True
+    register_quality = True
+
+    def __init__(self, options: Ros2Options, layout: Layout) -> None:
+        if importlib.util.find_spec("cyclonedds") is None:
+            raise ConfigError("connector: ros2 needs another library: pip install 'shmio[ros2]'")
+        self._options = options
+        self._topics = Topics(layout, options, known_types=True)
+        self._participant: Participant | None = None
+        self._incompatible: set[str] = set()
+
+    @property
+    def timeout_s(self) -> float:
+        """The longest time that any hook blocks, in s."""
+        return 3 * self._options.timeout / 1000
+
+    @property
+    def _where(self) -> str:
+        return f"domain {self._options.domain} on {self._options.interface}"
+
+    def describe(self) -> str:
+        """Return the domain and what is read, for the log."""
+        return f"to DDS {self._where}, {len(self._topics.by_name)} topics"
+
+    def connect(self) -> None:
+        """Join the domain, and wait for a publisher of a topic, or for a subscriber of a command topic.
+
+        Raises:
+            ConnectorError: There is none.
+
+        """
+        from shmio.connectors.ros import participant  # noqa: PLC0415  its library is optional
+
+        self.close()
+        self._topics.reset()
+        self._incompatible.clear()
+        options = self._options
+        timeout_s = options.timeout / 1000
+        end_s = time.monotonic() + timeout_s
+        configured = participant.configuration(
+            options.domain, options.interface, options.peers, options.max_message_bytes
+        )
+        joined = self._participant = participant.Participant(
+            options.domain, configured, self._topics.by_name.values(), timeout_s, options.reliability == "reliable"
+        )
+        while not self._met(joined):
+            if time.monotonic() > end_s:
+                self.close()
+                raise ConnectorError(
+                    f"no answer within {options.timeout} ms: no topic has a publisher in DDS {self._where}; compare "
+                    "ROS_DOMAIN_ID, names and types"
+                )
+            time.sleep(POLL_S)
+
+    def _met(self, joined: Participant) -> bool:
+        """Return whether another participant has something to do with the topics."""
+        names = self._topics.by_name
+        return any(joined.publishers(name) or joined.subscribers(name) for name in names)
+
+    def read(self) -> bytes:
+        """Return the image of the newest messages, if a publisher or a subscriber is there.
+
+        Raises:
+            ConnectorError: There is none any more.
+
+        """
+        joined = self._participant
+        if joined is None:
+            raise ConnectorError(f"not in DDS {self._where}")
+        self._pull(joined)
+        if not self._met(joined):
+            raise ConnectorError(f"all publishers of its topics have left DDS {self._where}")
+        for topic in self._topics.by_name.values():
+            gone = not topic.writable and topic.received_ns and not joined.publishers(topic.name)
+            topic.fault = BAD_NO_COMMUNICATION if gone else GOOD
+            if not topic.received_ns and topic.name not in self._incompatible and joined.incompatible(topic.name):
+                self._incompatible.add(topic.name)
+                log.warning(
+                    "%s: its publisher offers less than is requested: leave it out of latched, or set reliability to "
+                    "best_effort", topic.name,
+                )  # fmt: skip
+        return self._topics.image(time.monotonic_ns())
+
+    def _pull(self, joined: Participant) -> None:
+        for name, message in joined.take():
+            self._topics.take(name, message, time.monotonic_ns(), time.time_ns())
+
+    def close(self) -> None:
+        """Leave the domain. It may be called at any time and more than once."""
+        if self._participant is not None:
+            self._participant.close()
+            self._participant = None
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Publish messages, each confirmed when all reliable subscribers have it.
+
+        Raises:
+            WriteLostError: A subscriber did not acknowledge a message in time.
+
+        """
+        joined = self._participant
+        if joined is None:
+            raise WriteLostError(f"not in DDS {self._where}", [Lost.UNSENT] * len(writes))
+        self._pull(joined)
+        publications, refusals = plan(self._topics, writes)
+        outcomes: list[str | Lost] = list(refusals)
+        until_s = time.monotonic() + self._options.timeout / 1000
+        for place, publication in enumerate(publications):
+            try:
+                refusal = self._publish(joined, publication, until_s)
+            except ConnectorError as error:
+                mark_lost(outcomes, publications, place)
+                raise WriteLostError(str(error), outcomes) from None
+            for number in publication.writes:
+                outcomes[number] = outcomes[number] or refusal
+        return [str(outcome) for outcome in outcomes]
+
+    def _publish(self, joined: Participant, publication: Publication, until_s: float) -> str:
+        name, message = publication.topic.name, publication.message
+        if not joined.subscribers(name):
+            return f"no node subscribes to {name}: nobody would receive it"
+        now_ns = time.time_ns()
+        if "header" in message and not stamped(self._topics, publication.topic):
+            message["header"]["stamp"] = _time(now_ns)
+        if not joined.publish(name, message, until_s):
+            raise ConnectorError(
+                f"no answer within {self._options.timeout} ms: a subscriber of {name} did not acknowledge the message"
+            )
+        self._topics.take(name, message, time.monotonic_ns(), now_ns)
+        return ""
+
+
+def _time(utc_ns: int) -> dict[str, Any]:
+    sec, nanosec = divmod(utc_ns, 10**9)
+    return {"sec": sec, "nanosec": nanosec}

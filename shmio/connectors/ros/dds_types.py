@@ -1,0 +1,66 @@
+"""The message types as DDS types, with the names that ROS 2 gives them, and messages as samples of these."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from functools import lru_cache
+from typing import Any, Final
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import types as idl
+
+from shmio.connectors.ros.messages import DEFINITIONS
+
+_PRIMITIVES: Final[dict[str, Any]] = {
+    "bool": bool, "string": str, "float32": idl.float32, "float64": idl.float64,
+    **{f"{sign}int{bits}": getattr(idl, f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)},
+}  # fmt: skip
+
+
+def dds_topic(topic: str) -> str:
+    """Return the DDS topic of a ROS topic."""
+    return f"rt{topic}"
+
+
+def dds_type(kind: str) -> str:
+    """Return the DDS name of a type ``package/Name``."""
+    package, _, name = kind.partition("/")
+    return f"{package}::msg::dds_::{name}_"
+
+
+@lru_cache(maxsize=256)
+def sample_type(kind: str) -> Any:
+    """Return the class of a type's samples."""
+    annotations = {name: _annotation(inner) for name, inner in DEFINITIONS[kind].items()}
+
+    def fill(namespace: dict[str, Any]) -> None:
+        namespace |= {"__annotations__": annotations, "__module__": __name__}
+
+    name = f"{kind.partition('/')[2]}_"
+    return dataclasses.dataclass(types.new_class(name, (IdlStruct,), {"typename": dds_type(kind)}, fill))
+
+
+def _annotation(kind: str) -> Any:
+    if kind.endswith("[]"):
+        return idl.sequence[_annotation(kind[:-2])]
+    return _PRIMITIVES[kind] if kind in _PRIMITIVES else sample_type(kind)
+
+
+def to_message(sample: Any, kind: str) -> Any:
+    """Return the value of a field, or a whole sample, as dictionaries and lists."""
+    if kind.endswith("[]"):
+        inner = kind[:-2]
+        return list(sample) if inner in _PRIMITIVES else [to_message(one, inner) for one in sample]
+    if kind in _PRIMITIVES:
+        return sample
+    return {name: to_message(getattr(sample, name), inner) for name, inner in DEFINITIONS[kind].items()}
+
+
+def to_sample(message: Any, kind: str) -> Any:
+    """Return a message that conforms to its type as a sample."""
+    if kind.endswith("[]"):
+        return [to_sample(one, kind[:-2]) for one in message]
+    if kind in _PRIMITIVES:
+        return message
+    return sample_type(kind)(**{name: to_sample(message[name], inner) for name, inner in DEFINITIONS[kind].items()})

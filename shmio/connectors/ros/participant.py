@@ -1,0 +1,143 @@
+"""A participant in a DDS domain, with a reader for each topic, and a writer for those of commands."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterable, Iterator
+from typing import Any, Final
+from xml.sax.saxutils import quoteattr
+
+from cyclonedds.core import DDSException
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.internal import InvalidSample
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic as DdsTopic
+
+from shmio.connectors.ros.dds_types import dds_topic, sample_type, to_message, to_sample
+from shmio.connectors.ros.messages import plain
+from shmio.connectors.ros.topics import Topic
+from shmio.errors import ConnectorError
+
+MAX_PARTICIPANTS: Final = 60
+"""Participants of a host that are found without multicast."""
+WRITER_DEPTH: Final = 10
+
+log = logging.getLogger("shmio.source")
+
+
+def configuration(domain: int, interface: str, peers: Iterable[str], max_message_bytes: int) -> str:
+    """Return the configuration of Cyclone DDS for one domain."""
+    loopback = interface == "lo"
+    addresses = ["127.0.0.1"] if loopback else list(peers)
+    given = "".join(f"<Peer address={quoteattr(address)}/>" for address in addresses)
+    multicast = "<AllowMulticast>false</AllowMulticast>" if loopback else ""
+    return (
+        f'<CycloneDDS><Domain Id="{domain}"><General><Interfaces><NetworkInterface name={quoteattr(interface)}/>'
+        f"</Interfaces>{multicast}</General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f"<MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{given}</Peers></Discovery>"
+        f"<Internal><MaxSampleSize>{max_message_bytes} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
+    )
+
+
+class _Endpoint:
+    """The reader of a topic, and its writer if it has one."""
+
+    def __init__(self, participant: Any, topic: Topic, *, reliable: bool, blocking_ns: int) -> None:
+        self.topic, self.kind = topic, plain(topic.type)
+        dds = DdsTopic(participant, dds_topic(topic.name), sample_type(self.kind))
+        durable = Policy.Durability.TransientLocal if topic.latched else Policy.Durability.Volatile
+        sure = Policy.Reliability.Reliable(blocking_ns)
+        self.reader = DataReader(participant, dds, qos=Qos(
+            sure if reliable or topic.latched else Policy.Reliability.BestEffort, durable,
+            Policy.History.KeepLast(1), Policy.IgnoreLocal.Participant,
+        ))  # fmt: skip
+        self.writer = None
+        if topic.writable:
+            self.writer = DataWriter(participant, dds, qos=Qos(
+                sure, durable, Policy.History.KeepLast(WRITER_DEPTH), Policy.IgnoreLocal.Participant,
+            ))  # fmt: skip
+
+
+class Participant:
+    """One participant; it has joined the domain until it is closed."""
+
+    def __init__(self, domain: int, configured: str, topics: Iterable[Topic], timeout_s: float, reliable: bool) -> None:
+        """Join the domain.
+
+        Raises:
+            ConnectorError: The interface does not exist, or the domain cannot be joined.
+
+        """
+        self._endpoints: dict[str, _Endpoint] = {}
+        self._domain = self._participant = None
+        try:
+            self._domain = Domain(domain, configured)
+            self._participant = DomainParticipant(domain)
+            for topic in topics:
+                self._endpoints[topic.name] = _Endpoint(
+                    self._participant, topic, reliable=reliable, blocking_ns=round(timeout_s * 1e9)
+                )
+        except DDSException as error:
+            self.close()
+            raise ConnectorError(
+                f"cannot join DDS domain {domain}: {error.msg or error}; does the interface exist, and is it up?"
+            ) from None
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._endpoints.clear()
+        for entity in (self._participant, self._domain):
+            if entity is not None:
+                entity.__del__()  # deletes the entities in it, too; the interpreter would do it at some later time
+        self._participant = self._domain = None
+
+    def publishers(self, topic: str) -> int:
+        """Return how many publishers a topic has, without this participant."""
+        return len(self._endpoints[topic].reader.get_matched_publications())
+
+    def subscribers(self, topic: str) -> int:
+        """Return how many subscribers a command topic has, without this participant."""
+        writer = self._endpoints[topic].writer
+        return 0 if writer is None else len(writer.get_matched_subscriptions())
+
+    def incompatible(self, topic: str) -> bool:
+        """Return whether a publisher offers less than the reader of the topic requests."""
+        return bool(self._endpoints[topic].reader.get_requested_incompatible_qos_status().total_count)
+
+    def take(self) -> Iterator[tuple[str, Any]]:
+        """Yield the newest message of each topic that has a new one; None for one that cannot be decoded."""
+        for name, endpoint in self._endpoints.items():
+            try:
+                for sample in endpoint.reader.take(1):
+                    if not isinstance(sample, InvalidSample):
+                        yield name, to_message(sample, endpoint.kind)
+            except DDSException as error:
+                raise ConnectorError(f"{name}: {error.msg or error}") from None
+            except Exception as error:  # noqa: BLE001  decoding of a peer's bytes may fail in any way
+                log.warning("%s: a message cannot be decoded: %s", name, type(error).__name__)
+                yield name, None
+
+    def publish(self, topic: str, message: Any, until_s: float) -> bool:
+        """Publish a message, and wait until all reliable subscribers have it.
+
+        Returns:
+            Whether all have it.
+
+        Raises:
+            ConnectorError: It cannot be sent.
+
+        """
+        endpoint = self._endpoints[topic]
+        assert endpoint.writer is not None  # noqa: S101 - for the type checker
+        try:
+            endpoint.writer.write(to_sample(message, endpoint.kind))
+        except DDSException as error:
+            raise ConnectorError(f"{topic}: {error.msg or error}") from None
+        try:
+            rest_ns = max(1_000_000, round((until_s - time.monotonic()) * 1e9))
+            return bool(endpoint.writer.wait_for_acks(rest_ns))
+        except (DDSException, AttributeError):  # the library's own comparison for a time-out fails
+            return False
