@@ -1,0 +1,149 @@
+"""A node of ROS 2 as a program, made with cyclonedds; its types are written from the public definitions, not ours.
+
+Usage: dds_node.py DOMAIN PREFIX; it takes commands on standard input, a JSON list a line, and answers each.
+"""
+
+import json
+import sys
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import float64, int16, int32, sequence, uint32
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
+CONFIG = """<CycloneDDS><Domain Id="{}"><General><Interfaces><NetworkInterface name="lo"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>30</MaxAutoParticipantIndex><LeaseDuration>{}s</LeaseDuration>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+
+
+@dataclass
+class Time_(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):  # noqa: N801
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Header_(IdlStruct, typename="std_msgs::msg::dds_::Header_"):  # noqa: N801
+    stamp: Time_
+    frame_id: str
+
+
+@dataclass
+class JointState_(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):  # noqa: N801
+    header: Header_
+    name: sequence[str]
+    position: sequence[float64]
+    velocity: sequence[float64]
+    effort: sequence[float64]
+
+
+@dataclass
+class MultiArrayDimension_(IdlStruct, typename="std_msgs::msg::dds_::MultiArrayDimension_"):  # noqa: N801
+    label: str
+    size: uint32
+    stride: uint32
+
+
+@dataclass
+class MultiArrayLayout_(IdlStruct, typename="std_msgs::msg::dds_::MultiArrayLayout_"):  # noqa: N801
+    dim: sequence[MultiArrayDimension_]
+    data_offset: uint32
+
+
+@dataclass
+class Float64MultiArray_(IdlStruct, typename="std_msgs::msg::dds_::Float64MultiArray_"):  # noqa: N801
+    layout: MultiArrayLayout_
+    data: sequence[float64]
+
+
+@dataclass
+class Int16MultiArray_(IdlStruct, typename="std_msgs::msg::dds_::Int16MultiArray_"):  # noqa: N801
+    layout: MultiArrayLayout_
+    data: sequence[int16]
+
+
+@dataclass
+class String_(IdlStruct, typename="std_msgs::msg::dds_::String_"):  # noqa: N801
+    data: str
+
+
+RELIABLE = Policy.Reliability.Reliable(10**9)
+
+
+class Node:
+    """What the node publishes, and what it has received."""
+
+    def __init__(self, domain: str, prefix: str) -> None:
+        self.domain, self.prefix = int(domain), prefix
+        self.last = 0
+        self.counting: threading.Thread | None = None
+        self.stopped = threading.Event()
+        self.entities: list[Any] = []
+        self.join()
+
+    def topic(self, name: str, kind: Any) -> Any:
+        return Topic(self.entities[1], f"rt/{self.prefix}/{name}", kind)
+
+    def join(self, lease_s: int = 10) -> None:
+        self.entities = [Domain(self.domain, CONFIG.format(self.domain, lease_s))]
+        self.entities.append(DomainParticipant(self.domain))
+        last, durable = Policy.History.KeepLast(1), Policy.Durability.TransientLocal
+        self.states = DataWriter(self.entities[1], self.topic("states", JointState_), qos=Qos(RELIABLE, last))
+        self.counts = DataWriter(self.entities[1], self.topic("counted", Float64MultiArray_), qos=Qos(RELIABLE, last))
+        spare = self.topic("spare", Int16MultiArray_)
+        self.spares = DataWriter(self.entities[1], spare, qos=Qos(RELIABLE, last))
+        self.received = DataReader(self.entities[1], spare, qos=Qos(RELIABLE, last, Policy.IgnoreLocal.Participant))
+        self.modes = DataWriter(self.entities[1], self.topic("mode", String_), qos=Qos(RELIABLE, last, durable))
+
+    def leave(self) -> None:
+        if self.counting is not None:
+            self.stopped.set()
+            self.counting.join()
+            self.counting = None
+        del self.states, self.counts, self.spares, self.received, self.modes
+        for entity in reversed(self.entities):
+            entity.__del__()
+        self.entities = []
+
+    def state(self, names: list[str], positions: list[float], sec: int = 0) -> None:
+        self.states.write(JointState_(Header_(Time_(sec, 7), ""), names, [float(one) for one in positions], [], []))
+
+    def mode(self, text: str) -> None:
+        self.modes.write(String_(text))
+
+    def spare(self, data: list[int]) -> None:
+        self.spares.write(Int16MultiArray_(MultiArrayLayout_([], 0), data))
+
+    def commanded(self) -> Any:
+        found = self.received.take(1)
+        return list(found[-1].data) if found else None
+
+    def count(self, size: int, period_s: float) -> None:
+        def run() -> None:
+            while not self.stopped.wait(period_s):
+                self.last += 1
+                self.counts.write(Float64MultiArray_(MultiArrayLayout_([], 0), [float(self.last)] * size))
+
+        self.stopped.clear()
+        self.counting = threading.Thread(target=run)
+        self.counting.start()
+
+
+def main() -> None:
+    node = Node(*sys.argv[1:])
+    print('"ready"', flush=True)  # noqa: T201
+    for line in sys.stdin:
+        name, *given = json.loads(line)
+        print(json.dumps(getattr(node, name)(*given)), flush=True)  # noqa: T201
+    node.leave()
+
+
+if __name__ == "__main__":
+    main()

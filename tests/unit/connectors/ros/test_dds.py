@@ -1,0 +1,162 @@
+"""The ros2 connector with nodes that have type definitions of their own."""
+
+from __future__ import annotations
+
+import math
+import random
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from shmio.connectors.ros.dds import Ros2Connector, Ros2Options
+from shmio.connectors.ros.dds_types import dds_type, sample_type, to_message, to_sample
+from shmio.connectors.ros.messages import DEFINITIONS, default
+from shmio.errors import ConfigError, ConnectorError
+from shmio.model import statuses
+from tests.unit.connectors.ros.dds_peer import DOMAIN, Peer
+from tests.unit.connectors.ros.harness import Source, layout_of
+
+STATE = "sensor_msgs/msg/JointState "
+
+
+@pytest.fixture(scope="module")
+def peer() -> Iterator[Peer]:
+    with Peer() as peer:
+        yield peer
+
+
+def tags_of(peer: Peer) -> dict[str, tuple[str, str] | dict[str, Any]]:
+    return {
+        "j1": ("LREAL", peer.address("states", f"{STATE}position[name=j1]")),
+        "j2": ("LREAL", peer.address("states", f"{STATE}position[name=j2]")),
+        "mode": ("STRING[20]", peer.address("mode", "std_msgs/String data")),
+        "spare": {
+            "type": "ARRAY[0..1] OF INT", "address": peer.address("spare", "std_msgs/Int16MultiArray data"),
+            "writable": True,
+        },
+    }  # fmt: skip
+
+
+@contextmanager
+def connected(peer: Peer, tags: dict[str, Any] | None = None, **options: Any) -> Iterator[Source]:
+    layout = layout_of(tags or tags_of(peer))
+    latched = [f"/{peer.prefix}/mode"] if tags is None else []
+    keys: dict[str, Any] = {"domain": DOMAIN, "timeout": 5000, "latched": latched} | options
+    connector = Ros2Connector(Ros2Options(**keys), layout)
+    try:
+        connector.connect()
+        yield Source(connector, layout)
+    finally:
+        connector.close()
+
+
+def seen(source: Source, peer: Peer, names: list[str], positions: list[float], sec: int = 0) -> None:
+    """Publish joint states until the source shows the first joint."""
+
+    def shown() -> bool:
+        peer.ask("state", names, positions, sec)
+        return source.code("j1") == 0 and source.value("j1") == positions[names.index("j1")]
+
+    source.until(shown)
+
+
+def test_joints_by_name_and_a_latched_topic(peer: Peer) -> None:
+    peer.ask("mode", "auto")  # before anybody subscribes
+    with connected(peer, max_age=0) as source:
+        seen(source, peer, ["j2", "j1"], [math.nan, 1.5], 1_700_000_000)
+        found = source.value("j2")
+        assert isinstance(found, float)
+        assert math.isnan(found)
+        assert source.source_ns("j1") == 1_700_000_000_000_000_007
+        source.until(lambda: source.code("mode") == 0)
+        assert source.value("mode") == "auto"
+        seen(source, peer, ["j1"], [2.5])
+        assert source.code("j2") == statuses.BAD_NOT_FOUND
+
+
+def test_age_and_a_publisher_that_leaves(peer: Peer) -> None:
+    with connected(peer, max_age=100) as source:
+        seen(source, peer, ["j1"], [1.0])
+        source.until(lambda: source.code("j1") == statuses.BAD_TIMEOUT)
+    with Peer() as other:
+        tags = tags_of(peer) | {"o": ("LREAL", other.address("states", f"{STATE}position[0]"))}
+        with connected(peer, tags, max_age=0) as source:
+
+            def shown() -> bool:
+                other.ask("state", ["a"], [4.0])
+                return source.code("o") == 0
+
+            source.until(shown)
+            seen(source, peer, ["j1"], [3.0])
+            other.ask("leave")
+            source.until(lambda: source.code("o") == statuses.BAD_NO_COMMUNICATION)
+            assert (source.code("j1"), source.value("j1")) == (0, 3.0)
+            other.ask("join")
+            source.until(shown)
+
+
+def test_without_any_publisher_the_source_is_bad() -> None:
+    with Peer() as peer:
+        tags = {"j1": ("LREAL", peer.address("states", f"{STATE}position[0]"))}
+        with connected(peer, tags) as source:
+            peer.ask("leave")
+            with pytest.raises(ConnectorError, match="all publishers"):
+                source.until(lambda: False)
+            source.connector.close()
+            connector = Ros2Connector(Ros2Options(domain=DOMAIN, timeout=100), source.layout)
+            with pytest.raises(ConnectorError, match="no answer within 100 ms"):
+                connector.connect()
+            peer.ask("join")
+            source.connector.connect()
+
+
+def test_a_command_reaches_the_node(peer: Peer) -> None:
+    with connected(peer, max_age=0) as source:
+        peer.ask("spare", [1, 2])
+        source.until(lambda: source.write(spare=[3, -4]) == [""])  # once it is discovered
+        assert peer.ask("commanded") == [3, -4]
+        source.read()
+        assert (source.value("spare"), source.code("spare")) == ([3, -4], 0)
+        assert "writable" in source.write(j1=1.0)[0]
+    lonely = {
+        "j1": ("LREAL", peer.address("states", f"{STATE}position[0]")),
+        "nobody": {"type": "LREAL", "address": "/nobody std_msgs/Float64 data", "writable": True},
+    }
+    with connected(peer, lonely) as source:
+        assert "no node subscribes to /nobody" in source.write(nobody=1.0)[0]
+
+
+def test_garbage_and_large_messages_do_no_harm(peer: Peer) -> None:
+    noise = random.Random(7)
+    with connected(peer, max_age=0, max_message_bytes=1000) as source:
+        seen(source, peer, ["j1"], [1.0])
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for port in range(7400 + 250 * DOMAIN, 7400 + 250 * DOMAIN + 24):
+                for head in (b"", b"RTPS\x02\x01\x01\x10"):
+                    sender.sendto(head + noise.randbytes(200), ("127.0.0.1", port))
+        peer.ask("state", ["j1"], [5.0] * 1000)
+        seen(source, peer, ["j1"], [2.0])
+
+
+@pytest.mark.parametrize("kind", DEFINITIONS)
+def test_each_type_passes_through_its_dds_type(kind: str) -> None:
+    message = default(kind)
+    data = to_sample(message, kind).serialize()
+    assert to_message(sample_type(kind).deserialize(data), kind) == message
+    assert dds_type(kind).startswith(f"{kind.partition('/')[0]}::msg::dds_::")
+
+
+def test_what_is_wrong_is_said_before_anything_starts() -> None:
+    with pytest.raises(ConfigError, match="can be read"):
+        Ros2Connector(Ros2Options(), layout_of({"r": ("LREAL", "/a my_msgs/Thing x")}))
+    with pytest.raises(ValueError, match="peers"):
+        Ros2Options(peers=["10.0.0.1"])
+    connector = Ros2Connector(
+        Ros2Options(interface="none0", domain=DOMAIN), layout_of({"r": ("LREAL", "/a std_msgs/Float64 data")})
+    )
+    with pytest.raises(ConnectorError, match="interface"):
+        connector.connect()
+    connector.close()
