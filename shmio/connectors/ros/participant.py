@@ -24,6 +24,8 @@ from shmio.errors import ConnectorError
 MAX_PARTICIPANTS: Final = 60
 """Participants of a host that are found without multicast."""
 WRITER_DEPTH: Final = 10
+_HEARTBEAT: Final = '<HeartbeatInterval min="2 ms" minsched="2 ms" max="1 s">5 ms</HeartbeatInterval>'
+"""Asks subscribers soon for their acknowledgements: the poll loop waits for these."""
 
 log = logging.getLogger("shmio.source")
 
@@ -38,7 +40,8 @@ def configuration(domain: int, interface: str, peers: Iterable[str], max_message
         f'<CycloneDDS><Domain Id="{domain}"><General><Interfaces><NetworkInterface name={quoteattr(interface)}/>'
         f"</Interfaces>{multicast}</General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
         f"<MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{given}</Peers></Discovery>"
-        f"<Internal><MaxSampleSize>{max_message_bytes} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
+        f"<Internal><MaxSampleSize>{max_message_bytes} B</MaxSampleSize>"
+        f"{_HEARTBEAT}</Internal></Domain></CycloneDDS>"
     )
 
 

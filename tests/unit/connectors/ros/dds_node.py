@@ -125,6 +125,9 @@ class Node:
         found = self.received.take(1)
         return list(found[-1].data) if found else None
 
+    def restore(self, number: int) -> None:
+        self.last = number
+
     def count(self, size: int, period_s: float) -> None:
         def run() -> None:
             while not self.stopped.wait(period_s):

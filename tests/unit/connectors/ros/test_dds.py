@@ -138,6 +138,13 @@ def test_garbage_and_large_messages_do_no_harm(peer: Peer) -> None:
                 for head in (b"", b"RTPS\x02\x01\x01\x10"):
                     sender.sendto(head + noise.randbytes(200), ("127.0.0.1", port))
         peer.ask("state", ["j1"], [5.0] * 1000)
+
+        def later() -> bool:
+            peer.ask("spare", [7, 8])
+            return source.value("spare") == [7, 8]
+
+        source.until(later)
+        assert source.value("j1") == 1.0
         seen(source, peer, ["j1"], [2.0])
 
 

@@ -1,0 +1,233 @@
+"""The common conformance suites, run with the ros2 connector and a node made with cyclonedds.
+
+DDS has no connection that a proxy could break: the node itself leaves, dies, or is frozen. Faults of
+a connection are replaced by those of a node.
+"""
+
+from __future__ import annotations
+
+import random
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.ros.dds import Ros2Connector, Ros2Options
+from shmio.errors import ConnectorError
+from shmio.layout.model import Layout
+from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import codec
+from shmio.model.statuses import BAD_TIMEOUT, StatusArea
+from shmio.segment import Frame, Write
+from shmio.testing.conformance import Rig, Run
+from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
+from tests.unit.connectors.ros.dds_peer import Peer
+
+COUNTS = 20
+
+
+class NodeFaults:
+    """Does to a node what the suite does to a connection."""
+
+    def __init__(self, peer: Peer) -> None:
+        self._peer = peer
+        self._away = False
+
+    def refuse(self) -> None:
+        self._peer.ask("leave")
+        self._away = True
+
+    def admit(self) -> None:
+        if self._away:
+            self._away = False
+            self._peer.ask("join")
+            self.begin()
+
+    def begin(self) -> None:
+        self._peer.ask("count", COUNTS, 0.004)
+        self._peer.ask("spare", [0] * SPARE)
+
+    def freeze(self) -> None:
+        self._peer.freeze()
+
+    def thaw(self) -> None:
+        self._peer.thaw()
+
+
+class Ros2Rig:
+    """The node."""
+
+    proxy: Any
+
+    def __init__(self, peer: Peer) -> None:
+        self.peer = peer
+        self.proxy = NodeFaults(peer)
+        counted = peer.address("counted", "std_msgs/Float64MultiArray data")
+        tags: dict[str, object] = {
+            "counted": {"type": f"ARRAY[1..{COUNTS}] OF LREAL", "address": counted},
+        }
+        for at in range(SPARE):
+            address = peer.address("spare", f"std_msgs/Int16MultiArray data[{at}]")
+            tags[f"spare/{at}"] = {"type": "BYTE", "address": address, "writable": True}
+        tags["fixed"] = {"type": "INT", "address": "/nobody std_msgs/Int16 data", "writable": True}
+        self.layout: Layout = place_tags("device", tags).with_statuses()
+        self.area = StatusArea(self.layout)
+        by_path = {register.path: register for register in self.layout.registers}
+        self._counted = codec(by_path["counted"], "little")
+        self.spare = self.flags = by_path["spare/0"].offset
+        self.refused = Write(by_path["fixed"].offset, 0, b"\1\0")
+
+    def connector(self) -> Connector:
+        return Ros2Connector(Ros2Options(domain=self.peer.domain, timeout=1000, max_age=100), self.layout)
+
+    def generation(self, raw: bytes) -> int:
+        counted = self._counted.decode(raw)
+        assert isinstance(counted, list)
+        numbers = {one for one in counted if isinstance(one, float)}
+        assert len(numbers) == 1, "an array with elements of different moments"
+        return int(numbers.pop())
+
+    def counted(self, frame: Frame) -> bool:
+        """Return whether the counted register of a frame is good."""
+        return self.area.get(frame.raw, 0).code == 0
+
+
+class TestRos2(WriteConformance):
+    @pytest.fixture
+    def rig(self) -> Iterator[Ros2Rig]:
+        with Peer() as peer:
+            rig = Ros2Rig(peer)
+            rig.proxy.begin()
+            try:
+                yield rig
+            finally:
+                peer.thaw()
+
+    @pytest.fixture
+    def writer(self, run: Run, rig: Ros2Rig) -> Writer:
+        """Provide a writer, once the node is discovered in both directions."""
+        run.good()
+        writer = Writer(run)
+        for _ in range(1000):
+            rig.peer.ask("spare", [0] * SPARE)
+            if not writer.once_open(Write(rig.spare, 0, bytes(SPARE))).text:
+                break
+        return writer
+
+    def test_absent_at_start(self, absent: None, run: Run, rig: Rig) -> None:
+        """The source is bad with a reason until there is a node, and then good."""
+        assert "no topic has a publisher" in run.bad().reason
+        rig.proxy.admit()
+        run.good()
+
+    def test_reset(self, run: Run, rig: Ros2Rig) -> None:  # type: ignore[override]
+        """A node dies, and another one takes its place: values go on."""
+        run.until(rig.counted)
+        rig.peer.kill()
+        run.until(lambda frame: not rig.counted(frame))
+        rig.peer.start()
+        rig.peer.ask("restore", 1_000_000)  # as the counting goes on
+        rig.proxy.begin()
+        run.until(rig.counted)
+
+    test_cut_in_the_middle_of_an_answer: Any = None  # DDS delivers whole messages
+
+    def test_half_open(self, run: Run, rig: Ros2Rig) -> None:  # type: ignore[override]
+        """The node is silent: its registers are bad after the age limit, then good."""
+        run.until(rig.counted)
+        rig.proxy.freeze()
+        frame = run.until(lambda frame: not rig.counted(frame))
+        assert rig.area.get(frame.raw, 0).code == BAD_TIMEOUT
+        rig.proxy.thaw()
+        run.until(rig.counted)
+
+    @pytest.mark.parametrize("garbage", [b"\0" * 64, b"\xff" * 64, b"RTPS\2\1\1\x10" + random.Random(1).randbytes(200)])
+    def test_garbage(self, run: Run, rig: Ros2Rig, garbage: bytes) -> None:  # type: ignore[override]
+        """Datagrams that are not of DDS never become a value, and disturb nothing."""
+        run.until(rig.counted)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for port in range(7400 + 250 * rig.peer.domain, 7400 + 250 * rig.peer.domain + 24):
+                sender.sendto(garbage, ("127.0.0.1", port))
+        last = rig.generation(run.until(rig.counted).raw)
+        run.until(lambda frame: rig.counted(frame) and rig.generation(frame.raw) > last)
+
+    def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Ros2Rig) -> None:  # type: ignore[override]
+        """What a frozen node publishes late is newer than what was seen before: the fixture checks that."""
+        run.until(rig.counted)
+        for _ in range(2):
+            rig.proxy.freeze()
+            run.until(lambda frame: not rig.counted(frame))
+            rig.proxy.thaw()
+            run.until(rig.counted)
+
+    def test_several_writes_in_one_command(self, run: Run, writer: Writer, rig: Ros2Rig) -> None:  # type: ignore[override]
+        """A command for several fields of a message is one message, which the node receives."""
+        frame = writer.written(Write(rig.spare, 0, b"ab"), Write(rig.spare + 4, 0, b"\x42"))
+        assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
+        assert rig.peer.ask("commanded") == list(b"ab\0\0\x42\0\0\0")
+
+    def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
+        """A message has no bits of a number: the write is refused, and changes nothing."""
+        writer.written(Write(rig.spare, 0, b"\x0f"))
+        end = writer.write(Write(rig.spare, 1, b"\0"))
+        assert "write the whole register" in end.text
+        assert run.good().raw[rig.spare] == 0x0F
+
+    def test_a_refused_item_among_good_ones(self, rig: Ros2Rig) -> None:  # type: ignore[override]
+        """A topic without a subscriber is refused; the others are published."""
+        connector = rig.connector()
+        try:
+            connector.connect()
+            for _ in range(1000):
+                rig.peer.ask("spare", [0] * SPARE)
+                connector.read()
+                if not connector.write([Write(rig.spare, 0, bytes(SPARE))])[0]:
+                    break
+            writes = [Write(rig.spare, 0, b"one"), rig.refused, Write(rig.spare + 4, 0, b"two")]
+            outcomes = connector.write(writes)
+            assert [bool(outcome) for outcome in outcomes] == [False, True, False]
+            assert "no node subscribes" in outcomes[1]
+            assert connector.read()[rig.spare : rig.spare + SPARE] == b"one\0two\0"
+        finally:
+            connector.close()
+
+    def test_a_late_confirmation_is_not_taken_for_the_next(self, run: Run, writer: Writer, rig: Ros2Rig) -> None:  # type: ignore[override]
+        """A frozen node acknowledges nothing: the outcome is unknown, and the next one is its own."""
+        rig.proxy.freeze()
+        end = writer.write(Write(rig.spare, 0, b"late"))
+        assert "did not acknowledge" in end.text
+        rig.proxy.thaw()
+        run.until(rig.counted)
+
+    @pytest.mark.parametrize("count", [1])
+    def test_lost_in_mid_write(self, run: Run, writer: Writer, rig: Ros2Rig, count: int) -> None:  # type: ignore[override]
+        """A node leaves, and is back: the next write that succeeds reaches it."""
+        rig.proxy.refuse()
+        run.bad()
+        rig.proxy.admit()
+        run.until(rig.counted)
+        value = b"at last!"
+        while writer.once_open(Write(rig.spare, 0, value)).text:  # until the node is discovered again
+            rig.peer.ask("spare", [0] * SPARE)
+        assert rig.peer.ask("commanded") == list(value)
+
+    @pytest.mark.parametrize("fault", ["no answer"])
+    def test_of_each_lost_write_what_is_said_is_true(self, rig: Ros2Rig, fault: str) -> None:  # type: ignore[override]
+        """The node is frozen during several writes, which are one message."""
+        connector = rig.connector()
+        try:
+            connector.connect()
+            for _ in range(1000):
+                rig.peer.ask("spare", [0] * SPARE)
+                connector.read()
+                if not connector.write([Write(rig.spare, 0, bytes(SPARE))])[0]:
+                    break
+            rig.proxy.freeze()
+            with pytest.raises(ConnectorError) as raised:
+                connector.write([Write(rig.spare + place, 0, bytes([place + 1])) for place in range(SPARE)])
+            assert isinstance(raised.value, WriteLostError)
+            assert set(raised.value.outcomes) == {Lost.UNKNOWN}
+        finally:
+            connector.close()
