@@ -3,5 +3,6 @@
 ``messages.py`` has the message types, ``addresses.py`` finds the fields that addresses name,
 ``values.py`` fits them to registers, ``topics.py`` turns messages into images, and ``commands.py``
 turns writes into messages. Both connectors share these. ``rosbridge.py`` and ``websocket.py`` speak
-the rosbridge protocol; ``dds.py`` and ``dds_types.py`` speak DDS as ROS 2 does.
+the rosbridge protocol; ``dds.py``, ``participant.py`` and ``dds_types.py`` speak DDS as ROS 2
+does.
 """
