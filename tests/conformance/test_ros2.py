@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 import socket
 from collections.abc import Iterator
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -80,7 +81,7 @@ class Ros2Rig:
         self.refused = Write(by_path["fixed"].offset, 0, b"\1\0")
 
     def connector(self) -> Connector:
-        return Ros2Connector(Ros2Options(domain=self.peer.domain, timeout=1000, max_age=100), self.layout)
+        return Ros2Connector(Ros2Options(domain=self.peer.domain, timeout=500, max_age=100), self.layout)
 
     def generation(self, raw: bytes) -> int:
         counted = self._counted.decode(raw)
@@ -94,16 +95,24 @@ class Ros2Rig:
         return self.area.get(frame.raw, 0).code == 0
 
 
+@pytest.fixture(scope="module")
+def peer() -> Iterator[Peer]:
+    with Peer() as peer:
+        yield peer
+
+
 class TestRos2(WriteConformance):
     @pytest.fixture
-    def rig(self) -> Iterator[Ros2Rig]:
-        with Peer() as peer:
-            rig = Ros2Rig(peer)
+    def rig(self, request: pytest.FixtureRequest, peer: Peer) -> Iterator[Ros2Rig]:
+        own = Peer() if request.node.name == "test_reset" else None  # which ends the node's process
+        with own or nullcontext():
+            rig = Ros2Rig(own or peer)
             rig.proxy.begin()
             try:
                 yield rig
             finally:
-                peer.thaw()
+                rig.peer.thaw()
+                rig.proxy.admit()
 
     @pytest.fixture
     def writer(self, run: Run, rig: Ros2Rig) -> Writer:

@@ -11,7 +11,7 @@ from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
 from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
-from shmio.segment import Write
+from shmio.segment import EventKind, Write
 from shmio.testing.conformance import Rig, Run
 from shmio.testing.proxy import FaultProxy
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
@@ -58,6 +58,7 @@ class RosbridgeRig:
 @pytest.fixture(scope="module")
 def bridge() -> Iterator[Bridge]:
     with Bridge() as bridge:
+        bridge.ask("publish", "/fixed", {"data": 7})
         bridge.ask("refuse", "/fixed", "it is fixed")
         bridge.ask("count", "/counted", COUNTS, 4)
         yield bridge
@@ -89,3 +90,28 @@ class TestRosbridge(WriteConformance):
         end = writer.write(Write(rig.spare, 1, b"\0"))
         assert "write the whole register" in end.text
         assert run.good().raw[rig.spare] == 0x0F
+
+    @pytest.mark.parametrize("count", [1, 30])
+    def test_lost_in_mid_write(self, run: Run, writer: Writer, rig: WriteRig, count: int) -> None:
+        """The connection breaks around a write: the reported outcome is true.
+
+        A frame may still be good while the end of the connection is on its way, so that a write
+        after such a frame may be lost, too.
+        """
+        for turn in range(1, 5):
+            rig.proxy.cut_after(count * turn)
+            value = bytes([turn]) * SPARE
+            end = writer.once_open(Write(rig.spare, 0, value))
+            assert end.kind in {EventKind.WRITTEN, EventKind.EXPIRED, EventKind.UNKNOWN}
+            rig.proxy.pass_all()
+            frame = writer.after(end)
+            if end.kind != EventKind.UNKNOWN:
+                done = frame.raw[rig.spare : rig.spare + SPARE] == value
+                assert done == (end.kind == EventKind.WRITTEN), end
+        last = Write(rig.spare, 0, b"at last!")
+        for _ in range(3):
+            end = writer.once_open(last)
+            if end.kind == EventKind.WRITTEN:
+                break
+        assert end.kind == EventKind.WRITTEN, end
+        assert writer.after(end).raw[rig.spare : rig.spare + SPARE] == b"at last!"

@@ -26,6 +26,7 @@ connector = "ros2"
 layout = "other.toml"
 period_ms = 20
 domain = DOMAIN
+timeout = 1000
 """
 
 

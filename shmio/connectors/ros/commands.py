@@ -33,7 +33,6 @@ class Publication:
         self.message: Any = None
         self.writes: set[int] = set()
         self.values: dict[int, Value] = {}
-        self.refusal = ""
 
 
 def plan(topics: Topics, writes: Sequence[Write]) -> tuple[list[Publication], list[str]]:
@@ -61,19 +60,19 @@ def plan(topics: Topics, writes: Sequence[Write]) -> tuple[list[Publication], li
                 drafts.append(draft)
             draft.values[index] = value
             draft.writes.add(number)
-    while True:
+    failed = True
+    while failed:  # a message may build on one that is not sent after all
+        failed = False
         bases = {draft.topic.name: draft.topic.message for draft in drafts}
         for draft in drafts:
             try:
                 draft.message = bases[draft.topic.name] = _message(topics, draft, bases[draft.topic.name])
             except ValueError as error:
-                draft.refusal = str(error)
-                break
-        else:
-            return drafts, outcomes
-        for number in draft.writes:
-            outcomes[number] = outcomes[number] or draft.refusal
+                failed = True
+                for number in draft.writes:
+                    outcomes[number] = outcomes[number] or str(error)
         drafts = [one for one in drafts if not any(outcomes[number] for number in one.writes)]
+    return drafts, outcomes
 
 
 def mark_lost(outcomes: list[str | Lost], publications: Sequence[Publication], place: int) -> None:

@@ -23,7 +23,7 @@ from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
 
 DEFAULT_PORT: Final = 9090
-FIRST_S: Final = 0.2
+FIRST_S: Final = 0.1
 """How long a new connection waits for the first messages."""
 
 
@@ -92,7 +92,9 @@ class RosbridgeConnector(Connector):
         self.close()
         self._topics.reset()
         options = self._options
-        link = self._link = Link(options.full_url, options.address, options.timeout / 1000, options.max_message_bytes)
+        link = self._link = Link(
+            options.full_url, options.address, options.timeout / 1000, options.max_message_bytes, self._topics.by_name
+        )
         try:
             for topic in self._topics.by_name.values():
                 link.send(
@@ -101,7 +103,7 @@ class RosbridgeConnector(Connector):
                 )  # fmt: skip
                 if topic.writable:
                     link.send(op="advertise", id=f"advertise:{topic.name}", topic=topic.name, type=topic.type)
-            link.wait_newest(set(self._topics.by_name), time.monotonic() + min(FIRST_S, options.timeout / 1000))
+            link.wait_newest(time.monotonic() + min(FIRST_S, options.timeout / 1000))
             link.check()
         except ConnectorError:
             self.close()

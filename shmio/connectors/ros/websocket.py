@@ -11,7 +11,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
@@ -54,8 +54,15 @@ _envelope = msgspec.json.Decoder(_Envelope)
 class Link:
     """A connection to a rosbridge server."""
 
-    def __init__(self, url: str, peer: Address, timeout_s: float, max_bytes: int) -> None:
+    def __init__(self, url: str, peer: Address, timeout_s: float, max_bytes: int, topics: Collection[str]) -> None:
         """Connect.
+
+        Args:
+            url: The server's URL.
+            peer: Its host and port.
+            timeout_s: Time-out for the connection, and for the silence of the server.
+            max_bytes: The largest message that is accepted.
+            topics: The topics whose messages are kept.
 
         Raises:
             ConnectorError: The server cannot be reached, or is no WebSocket.
@@ -64,7 +71,7 @@ class Link:
         from websockets.exceptions import WebSocketException  # noqa: PLC0415  the library is optional
         from websockets.sync.client import connect  # noqa: PLC0415
 
-        self._peer, self._timeout_s = peer, timeout_s
+        self._peer, self._timeout_s, self._topics = peer, timeout_s, topics
         self._closed_errors = (WebSocketException, OSError)
         self._condition = threading.Condition()
         self._newest: dict[str, Received] = {}
@@ -118,11 +125,11 @@ class Link:
             found, self._newest = self._newest, {}
         return found
 
-    def wait_newest(self, topics: set[str], until_s: float) -> None:
-        """Wait until all topics have a message, at most until a time of CLOCK_MONOTONIC in s."""
+    def wait_newest(self, until_s: float) -> None:
+        """Wait until each topic has a message, at most until a time of CLOCK_MONOTONIC in s."""
         with self._condition:
             self._condition.wait_for(
-                lambda: self._failure or topics <= self._newest.keys(), max(0.0, until_s - time.monotonic())
+                lambda: self._failure or len(self._newest) == len(self._topics), max(0.0, until_s - time.monotonic())
             )
 
     def check(self) -> None:
@@ -211,6 +218,8 @@ class Link:
             self._take_status(envelope)
 
     def _take_message(self, envelope: _Envelope) -> None:
+        if envelope.topic not in self._topics:
+            return
         json = envelope.msg.copy()
         with self._condition:
             self._newest[envelope.topic] = Received(json, self.heard_ns, time.time_ns())

@@ -134,6 +134,8 @@ class Node:
                 self.last += 1
                 self.counts.write(Float64MultiArray_(MultiArrayLayout_([], 0), [float(self.last)] * size))
 
+        if self.counting is not None:
+            return
         self.stopped.clear()
         self.counting = threading.Thread(target=run)
         self.counting.start()

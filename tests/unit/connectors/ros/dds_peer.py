@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import json
 import os
@@ -12,6 +13,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import pytest
+
 PROGRAM = Path(__file__).with_name("dds_node.py")
 DOMAIN = 100 + os.getpid() % 100
 _numbers = itertools.count(1)
@@ -21,6 +24,8 @@ class Peer:
     """A running node; its topics begin with ``prefix``, so that tests do not disturb each other."""
 
     def __init__(self) -> None:
+        if importlib.util.find_spec("cyclonedds") is None:
+            pytest.skip("needs cyclonedds")
         self.prefix = f"p{os.getpid()}_{next(_numbers)}"
         self.domain = DOMAIN
 

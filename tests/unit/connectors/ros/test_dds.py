@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from shmio.connectors import registry
 from shmio.connectors.ros.dds import Ros2Connector, Ros2Options
-from shmio.connectors.ros.dds_types import dds_type, sample_type, to_message, to_sample
 from shmio.connectors.ros.messages import DEFINITIONS, default
 from shmio.errors import ConfigError, ConnectorError
 from shmio.model import statuses
@@ -150,13 +150,26 @@ def test_garbage_and_large_messages_do_no_harm(peer: Peer) -> None:
 
 @pytest.mark.parametrize("kind", DEFINITIONS)
 def test_each_type_passes_through_its_dds_type(kind: str) -> None:
+    pytest.importorskip("cyclonedds")
+    from shmio.connectors.ros.dds_types import dds_type, sample_type, to_message, to_sample
+
     message = default(kind)
     data = to_sample(message, kind).serialize()
     assert to_message(sample_type(kind).deserialize(data), kind) == message
     assert dds_type(kind).startswith(f"{kind.partition('/')[0]}::msg::dds_::")
 
 
+@pytest.mark.parametrize(("name", "library"), [("ros2", "cyclonedds"), ("rosbridge", "websockets")])
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch, name: str, library: str) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda wanted: None if wanted == library else object())
+    kind: Any = registry.load(name)
+    options = registry.convert_options(name, {"url": "ws://robot"} if name == "rosbridge" else {})
+    with pytest.raises(ConfigError, match=rf"pip install 'shmio\[{name}\]'"):
+        kind(options, layout_of({"r": ("LREAL", "/a std_msgs/Float64 data")}))
+
+
 def test_what_is_wrong_is_said_before_anything_starts() -> None:
+    pytest.importorskip("cyclonedds")
     with pytest.raises(ConfigError, match="can be read"):
         Ros2Connector(Ros2Options(), layout_of({"r": ("LREAL", "/a my_msgs/Thing x")}))
     with pytest.raises(ValueError, match="peers"):

@@ -11,6 +11,7 @@ import pytest
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
 from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.values.write import encode
 from shmio.model import statuses
 from tests.unit.connectors.ros.bridge import Bridge
 from tests.unit.connectors.ros.harness import connected, layout_of
@@ -123,6 +124,23 @@ def test_what_is_not_of_the_protocol_ends_the_connection(bridge: Bridge, text: s
         bridge.ask("raw", text)
         with pytest.raises(ConnectorError, match="rosbridge protocol"):
             source.until(lambda: False)
+
+
+def test_topics_that_nobody_asked_for_are_ignored(bridge: Bridge) -> None:
+    with connected(bridge.url, JOINTS) as source:
+        for number in range(100):
+            bridge.ask("raw", f'{{"op": "publish", "topic": "/t{number}", "msg": {{}}}}')
+        bridge.ask("publish", "/joint_states", joint_state(["j1"], [1.0]))
+        source.until(lambda: source.code("j1") == 0)
+
+
+def test_both_values_of_a_pulse_are_published(bridge: Bridge) -> None:
+    with connected(bridge.url, TWIST) as source:
+        assert source.write(vx=1.0, wz=0.5) == ["", ""]
+        register = source.layout.registers[source.layout.by_path["vx"]]
+        pulse = [encode(register, value, source.layout.byte_order)[0] for value in (2.0, 0.0)]
+        assert source.connector.write(pulse) == ["", ""]
+        assert [one["linear"]["x"] for one in bridge.ask("history", "/cmd_vel")] == [1.0, 2.0, 0.0]
 
 
 def test_a_large_or_a_binary_message_ends_the_connection(bridge: Bridge) -> None:

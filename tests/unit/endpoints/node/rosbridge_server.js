@@ -17,6 +17,7 @@ function topicOf(name) {
 
 function deliver(name, msg) {
   topicOf(name).last = msg
+  topicOf(name).history = [...(topicOf(name).history ?? []), msg].slice(-10)
   for (const [socket, client] of clients) {
     if (client.subscribed.has(name)) socket.send(JSON.stringify({ op: 'publish', topic: name, msg }))
   }
@@ -51,6 +52,7 @@ const commands = {
   binary: hex => { for (const socket of clients.keys()) socket.send(Buffer.from(hex, 'hex')) },
   refuse: (topic, text) => { topicOf(topic).refused = text },
   last: topic => topicOf(topic).last,
+  history: topic => topicOf(topic).history,
   forget: topic => { topics.delete(topic) },
   clients: () => clients.size,
   advertised: () => [...clients.values()].flatMap(client => [...client.advertised]),
