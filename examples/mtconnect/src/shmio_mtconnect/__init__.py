@@ -1,0 +1,1 @@
+"""The connector mtconnect for shmio: machine tools by MTConnect."""

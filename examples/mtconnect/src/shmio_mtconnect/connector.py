@@ -1,0 +1,232 @@
+"""The connector mtconnect: its keys of ``[[source]]``, and the stream of an agent in an image."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import defaultdict
+from typing import Annotated, Final
+from urllib.parse import urlsplit
+
+import msgspec
+
+from shmio.connectors.base import Connector
+from shmio.connectors.register_image import RegisterImage
+from shmio.errors import ConnectorError
+from shmio.layout.model import Layout
+from shmio.model.statuses import BAD_WAITING_FOR_INITIAL_DATA
+from shmio_mtconnect.documents import DevicesDocument, Streams, StreamsDocument
+from shmio_mtconnect.http import Exchange
+from shmio_mtconnect.values import Target, find, parse
+
+MAX_REPORTED: Final = 20
+"""Registers without a data item that are reported by name."""
+CLOSE_S: Final = 2.0
+
+log = logging.getLogger("shmio.source")
+
+
+class MTConnectOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """The connector's own keys of ``[[source]]``.
+
+    Raises:
+        ValueError: The URL is invalid.
+
+    """
+
+    url: Annotated[str, msgspec.Meta(min_length=8, max_length=1000)]
+    """``http://HOST:PORT`` of the agent; a path behind it comes before each request."""
+    timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 2000
+    """Time-out in ms for each document, and for a heartbeat that is late."""
+    interval: Annotated[int, msgspec.Meta(ge=1, le=60_000)] = 100
+    """Shortest time in ms between two documents of the stream."""
+    heartbeat: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 1000
+    """Longest time in ms between two documents of the stream."""
+    count: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1000
+    """Most observations in one document. The agent may refuse more than its buffer has."""
+
+    def __post_init__(self) -> None:
+        try:
+            parts = urlsplit(self.url)
+            valid = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port or 1) > 0
+        except ValueError:
+            valid = False
+        if not valid or not self.url.isascii() or not self.url.isprintable() or " " in self.url:
+            raise ValueError(f"url: {self.url[:80]!r} is no address of an agent, such as http://192.168.0.20:5000")
+        if parts.query or parts.fragment or parts.username is not None:
+            raise ValueError("url: leave out everything from ? or # on, and users: expected http://HOST:PORT/PATH")
+
+
+class MTConnectConnector(Connector):
+    """Follows the stream of an agent, and gives the present state as the image of each cycle."""
+
+    Options = MTConnectOptions
+    register_quality = True
+
+    def __init__(self, options: MTConnectOptions, layout: Layout) -> None:
+        self._options, self._layout = options, layout
+        self._addresses = [parse(register) for register in layout.registers]
+        self._image = RegisterImage(layout) if layout.status_offset is not None else None
+        self._lock = threading.Lock()  # of the image, and of the state of the stream below
+        self._follower: _Follower | None = None
+
+    @property
+    def timeout_s(self) -> float:
+        """The longest time that any hook blocks, in s: a connection has three requests."""
+        return 4 * self._options.timeout / 1000 + CLOSE_S
+
+    @property
+    def doubt(self) -> str:
+        """Why values are uncertain: the stream has fallen behind the agent."""
+        behind = self._follower.behind if self._follower is not None else 0
+        if behind <= self._options.count:
+            return ""
+        return f"the stream is {behind} observations behind the agent: raise count, or reduce interval"
+
+    def describe(self) -> str:
+        """Return the peer and how it is read, for the log."""
+        known = len(self._follower.targets) if self._follower is not None else 0
+        return f"to {self._options.url}, {known} data items"
+
+    def connect(self) -> None:
+        """Ask for the device model and the present state, and open the stream from there.
+
+        Raises:
+            ConnectorError: The agent cannot be reached, or is none.
+
+        """
+        self.close()
+        if self._image is None:
+            raise ConnectorError("the layout has no status area")
+        for index in range(len(self._addresses)):
+            self._image.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
+        self._follower = _Follower(self._options, self._image, self._lock, self._targets(self._image))
+        self._follower.start()
+
+    def read(self) -> bytes:
+        """Return the present state, if the stream is certainly alive.
+
+        Raises:
+            ConnectorError: The stream is lost, or its heartbeat is missing.
+
+        """
+        if self._follower is None or self._image is None:
+            raise ConnectorError(f"not connected to {self._options.url}")
+        with self._lock:
+            self._follower.check()
+            return bytes(self._image)
+
+    def close(self) -> None:
+        """Close the stream. It may be called at any time and more than once."""
+        if self._follower is not None:
+            self._follower.close()
+            self._follower = None
+
+    def _targets(self, image: RegisterImage) -> dict[str, list[Target]]:
+        """Ask for the device model; return the registers of each data item."""
+        devices = DevicesDocument()
+        exchange = Exchange(self._options.url, self._options.timeout)
+        try:
+            exchange.document("probe", devices)
+        finally:
+            exchange.close()
+        ids = defaultdict(list)
+        for item in devices.items:
+            ids[item.id].append(item)
+        found: dict[str, list[Target]] = defaultdict(list)
+        missing = 0
+        for index, (register, address) in enumerate(zip(self._layout.registers, self._addresses, strict=True)):
+            candidates = ids.get(address.parts[0], []) if len(address.parts) == 1 else devices.items
+            item, code, why = find(address, candidates)
+            if item is not None:
+                found[item.id].append(Target(index, register, address, item))
+                continue
+            image.fail(index, code)
+            missing += 1
+            if missing <= MAX_REPORTED:
+                log.warning("%s: %s", register.path, why)
+        if missing > MAX_REPORTED:
+            log.warning("%d more registers have no data item: shmio get shows all", missing - MAX_REPORTED)
+        return dict(found)
+
+
+class _Follower:
+    """Follows the stream of one connection in a thread. After an error it is done."""
+
+    def __init__(
+        self, options: MTConnectOptions, image: RegisterImage, lock: threading.Lock, targets: dict[str, list[Target]]
+    ) -> None:
+        self._options, self._image, self._lock, self.targets = options, image, lock, targets
+        self._stream = Exchange(options.url, options.timeout)
+        self._thread: threading.Thread | None = None
+        self._instance = ""
+        self._next = 0
+        self._error = ""
+        self._heard_ns = 0
+        self.behind = 0
+        """Observations that the agent has and has not sent yet, when it sent the last document."""
+
+    def start(self) -> None:
+        """Take the whole state, and open the stream that continues it; ConnectorError."""
+        current = StreamsDocument(self.targets)
+        exchange = Exchange(self._options.url, self._options.timeout)
+        try:
+            exchange.document("current", current)
+        finally:
+            exchange.close()
+        self._instance, self._next = current.streams.instance_id, current.streams.next_sequence
+        with self._lock:
+            self._store(current.streams, whole=True)
+        options = self._options
+        request = f"sample?from={self._next}&interval={options.interval}&count={options.count}"
+        with self._stream.answer_within():
+            self._stream.begin(f"{request}&heartbeat={options.heartbeat}")
+        self._stream.keep_waiting((options.heartbeat + options.interval + options.timeout) / 1000)
+        self._heard_ns = time.monotonic_ns()
+        self._thread = threading.Thread(target=self._follow, name="mtconnect", daemon=True)
+        self._thread.start()
+
+    def check(self) -> None:
+        """Raise ConnectorError unless the last document is recent; the caller has the lock."""
+        if self._error:
+            raise ConnectorError(self._error)
+        limit_ms = self._options.heartbeat + self._options.interval + self._options.timeout
+        if time.monotonic_ns() - self._heard_ns > limit_ms * 1_000_000:
+            raise ConnectorError(f"no answer from {self._stream.peer} within {limit_ms} ms: the heartbeat is missing")
+
+    def close(self) -> None:
+        """Close the stream, and wait for the thread."""
+        self._stream.close()
+        if self._thread is not None:
+            self._thread.join(CLOSE_S)
+
+    def _follow(self) -> None:
+        try:
+            for part in self._stream.parts():
+                document = StreamsDocument(self.targets)
+                document.feed(part)
+                self._take(document.finish())
+        except ConnectorError as error:
+            self._error = str(error)
+        except Exception as error:  # noqa: BLE001  a defect must not leave old values good
+            log.exception("the thread of the stream has failed")
+            self._error = f"the thread of the stream has failed: {error}"
+
+    def _take(self, streams: Streams) -> None:
+        if streams.instance_id != self._instance:
+            raise ConnectorError(f"{self._stream.peer} has restarted: its instanceId is {streams.instance_id!r} now")
+        if streams.next_sequence < self._next:
+            raise ConnectorError(
+                f"{self._stream.peer} goes back to observation {streams.next_sequence} behind {self._next}"
+            )
+        with self._lock:
+            self._store(streams, whole=False)
+            self._next = streams.next_sequence
+            self.behind = max(0, streams.last_sequence + 1 - streams.next_sequence)
+            self._heard_ns = time.monotonic_ns()
+
+    def _store(self, streams: Streams, *, whole: bool) -> None:
+        for observation in streams.observations:
+            for target in self.targets[observation.item]:
+                target.put(self._image, observation, whole=whole)

@@ -1,0 +1,227 @@
+"""Values, quality and recovery, against an agent in another language."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from agent import Agent
+from shmio.connectors import registry
+from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import codec
+from shmio.model.statuses import StatusArea, describe
+
+from shmio_mtconnect.connector import MTConnectConnector, MTConnectOptions
+
+TAGS: dict[str, object] = {
+    "x": {"type": "LREAL", "address": "VMC/X/act"},
+    "y": {"type": "INT", "address": "VMC/base/Y/POSITION.ACTUAL", "scale": [10.0, 1.0]},
+    "running": {"type": "BOOL", "address": "exec=ACTIVE"},
+    "execution": {"type": "STRING[20]", "address": "VMC/controller/path/EXECUTION"},
+    "position": {"type": "ARRAY[0..2] OF REAL", "address": "pos"},
+    "vibration": {"type": "ARRAY[0..3] OF INT", "address": "vib"},
+    "level": {"type": "USINT", "address": "hyd"},
+    "fault": {"type": "STRING[60]", "address": "hyd"},
+    "is_fault": {"type": "BOOL", "address": "hyd=Fault"},
+    "parts": {"type": "UINT", "address": "count"},
+    "set": {"type": "INT", "address": "set"},
+    "gone": {"type": "INT", "address": "VMC/gone"},
+    "either": {"type": "REAL", "address": "VMC/act"},
+}
+
+
+class Reader:
+    """A connector, and what its images have."""
+
+    def __init__(self, agent: Agent, **options: int) -> None:
+        self.layout = place_tags("device", TAGS).with_statuses()
+        keys = {"timeout": 500, "interval": 5, "heartbeat": 50} | options
+        self.connector = MTConnectConnector(MTConnectOptions(url=f"http://{agent.address}", **keys), self.layout)
+
+    def read(self) -> dict[str, object]:
+        """Return value, or the name of its status, by path."""
+        raw, area = self.connector.read(), StatusArea(self.layout)
+        found: dict[str, object] = {}
+        for index, register in enumerate(self.layout.registers):
+            code = area.get(raw, index).code
+            found[register.path] = describe(code).split()[0] if code else codec(register, "little").decode(raw)
+        return found
+
+    def until(self, condition: Callable[[dict[str, object]], bool]) -> dict[str, object]:
+        """Read until a condition is true."""
+        end = time.monotonic() + 10
+        while not condition(found := self.read()):
+            assert time.monotonic() < end, found
+        return found
+
+    def error(self) -> str:
+        """Read until the connection is lost; return why."""
+        end = time.monotonic() + 10
+        while time.monotonic() < end:
+            try:
+                self.connector.read()
+            except ConnectorError as error:
+                return str(error)
+        raise AssertionError("the connection is not lost")
+
+
+@pytest.fixture
+def agent() -> Iterator[Agent]:
+    """Provide an agent."""
+    with Agent() as running:
+        yield running
+
+
+@pytest.fixture
+def reader(agent: Agent) -> Iterator[Reader]:
+    """Provide a reader of the agent."""
+    made = Reader(agent)
+    yield made
+    made.connector.close()
+
+
+@pytest.mark.parametrize("version", ["1.3", "1.8", "2.3"])
+def test_values_of_all_kinds(agent: Agent, reader: Reader, version: str) -> None:
+    """Samples, events, vectors, time series and conditions, from ``current`` and from the stream."""
+    agent.tell(version=version)
+    agent.set(Xact="1.5")
+    reader.connector.connect()
+    first = reader.read()
+    assert (first["x"], first["y"]) == (1.5, "BadNoData")
+    assert first["gone"] == "BadNodeIdUnknown"
+    assert first["either"] == "BadConfigurationError"
+    assert first["set"] == "BadNotSupported"
+    agent.set(Yact="2.5", exec="ACTIVE", pos="1 2.5 -3e1", vib="9 1 2 3 4", count="70000")
+    agent.condition("hyd", "Warning", "W1", "Oil <low>")
+    agent.condition("hyd", "Fault", "F7", "Pump")
+    found = reader.until(lambda one: one["level"] == 2)
+    assert found == first | {
+        "y": 26,
+        "running": True,
+        "execution": "ACTIVE",
+        "position": [1.0, 2.5, -30.0],
+        "vibration": [1, 2, 3, 4],
+        "level": 2,
+        "fault": "Fault [F7] Pump",
+        "is_fault": True,
+        "parts": "BadOutOfRange",
+    }
+    agent.condition("hyd", "Normal", "F7")
+    assert reader.until(lambda one: one["level"] == 1)["fault"] == "Warning [W1] Oil <low>"
+    agent.condition("hyd", "Normal")
+    assert reader.until(lambda one: one["level"] == 0)["fault"] == "Normal"
+    agent.condition("hyd", "Unavailable")
+    agent.set(exec="INTERRUPTED", Xact="UNAVAILABLE", Yact="fast", vib="1 2", count="7")
+    found = reader.until(lambda one: one["parts"] == 7)
+    assert (found["level"], found["x"], found["y"]) == ("BadNoData", "BadNoData", "BadTypeMismatch")
+    assert (found["vibration"], found["running"], found["execution"]) == ("BadOutOfRange", False, "INTERRUPTED")
+
+
+def test_source_time_is_the_timestamp(agent: Agent, reader: Reader) -> None:
+    """With fractions of any length."""
+    agent.tell(set={"Xact": "1"}, at="2024-02-29T12:00:00.123456789Z")
+    agent.tell(set={"Yact": "1"}, at="2024-02-29T13:00:00+01:00")
+    reader.connector.connect()
+    raw, area = reader.connector.read(), StatusArea(reader.layout)
+    second_ns = 1_709_208_000_000_000_000
+    assert [area.get(raw, index).source_ns for index in (0, 1)] == [second_ns + 123_456_789, second_ns]
+
+
+def test_active_conditions_of_the_present_state(agent: Agent, reader: Reader) -> None:
+    """All of them are in ``current``; when the worst one ends, the other one remains."""
+    agent.condition("hyd", "Fault", "F7", "Pump")
+    agent.condition("hyd", "Warning", "W1", "Oil")
+    reader.connector.connect()
+    assert reader.read()["fault"] == "Fault [F7] Pump"
+    agent.condition("hyd", "Normal", "F7")
+    reader.until(lambda one: one["fault"] == "Warning [W1] Oil")
+
+
+def test_a_restarted_agent_is_read_anew(agent: Agent, reader: Reader) -> None:
+    """Its sequence begins again, and the connector begins with the present state."""
+    agent.set(Xact="1", count="1")
+    reader.connector.connect()
+    agent.tell(restart=True)
+    assert "has restarted" in reader.error()
+    agent.set(Xact="2")
+    reader.connector.connect()
+    found = reader.read()
+    assert (found["x"], found["parts"]) == (2.0, "BadNoData")
+
+
+def test_a_missing_heartbeat(agent: Agent, reader: Reader) -> None:
+    """The connection is open and silent: no old value stays good."""
+    reader.connector.connect()
+    agent.tell(silent=True)
+    assert "no answer" in reader.error()
+
+
+def test_observations_that_fell_out_of_the_buffer(agent: Agent, reader: Reader) -> None:
+    """The stream ends with the agent's error, and the next connection begins with the present state."""
+    reader.connector.connect()
+    agent.tell(silent=True)
+    agent.tell(buffer=20)
+    for number in range(40):
+        agent.set(count=str(number))
+    agent.tell(silent=False)
+    assert "OUT_OF_RANGE" in reader.error()
+    reader.connector.connect()
+    assert reader.read()["parts"] == 39
+
+
+@pytest.mark.parametrize(
+    ("answer", "error"),
+    [
+        ("garbage", "not valid XML"),
+        ("<html/>", "where MTConnectDevices is expected"),
+        (
+            "<!DOCTYPE a [<!ENTITY b 'cc'><!ENTITY c '&b;&b;'>]><MTConnectDevices>&c;</MTConnectDevices>",
+            "document type",
+        ),
+        ("<MTConnectDevices>" + "<a>" * 100, "nested more than 64"),
+        ("<MTConnectDevices>" + "x" * (1 << 21), "more than 1048576 characters"),
+        ("<MTConnectDevices>" + "<DataItem id='a'/>" * 100_001, "more than 100000 data items"),
+        ("<MTConnectDevices>" + "<!-- " + "x" * (33 << 20), "more than 32 MiB"),
+        ("<MTConnectDevices>", "not valid XML"),
+        ("<MTConnectError><Errors><Error errorCode='X'>so</Error></Errors></MTConnectError>", "agent reports: X so"),
+    ],
+    ids=["garbage", "html", "entities", "depth", "text", "items", "size", "cut", "error"],
+)
+def test_hostile_documents(agent: Agent, answer: str, error: str) -> None:
+    """Each is refused with a reason, and limited."""
+    reader = Reader(agent, timeout=5000)
+    agent.tell(raw=answer)
+    with pytest.raises(ConnectorError, match=error):
+        reader.connector.connect()
+    reader.connector.close()
+
+
+@pytest.mark.parametrize(
+    "tag",
+    [
+        "REAL",
+        {"type": "REAL", "address": "a//b"},
+        {"type": "INT", "address": "exec=ACTIVE"},
+        {"type": "DTL", "address": "a"},
+    ],
+)
+def test_registers_that_it_cannot_read_are_refused(tag: object) -> None:
+    """The error names the register."""
+    with pytest.raises(ConfigError, match="speed"):
+        MTConnectConnector(MTConnectOptions(url="http://a"), place_tags("device", {"speed": tag}).with_statuses())
+
+
+@pytest.mark.parametrize(
+    "url", ["ftp://host:1", "http://", "http://a b", "http://a:99999", "http://u@a", "http://a/?b"]
+)
+def test_addresses_of_agents(url: str) -> None:
+    """Only plain ones are accepted."""
+    with pytest.raises(ValueError, match="url"):
+        MTConnectOptions(url=url)
+
+
+def test_shmio_finds_it_by_its_entry_point() -> None:
+    """The package must be installed: pip install -e ."""
+    assert registry.load("mtconnect") is MTConnectConnector

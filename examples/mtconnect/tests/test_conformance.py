@@ -1,0 +1,56 @@
+"""The suite that all connectors of shmio pass, against an agent in another language."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from agent import Agent
+from shmio.connectors.base import Connector
+from shmio.layout.model import Layout
+from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import codec
+from shmio.testing.conformance import ConnectorConformance
+from shmio.testing.proxy import FaultProxy
+
+from shmio_mtconnect.connector import MTConnectConnector, MTConnectOptions
+
+PIECE = 64
+
+
+class Rig:
+    """The agent behind a proxy that breaks the connection."""
+
+    def __init__(self, proxy: FaultProxy) -> None:
+        self.proxy = proxy
+        tags: dict[str, object] = {
+            "count": {"type": "UDINT", "address": "count"},
+            "copy": {"type": "LREAL", "address": "VMC/copy"},
+        }
+        self.layout: Layout = place_tags("device", tags).with_statuses()
+
+    def connector(self) -> Connector:
+        """Return a connector to the agent."""
+        options = MTConnectOptions(url=f"http://{self.proxy.address}", timeout=200, interval=5, heartbeat=50)
+        return MTConnectConnector(options, self.layout)
+
+    def generation(self, raw: bytes) -> int:
+        """Return the count that an image has."""
+        count, copy = (codec(register, "little").decode(raw) for register in self.layout.registers)
+        assert isinstance(count, int)
+        assert copy == count, "values of two moments in one image"
+        return count
+
+
+class TestMTConnect(ConnectorConformance):
+    """The connector passes the suite of all connectors."""
+
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig]:
+        """Provide the agent, which counts, behind the proxy."""
+        with Agent() as agent:
+            agent.tell(count=True)
+            agent.set(count="0", copy="0")
+            # A frame is a piece of the stream, so that faults hit the middle of a document.
+            with FaultProxy(agent.address, framing=lambda data: min(len(data), PIECE)) as proxy:
+                yield Rig(proxy)
