@@ -1,7 +1,7 @@
 // An MTConnect agent for the tests, written from the public standard (parts 1 to 3, version 1.3 to 2.x).
 // It shares no code with the connector. It prints its port, and takes one command in JSON per line on its
 // standard input, answering "ok" to each: {"set": {"Xact": "1.5"}, "at": "…"}, {"restart": true},
-// {"silent": true}, {"condition": [id, element, code, text]}, {"version": "1.3"}, {"buffer": 100}, {"raw": "…"}.
+// {"silent": true}, {"condition": [id, element, code, text]}, {"version": "1.3"}, {"buffer": 100}, {"raw": [begin, repeated, times]}.
 'use strict'
 const http = require('http')
 const readline = require('readline')
@@ -148,7 +148,7 @@ readline.createInterface({ input: process.stdin }).on('line', line => {
   if (command.buffer) limit = command.buffer
   if (command.count) counted = 1
   if ('silent' in command) silent = command.silent
-  if ('raw' in command) raw = command.raw
+  if (command.raw) raw = command.raw[0] + command.raw[1].repeat(command.raw[2])
   if (command.restart) { instanceId++; begin() }
   for (const [id, text] of Object.entries(command.set || {})) add(id, ITEMS[id][1], text, command.at)
   if (command.condition) { const [id, element, code, text] = command.condition; add(id, element, text, command.at, code) }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+
 from agent import Agent
 from shmio.connectors.base import Connector
 from shmio.layout.model import Layout
@@ -12,7 +13,6 @@ from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
 from shmio.testing.conformance import ConnectorConformance
 from shmio.testing.proxy import FaultProxy
-
 from shmio_mtconnect.connector import MTConnectConnector, MTConnectOptions
 
 PIECE = 64

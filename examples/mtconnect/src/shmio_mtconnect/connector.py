@@ -132,8 +132,8 @@ class MTConnectConnector(Connector):
         finally:
             exchange.close()
         ids = defaultdict(list)
-        for item in devices.items:
-            ids[item.id].append(item)
+        for one in devices.items:
+            ids[one.id].append(one)
         found: dict[str, list[Target]] = defaultdict(list)
         missing = 0
         for index, (register, address) in enumerate(zip(self._layout.registers, self._addresses, strict=True)):
@@ -209,7 +209,7 @@ class _Follower:
                 self._take(document.finish())
         except ConnectorError as error:
             self._error = str(error)
-        except Exception as error:  # noqa: BLE001  a defect must not leave old values good
+        except Exception as error:
             log.exception("the thread of the stream has failed")
             self._error = f"the thread of the stream has failed: {error}"
 

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 from shmio.connectors.register_image import RegisterImage
 from shmio.errors import ConfigError
 from shmio.layout.model import INTEGERS, NUMBERS, Register
+from shmio.layout.values.codec import Value
 from shmio.model.statuses import (
     BAD_CONFIGURATION_ERROR,
     BAD_NO_DATA,
@@ -151,7 +152,7 @@ class Target:
         else:
             image.put(self._index, value, observation.source_ns)
 
-    def _value(self, text: str) -> bool | int | float | str | list[bool | int | float | str]:
+    def _value(self, text: str) -> Value:
         """Return the register's value; ValueError if the text is none, OverflowError if it is too short."""
         register = self._register
         if self._address.text is not None:
