@@ -96,8 +96,9 @@ class Ros2Connector(Connector):
             options.domain, options.interface, options.peers, options.max_message_bytes
         )
         joined = self._participant = participant.Participant(
-            options.domain, configured, self._topics.by_name.values(), timeout_s, options.reliability == "reliable"
-        )
+            options.domain, configured, self._topics.by_name.values(), timeout_s,
+            reliable=options.reliability == "reliable", loopback=options.interface == "lo",
+        )  # fmt: skip
         while not self._met(joined):
             if time.monotonic() > end_s:
                 self.close()
@@ -181,6 +182,7 @@ class Ros2Connector(Connector):
             raise ConnectorError(
                 f"no answer within {self._options.timeout} ms: a subscriber of {name} did not acknowledge the message"
             )
+        self._pull(joined)  # what others published before the confirmation is older
         self._topics.take(name, message, time.monotonic_ns(), now_ns)
         return ""
 

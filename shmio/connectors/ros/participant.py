@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
+import socket
+import stat
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final
 from xml.sax.saxutils import quoteattr
 
@@ -45,6 +50,35 @@ def configuration(domain: int, interface: str, peers: Iterable[str], max_message
     )
 
 
+def _sockets() -> Iterator[int]:
+    """Yield the descriptors of this process's sockets."""
+    for path in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):
+            if stat.S_ISSOCK(os.fstat(int(path.name)).st_mode):
+                yield int(path.name)
+
+
+def _keep_to_loopback(before: set[int]) -> None:
+    """Let the sockets that are not in ``before`` receive from this host only.
+
+    Cyclone DDS sends by the interface of its configuration, but receives from all.
+
+    Raises:
+        ConnectorError: The kernel does not allow it.
+
+    """
+    for descriptor in set(_sockets()) - before:
+        with socket.socket(fileno=os.dup(descriptor)) as made:
+            if made.family != socket.AF_INET or made.type != socket.SOCK_DGRAM:
+                continue
+            try:
+                made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+            except OSError as error:
+                raise ConnectorError(
+                    f"cannot keep other hosts out: {error.strerror}; use Linux 5.7 or later, or name an interface"
+                ) from None
+
+
 class _Endpoint:
     """The reader of a topic, and its writer if it has one."""
 
@@ -67,8 +101,18 @@ class _Endpoint:
 class Participant:
     """One participant; it has joined the domain until it is closed."""
 
-    def __init__(self, domain: int, configured: str, topics: Iterable[Topic], timeout_s: float, reliable: bool) -> None:
+    def __init__(
+        self, domain: int, configured: str, topics: Iterable[Topic], timeout_s: float, *, reliable: bool, loopback: bool
+    ) -> None:
         """Join the domain.
+
+        Args:
+            domain: The domain's id.
+            configured: What :func:`configuration` returns.
+            topics: The topics to read, and those of them to write.
+            timeout_s: How long a write may wait for room.
+            reliable: Whether publishers must be reliable.
+            loopback: Whether other hosts are kept out.
 
         Raises:
             ConnectorError: The interface does not exist, or the domain cannot be joined.
@@ -77,12 +121,18 @@ class Participant:
         self._endpoints: dict[str, _Endpoint] = {}
         self._domain = self._participant = None
         try:
+            before = set(_sockets())
             self._domain = Domain(domain, configured)
+            if loopback:
+                _keep_to_loopback(before)
             self._participant = DomainParticipant(domain)
             for topic in topics:
                 self._endpoints[topic.name] = _Endpoint(
                     self._participant, topic, reliable=reliable, blocking_ns=round(timeout_s * 1e9)
                 )
+        except ConnectorError:
+            self.close()
+            raise
         except DDSException as error:
             self.close()
             raise ConnectorError(

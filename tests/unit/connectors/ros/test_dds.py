@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import random
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -115,7 +117,6 @@ def test_without_any_publisher_the_source_is_bad() -> None:
 
 def test_a_command_reaches_the_node(peer: Peer) -> None:
     with connected(peer, max_age=0) as source:
-        peer.ask("spare", [1, 2])
         source.until(lambda: source.write(spare=[3, -4]) == [""])  # once it is discovered
         assert peer.ask("commanded") == [3, -4]
         source.read()
@@ -127,6 +128,23 @@ def test_a_command_reaches_the_node(peer: Peer) -> None:
     }
     with connected(peer, lonely) as source:
         assert "no node subscribes to /nobody" in source.write(nobody=1.0)[0]
+
+
+def descriptors() -> set[int]:
+    return {int(path.name) for path in Path("/proc/self/fd").iterdir()}
+
+
+def test_other_hosts_are_kept_out(peer: Peer) -> None:
+    """The library binds its receiving sockets to all addresses; the connector keeps them to loopback."""
+    before = descriptors()
+    devices = []
+    with connected(peer):
+        for descriptor in descriptors() - before:
+            with suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as found:
+                if found.family == socket.AF_INET and found.type == socket.SOCK_DGRAM:
+                    devices.append(found.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16))
+    assert len(devices) >= 2
+    assert set(devices) == {b"lo\0"}
 
 
 def test_garbage_and_large_messages_do_no_harm(peer: Peer) -> None:
