@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
-FLOATS: Final = frozenset({"float32", "float64"})
+FLOATS: Final = ("float32", "float64")
 INTEGERS: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
     {f"int{bits}": (-(1 << bits - 1), (1 << bits - 1) - 1) for bits in (8, 16, 32, 64)}
     | {f"uint{bits}": (0, (1 << bits) - 1) for bits in (8, 16, 32, 64)}
