@@ -1,6 +1,7 @@
 // An MTConnect agent for the tests, written from the public standard (parts 1 to 3, version 1.3 to 2.x).
 // It shares no code with the connector. It prints its port, and takes one command in JSON per line on its
 // standard input, answering "ok" to each: {"set": {"Xact": "1.5"}, "at": "…"}, {"restart": true},
+// {"parts": [bytes of the stream, milliseconds between its bytes]}, {"drip": true},
 // {"silent": true}, {"condition": [id, element, code, text]}, {"version": "1.3"}, {"buffer": 100}, {"raw": [begin, repeated, times]}.
 'use strict'
 const http = require('http')
@@ -13,6 +14,8 @@ let buffer = []
 let limit = 10000
 let silent = false
 let raw = null
+let parts = null
+let drip = false
 let counted = 0
 const state = {}
 const active = {} // conditions by data item: {code: observation}
@@ -95,11 +98,19 @@ function since (from, count) {
   return [found, found.length ? found[found.length - 1].sequence + 1 : from]
 }
 
+function dribble (response, text, pause) {
+  let at = 0
+  const step = pause ? 1 : text.length
+  const timer = setInterval(() => { response.write(text.slice(at, at + step)); at += step; if (at >= text.length) clearInterval(timer) }, pause || 1)
+  response.on('close', () => clearInterval(timer))
+}
+
 function serve (request, response) {
   const url = new URL(request.url, 'http://agent')
   const verb = url.pathname.split('/').pop()
   const number = (name, otherwise) => Number(url.searchParams.get(name) || otherwise)
   const send = (text, status = 200) => { response.writeHead(status, { 'Content-Type': 'text/xml' }); response.end(text) }
+  if (drip) { response.writeHead(200, { 'Content-Type': 'text/xml' }); dribble(response, ' '.repeat(100000), 20); return }
   if (raw !== null) { response.writeHead(200, { 'Content-Type': 'text/xml' }); response.end(raw); return }
   if (verb === 'probe') { send(devices()); return }
   if (verb === 'current') {
@@ -113,6 +124,7 @@ function serve (request, response) {
   const boundary = 'part-' + instanceId
   response.writeHead(200, { 'Content-Type': `multipart/x-mixed-replace;boundary=${boundary}` })
   response.socket.setNoDelay(true)
+  if (parts !== null) { dribble(response, ...parts); return }
   let sent = 0
   const interval = number('interval', 100)
   const heartbeat = number('heartbeat', 10000)
@@ -149,6 +161,8 @@ readline.createInterface({ input: process.stdin }).on('line', line => {
   if (command.count) counted = 1
   if ('silent' in command) silent = command.silent
   if (command.raw) raw = command.raw[0] + command.raw[1].repeat(command.raw[2])
+  if (command.parts) parts = command.parts
+  if (command.drip) drip = true
   if (command.restart) { instanceId++; begin() }
   for (const [id, text] of Object.entries(command.set || {})) add(id, ITEMS[id][1], text, command.at)
   if (command.condition) { const [id, element, code, text] = command.condition; add(id, element, text, command.at, code) }

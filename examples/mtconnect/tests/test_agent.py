@@ -195,6 +195,43 @@ def test_hostile_documents(agent: Agent, answer: tuple[str, str, int], error: st
     reader.connector.close()
 
 
+PART = "--part-1000\r\nContent-type: text/xml\r\n"
+
+
+@pytest.mark.parametrize(
+    ("parts", "error"),
+    [
+        ([f"{PART}\r\n<a/>", 0], "sends a part of unknown bytes"),
+        ([f"{PART}Content-length: 99999999\r\n\r\n", 0], "sends a part of 99999999 bytes"),
+        ([f"{PART}Content-length: -1\r\n\r\n", 0], "sends a part of -1 bytes"),
+        ([PART + "a: b\r\n" * 100, 0], "more than 32 headers"),
+        (["x" * 100_000, 0], "a header of more than 4096 bytes"),
+        (["<html>\r\n", 0], "where a part begins"),
+        (["--part-1000--\r\n", 0], "has ended the stream"),
+        ([f"{PART}Content-length: 13\r\n\r\n<!DOCTYPE a>\n", 0], "document type"),
+        ([f"{PART}Content-length: 3\r\n\r\n<a>", 0], "MTConnectStreams is expected"),
+        (["\r\n" * 10_000, 20], "no answer"),
+    ],
+    ids=["no length", "long", "negative", "headers", "line", "html", "end", "entities", "other", "drip"],
+)
+def test_hostile_streams(agent: Agent, parts: list[object], error: str) -> None:
+    """Each is refused with a reason; one that never completes a part misses its heartbeat."""
+    reader = Reader(agent)
+    agent.tell(parts=parts)
+    reader.connector.connect()
+    assert error in reader.error()
+    reader.connector.close()
+
+
+def test_a_document_that_drips(agent: Agent) -> None:
+    """It is late as a whole, although there is always another byte in time."""
+    reader = Reader(agent, timeout=300)
+    agent.tell(drip=True)
+    with pytest.raises(ConnectorError, match=r"no answer from .* within 300 ms"):
+        reader.connector.connect()
+    reader.connector.close()
+
+
 @pytest.mark.parametrize(
     "tag",
     [

@@ -16,7 +16,7 @@ from shmio.connectors.register_image import RegisterImage
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.model.statuses import BAD_WAITING_FOR_INITIAL_DATA
-from shmio_mtconnect.documents import DevicesDocument, Streams, StreamsDocument
+from shmio_mtconnect.documents import DataItem, DevicesDocument, Streams, StreamsDocument
 from shmio_mtconnect.http import Exchange
 from shmio_mtconnect.values import Target, find, parse
 
@@ -73,8 +73,8 @@ class MTConnectConnector(Connector):
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks, in s: a connection has three requests."""
-        return 4 * self._options.timeout / 1000 + CLOSE_S
+        """The longest time that any hook blocks, in s: a connection has three requests, and finds data items."""
+        return 5 * self._options.timeout / 1000 + CLOSE_S
 
     @property
     def doubt(self) -> str:
@@ -131,14 +131,20 @@ class MTConnectConnector(Connector):
             exchange.document("probe", devices)
         finally:
             exchange.close()
-        ids = defaultdict(list)
+        deadline = time.monotonic() + self._options.timeout / 1000
+        by_name: dict[str, list[DataItem]] = defaultdict(list)
         for one in devices.items:
-            ids[one.id].append(one)
+            for name in one.names[-1]:
+                by_name[name].append(one)
         found: dict[str, list[Target]] = defaultdict(list)
         missing = 0
         for index, (register, address) in enumerate(zip(self._layout.registers, self._addresses, strict=True)):
-            candidates = ids.get(address.parts[0], []) if len(address.parts) == 1 else devices.items
-            item, code, why = find(address, candidates)
+            if time.monotonic() > deadline:
+                raise ConnectorError(
+                    f"finding the data items takes longer than {self._options.timeout} ms: name them by dataItemId, or "
+                    "raise timeout"
+                )
+            item, code, why = find(address, by_name.get(address.parts[-1], []))
             if item is not None:
                 found[item.id].append(Target(index, register, address, item))
                 continue

@@ -18,6 +18,8 @@ from shmio.errors import ConnectorError
 MAX_DOCUMENT_BYTES: Final = 32 << 20
 MAX_DEPTH: Final = 64
 MAX_DATA_ITEMS: Final = 100_000
+MAX_OBSERVATIONS: Final = 100_000
+"""Most observations of wanted data items in one document."""
 MAX_TEXT: Final = 1 << 20
 """Longest text of one observation, in characters; a time series is one."""
 MAX_ERROR: Final = 300
@@ -198,6 +200,8 @@ class StreamsDocument:
     def finish(self) -> Streams:
         """Return the content; ConnectorError if the document is not complete, or an error of the agent."""
         self._parser.finish()
+        if not self.streams.instance_id:
+            raise ConnectorError("the agent's document has no Header with an instanceId")
         self.streams.observations.sort(key=lambda one: one.sequence)
         return self.streams
 
@@ -214,6 +218,8 @@ class StreamsDocument:
         if found is None or self._parser.parent not in _KINDS:
             return
         self._open = None
+        if len(self.streams.observations) >= MAX_OBSERVATIONS:
+            raise ConnectorError(f"the agent's document has more than {MAX_OBSERVATIONS} observations")
         self.streams.observations.append(
             Observation(
                 found["dataItemId"],

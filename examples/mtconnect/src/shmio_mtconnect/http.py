@@ -35,14 +35,15 @@ class Exchange:
         self._answer: http.client.HTTPResponse | None = None
         self._socket: socket.socket | None = None
         self._closed = False
+        self._late = False
 
     @contextmanager
     def answer_within(self) -> Iterator[None]:
         """Cut the connection after the time-out, and turn all faults into ConnectorError."""
-        late = threading.Event()
+        self._late = False
 
         def cut() -> None:
-            late.set()
+            self._late = True
             self._shut()
 
         timer = threading.Timer(self._timeout_ms / 1000, cut)
@@ -52,7 +53,7 @@ class Exchange:
             with self.faults():
                 yield
         except ConnectorError:
-            if late.is_set():
+            if self._late:
                 raise ConnectorError(f"no answer from {self.peer} within {self._timeout_ms} ms") from None
             raise
         finally:
@@ -74,8 +75,8 @@ class Exchange:
         """Send a request, and receive the headers of its answer; to be called within ``answer_within``."""
         self._connection.connect()
         self._socket = self._connection.sock
-        if self._closed:
-            raise ConnectorError("closed")
+        if self._closed or self._late:  # there was no socket yet to be shut
+            raise ConnectorError(f"the connection to {self.peer} was closed")
         self._connection.request("GET", f"{self._prefix}/{request}", headers={"Accept": "text/xml, application/xml"})
         self._answer = self._connection.getresponse()
 
@@ -85,9 +86,9 @@ class Exchange:
             self.begin(request)
             answer = self._opened()
             self._check(answer, streamed=False)
-            while data := answer.read1(_CHUNK):
+            while (data := answer.read1(_CHUNK)) and not self._late:  # parsing takes time, too
                 into.feed(data)
-            if answer.length:
+            if answer.length or self._late:
                 raise ConnectorError(f"{self.peer} has closed the connection in the middle of an answer")
             into.finish()
 
