@@ -82,7 +82,10 @@ def _loop_of(worker: Worker) -> _LoopHandle:
     options = registry.convert_options(name, worker.config["options"])
     if issubclass(found, Replayed):
         return _replay_loop(worker, options)
-    source = found(options, segment.blocks[worker.name].layout)
+    layout = segment.blocks[worker.name].layout
+    if issubclass(found, Connector):
+        found = found.for_layout(layout)
+    source = found(options, layout)
     writer = segment.writer(worker.name)  # after the source: a configuration error must not change the segment
     schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
     owner_of, blocks = partial(_owner_of, segment), partial(_blocks, segment)

@@ -75,6 +75,15 @@ class Connector(ABC):
     path_options: ClassVar[tuple[str, ...]] = ()
     """Those of its keys that are paths of files or folders, which are relative to the configuration."""
 
+    @classmethod
+    def for_layout(cls, layout: Layout) -> type[Connector]:  # noqa: ARG003  most read all layouts
+        """Return the class that reads a layout, with the same ``Options``.
+
+        A connector that needs ``register_quality`` only for some layouts returns another class for
+        these.
+        """
+        return cls
+
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:
         """Create the connector without connecting it.

@@ -51,6 +51,12 @@ class RegisterImage:
             code = BAD_OUT_OF_RANGE
         self._area.put(self._image, index, RegisterStatus(code, source_ns))
 
+    def put_bytes(self, index: int, data: bytes, source_ns: int = 0, code: int = GOOD) -> None:
+        """Store the value of a register as its bytes in the layout, which must be ``size`` bytes."""
+        register = self._layout.registers[index]
+        self._image[register.offset : register.offset + register.size] = data
+        self._area.put(self._image, index, RegisterStatus(code, source_ns))
+
     def fail(self, index: int, code: int, source_ns: int = 0) -> None:
         """Turn a register bad, or uncertain, with a status code; its last value stays."""
         self._area.put(self._image, index, RegisterStatus(code, source_ns))

@@ -59,9 +59,14 @@ _TYPES = {
     S7WordLen.DWORD: (4, 0x04, True),
     S7WordLen.DINT: (4, 0x05, True),
     S7WordLen.REAL: (4, 0x07, False),
+    S7WordLen.COUNTER: (2, 0x09, False),
+    S7WordLen.TIMER: (2, 0x09, False),
 }
 _LENGTH_IN_BITS = {0x04, 0x05}
-_AREAS = {int(area): area for area in S7Area}
+_PERIPHERAL = 0x80
+_AREAS = {int(area): area for area in S7Area} | {_PERIPHERAL: S7Area.PE}  # of peripheral access, inputs only
+_NUMBERED = {S7Area.CT: S7WordLen.COUNTER, S7Area.TM: S7WordLen.TIMER}
+"""Areas that are addressed by number, with the type that they need."""
 
 _TPKT = struct.Struct(">BxH")
 _DT = b"\x02\xf0\x80"  # COTP data, and the end of the message: PDUs fit a TPDU, so clients have no reason to split them
@@ -226,6 +231,10 @@ class Jobs:
         if area is None:
             return _Item(_NO_SUCH_OBJECT, nothing, 0, 0, 0, kind)
         size = count * _TYPES[S7WordLen(kind)][0]
+        if kind in _NUMBERED.values() or known in _NUMBERED:
+            if known is None or _NUMBERED.get(known) != kind:
+                return _Item(_NO_SUCH_TYPE, nothing, 0, 0, 0, kind)
+            start, bit = 2 * (place & 0xFFFF), 0
         if not count or (kind == _BIT and count != 1):
             return _Item(_TYPE_MISMATCH, nothing, 0, 0, 0, kind)
         if start + size > self._size(known, area) or (bit and kind != _BIT):
@@ -322,6 +331,13 @@ class S7Server(Server):
             raise ConfigError(f"DB{number} is served already")
         self.register_area(SrvArea.DB, number, data)
         self.area_locks[(S7Area.DB, number)] = self.lock  # for python-snap7's own code
+
+    def add_area(self, area: SrvArea, data: bytearray) -> None:
+        """Serve ``data``, in place, as the inputs, outputs, markers, timers or counters."""
+        self.register_area(area, 0, data)
+        for kind, number in self.memory_areas:
+            if number == 0:
+                self.area_locks[(kind, number)] = self.lock  # for python-snap7's own code
 
     @property
     def address(self) -> Address:

@@ -89,6 +89,7 @@ def _check_source(
     optimized = issubclass(connector, Connector) and connector.reads_optimized
     layout = files.get(key, source, source.options.get("dbNumber"), optimized=optimized)
     if issubclass(connector, Connector):
+        connector = connector.for_layout(layout)
         if connector.register_quality:
             layout = layout.with_statuses()
         if options is not None and (paths := [name for name in connector.path_options if source.options[name]]):

@@ -102,17 +102,19 @@ class BlockRead:
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
-def byte_item(db_number: int, start: int, data: bytes) -> tuple[bytes, bytes]:
+def byte_item(db_number: int, start: int, data: bytes, area: int = pdu.DATA_BLOCK) -> tuple[bytes, bytes]:
     """Return the encoded address and value of an item of bytes."""
-    return pdu.address(db_number, 8 * start, len(data)), _ITEM_HEAD.pack(0, _SIZE_BITS, 8 * len(data)) + data
+    return pdu.address(db_number, 8 * start, len(data), area=area), _ITEM_HEAD.pack(0, _SIZE_BITS, 8 * len(data)) + data
 
 
-def bit_item(db_number: int, start: int, bit: int, value: bool) -> tuple[bytes, bytes]:
+def bit_item(db_number: int, start: int, bit: int, value: bool, area: int = pdu.DATA_BLOCK) -> tuple[bytes, bytes]:
     """Return the encoded address and value of an item of one bit.
 
     The controller does not change the other bits of the byte.
     """
-    return pdu.address(db_number, 8 * start + bit, 1, pdu.TYPE_BIT), _ITEM_HEAD.pack(0, _SIZE_BIT, 1) + bytes((value,))
+    place = 8 * start + bit
+    head = _ITEM_HEAD.pack(0, _SIZE_BIT, 1)
+    return pdu.address(db_number, place, 1, pdu.TYPE_BIT, area), head + bytes((value,))
 
 
 def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes:
@@ -139,7 +141,9 @@ def parse_write_answer(frame: memoryview, count: int) -> bytes:
     return bytes(codes)
 
 
-class _Item(NamedTuple):
+class WriteItem(NamedTuple):
+    """A part of a write that one item of a job carries out."""
+
     write: int
     """Index of the write to which the item belongs."""
     last: int
@@ -154,7 +158,7 @@ class BlockWrite:
     refusals are stored in ``outcomes``.
     """
 
-    def __init__(self, db_number: int, pdu_size: int, items: Sequence[_Item], outcomes: list[str]) -> None:
+    def __init__(self, db_number: int, pdu_size: int, items: Sequence[WriteItem], outcomes: list[str]) -> None:
         self._db_number = db_number
         self._outcomes = outcomes
         self._jobs = list(_fill(items, pdu_size))
@@ -191,7 +195,7 @@ class BlockWrite:
         else:
             for item, code in zip(job, codes, strict=True):
                 if code != ITEM_OK:
-                    self._refuse(item, explain_write(code, self._db_number, item.last))
+                    self._refuse(item, self._reason(item, code))
         self._answered.add(index)
 
     def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
@@ -201,7 +205,11 @@ class BlockWrite:
             for item in job:
                 yield item.write, known
 
-    def _refuse(self, item: _Item, reason: str) -> None:
+    def _reason(self, item: WriteItem, code: int) -> str:
+        """Return why an item was refused, by its return code."""
+        return explain_write(code, self._db_number, item.last)
+
+    def _refuse(self, item: WriteItem, reason: str) -> None:
         self._outcomes[item.write] = self._outcomes[item.write] or reason
 
 
@@ -211,11 +219,11 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
     The controller may execute jobs in flight in any order. So writes to the same bits must be in
     different waves. Each wave stores the reasons of refusals in ``outcomes``, by the write's index.
     """
-    wave: list[_Item] = []
+    wave: list[WriteItem] = []
     spans: list[tuple[int, int]] = []  # sorted ranges of bits that the wave writes
     for place, write in enumerate(writes):
         span = _span(write)
-        if wave and _touches(spans, span):
+        if wave and touches(spans, span):
             yield BlockWrite(db_number, pdu_size, wave, outcomes)
             wave, spans = [], []
         insort(spans, span)
@@ -251,28 +259,28 @@ def _span(write: Write) -> tuple[int, int]:
     return 8 * write.offset, 8 * (write.offset + len(write.data))
 
 
-def _touches(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
+def touches(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
     """Return whether a span overlaps any of ``spans``, which are disjoint and sorted."""
     after = bisect_right(spans, span)
     return (after > 0 and spans[after - 1][1] > span[0]) or (after < len(spans) and spans[after][0] < span[1])
 
 
-def _items(db_number: int, pdu_size: int, place: int, write: Write) -> Iterator[_Item]:
+def _items(db_number: int, pdu_size: int, place: int, write: Write) -> Iterator[WriteItem]:
     if write.mask:
         bit = write.mask.bit_length() - 1
         value = bool(write.data[0] & write.mask)
-        yield _Item(place, write.offset, bit_item(db_number, write.offset, bit, value))
+        yield WriteItem(place, write.offset, bit_item(db_number, write.offset, bit, value))
         return
     most = pdu_size - JOB_OVERHEAD - ITEM_OVERHEAD
     for start in range(0, len(write.data), most):
         data = write.data[start : start + most]
         offset = write.offset + start
-        yield _Item(place, offset + len(data) - 1, byte_item(db_number, offset, data))
+        yield WriteItem(place, offset + len(data) - 1, byte_item(db_number, offset, data))
 
 
-def _fill(items: Sequence[_Item], pdu_size: int) -> Iterator[list[_Item]]:
+def _fill(items: Sequence[WriteItem], pdu_size: int) -> Iterator[list[WriteItem]]:
     """Group items into jobs, in order, with as many items in each as fit into a PDU."""
-    job: list[_Item] = []
+    job: list[WriteItem] = []
     size = JOB_OVERHEAD
     for item in items:
         address, value = item.encoded

@@ -10,10 +10,11 @@ import ipaddress
 import re
 import socket
 import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
-from typing import Annotated
+from typing import Annotated, Literal, Protocol
 
 import msgspec
 
@@ -49,6 +50,12 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 102
     rack: Annotated[int, msgspec.Meta(ge=0, le=7)] = 0
     slot: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None
+    connection: Literal["pg", "op", "basic"] = "pg"
+    """Type of the connection: programming device, operator panel or other (S7 basic)."""
+    local_tsap: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] = 0x0100
+    """TSAP of this side."""
+    remote_tsap: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None = None
+    """TSAP of the controller; None: that of ``connection``, ``rack`` and ``slot``."""
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
     """Time-out in ms for connecting, for reading the block, and for each answer to a write."""
     packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
@@ -72,6 +79,13 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
         if self.slot is not None:
             return self.slot
         return 1 if self.model is None else _CPU_SLOT[_family(self.model)]
+
+    @property
+    def called_tsap(self) -> int:
+        """The configured TSAP of the controller, or that of connection type, rack and slot."""
+        if self.remote_tsap is not None:
+            return self.remote_tsap
+        return pdu.CONNECTION_TYPES[self.connection] << 8 | self.rack << 5 | self.cpu_slot
 
     @property
     def peer(self) -> str:
@@ -102,34 +116,40 @@ def _is_name(text: str) -> bool:
     return True
 
 
-class S7Client:
-    """Reads and writes one block of one controller.
+class Read(Operation, Protocol):
+    """A read of all values of a cycle, which may be begun again."""
 
-    Any error closes the socket, so that a late answer is never matched to a later request. You may
-    call ``connect`` again afterwards.
+    deadline_ns: int
+    """Time by which it must be complete, in ns of CLOCK_MONOTONIC."""
+    refusal: RefusedError | None
+    """The controller's refusal of the whole read; None if it did not refuse."""
+
+    @property
+    def data(self) -> bytes:
+        """The image; valid only if the read is complete and was not refused."""
+
+    def begin(self, deadline_ns: int) -> None:
+        """Start a read that must be complete by ``deadline_ns``."""
+
+
+class S7Session(ABC):
+    """Keeps a session with one controller, in which several reads may be in flight.
+
+    A subclass says what is read and how writes are carried out. Any error closes the socket, so
+    that a late answer is never matched to a later request. You may call ``connect`` again
+    afterwards.
     """
 
-    def __init__(self, options: S7Options, db_number: int, size: int) -> None:
-        """Create a client for ``size`` bytes of DB ``db_number``. It does not connect yet.
-
-        Raises:
-            ConfigError: S7 cannot address such a block.
-
-        """
-        if not 1 <= size <= pdu.MAX_BLOCK_SIZE:
-            raise ConfigError(f"DB{db_number} of {size} bytes: S7 reads blocks of 1 to {pdu.MAX_BLOCK_SIZE} bytes")
-        if not 1 <= db_number <= 65535:
-            raise ConfigError(f"DB{db_number}: data blocks are numbered 1 to 65535")
+    def __init__(self, options: S7Options) -> None:
+        """Create a session. It does not connect yet."""
         self.options = options
-        self.db_number = db_number
-        self.size = size
         self._timeout_ns = options.timeout * 1_000_000
         self._transport: Transport | None = None
         self._session = pdu.Session(0, 0)
         # References continue after a reconnect, so that a late answer matches no new request.
         self._window = Window(0, 0)
-        self._under_way: deque[BlockRead] = deque()
-        self._idle: list[BlockRead] = []
+        self._under_way: deque[Read] = deque()
+        self._idle: list[Read] = []
         self._mode = ModeQuery()
         self._close_on_error = _CloseOnError(self.close, options)
 
@@ -177,7 +197,7 @@ class S7Client:
         with _CloseOnError(self.close, self.options, opening=True):
             self._transport = transport = Transport(self.options.host, self.options.port, self._timeout_ns)
             deadline_ns = transport.deadline_ns
-            transport.send(pdu.connect_request(self.options.rack, self.options.cpu_slot), deadline_ns)
+            transport.send(pdu.connect_request(self.options.local_tsap, self.options.called_tsap), deadline_ns)
             tpdu_size = pdu.parse_connect_confirm(transport.next_frame(deadline_ns))
             asked = pdu.Session(min(pdu.WANTED_PDU_SIZE, tpdu_size - 3), pdu.WANTED_JOBS)
             reference = self._window.reference
@@ -281,7 +301,7 @@ class S7Client:
             with self._close_on_error:
                 begun_ns = time.monotonic_ns()
                 end_ns = begun_ns + round(self.timeout_s * 1e9)
-                for wave in waves(self.db_number, self.pdu_size, writes, outcomes):
+                for wave in self._waves(writes, outcomes):
                     begun.append(wave)
                     self._window.add(wave, urgent=True)
                     self._flush()
@@ -312,10 +332,18 @@ class S7Client:
         self._session = pdu.Session(granted.pdu_size, jobs)
         self._window = Window(jobs, self._window.reference)
         transport.reserve(jobs, granted.pdu_size + pdu.FRAME_OVERHEAD)
-        chunk = min(granted.pdu_size - pdu.READ_OVERHEAD, self.options.packetSize or self.size, self.size)
-        first = BlockRead(self.db_number, self.size, chunk)
-        depth = min(max(1, jobs // first.count), MAX_DEPTH)
-        self._idle = [first, *(BlockRead(self.db_number, self.size, chunk) for _ in range(depth - 1))]
+        self._idle = self._reads()
+
+    @abstractmethod
+    def _reads(self) -> list[Read]:
+        """Return the reads that may be in flight at once in the new session, at least one."""
+
+    @abstractmethod
+    def _waves(self, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
+        """Divide a batch into waves that are sent one after the other.
+
+        Each wave stores the reasons of refusals in ``outcomes``, by the write's index.
+        """
 
     # -- requests and answers ------------------------------------------------------------------------------------------
 
@@ -393,6 +421,38 @@ class S7Client:
                     "at once"
                 )
 
+    def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:  # noqa: ARG002
+        """Return the refusal of a read, with more detail if there is some to be had by ``deadline_ns``."""
+        return refusal
+
+
+class S7Client(S7Session):
+    """Reads and writes one block of one controller."""
+
+    def __init__(self, options: S7Options, db_number: int, size: int) -> None:
+        """Create a client for ``size`` bytes of DB ``db_number``. It does not connect yet.
+
+        Raises:
+            ConfigError: S7 cannot address such a block.
+
+        """
+        if not 1 <= size <= pdu.MAX_BLOCK_SIZE:
+            raise ConfigError(f"DB{db_number} of {size} bytes: S7 reads blocks of 1 to {pdu.MAX_BLOCK_SIZE} bytes")
+        if not 1 <= db_number <= 65535:
+            raise ConfigError(f"DB{db_number}: data blocks are numbered 1 to 65535")
+        super().__init__(options)
+        self.db_number = db_number
+        self.size = size
+
+    def _reads(self) -> list[Read]:
+        chunk = min(self.pdu_size - pdu.READ_OVERHEAD, self.options.packetSize or self.size, self.size)
+        first = BlockRead(self.db_number, self.size, chunk)
+        depth = min(max(1, self.jobs // first.count), MAX_DEPTH)
+        return [first, *(BlockRead(self.db_number, self.size, chunk) for _ in range(depth - 1))]
+
+    def _waves(self, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
+        return waves(self.db_number, self.pdu_size, writes, outcomes)
+
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:
         """If the controller's block is too short, return a refusal that names its real length."""
         if refusal.code != OUT_OF_RANGE:
@@ -414,6 +474,15 @@ class S7Connector(S7Client, Connector):
 
     Options = S7Options
     can_write = True
+
+    @classmethod
+    def for_layout(cls, layout: Layout) -> type[Connector]:
+        """Return the connector of tag tables if registers have addresses."""
+        if not any(register.address for register in layout.registers):
+            return cls
+        from shmio.connectors.s7.table import S7TableConnector  # noqa: PLC0415  it imports this module
+
+        return S7TableConnector
 
     def __init__(self, options: S7Options, layout: Layout) -> None:
         number = options.dbNumber if options.dbNumber is not None else layout.number

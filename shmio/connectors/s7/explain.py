@@ -57,7 +57,7 @@ def explain_read(code: int, db_number: int, size: int) -> str:
             f"DB{db_number} has no {size} bytes (item code 0x05): the layout is of another version of the block, "
             f"export it again; or the block is optimized, then {_NO_OPTIMIZED}"
         )
-    return f"DB{db_number}: {_explain_item(code)}"
+    return f"DB{db_number}: {explain_item(code)}"
 
 
 def explain_size(db_number: int, size: int, found: int) -> str:
@@ -80,10 +80,11 @@ def explain_write(code: int, db_number: int, last: int) -> str:
             f"DB{db_number} has no byte {last} (item code 0x05): the layout is of another version of the block; export "
             "it again"
         )
-    return f"DB{db_number}: {_explain_item(code)}"
+    return f"DB{db_number}: {explain_item(code)}"
 
 
-def _explain_item(code: int) -> str:
+def explain_item(code: int) -> str:
+    """Return a message for an item's return code, without the place."""
     where = f"(item code 0x{code:02X})"
     if code == ACCESS_DENIED:
         return _ACCESS_DENIED.format(where=where)
@@ -92,6 +93,8 @@ def _explain_item(code: int) -> str:
             f"the block does not exist {where}: check dbNumber, and that it is loaded; on an S7-1200 or S7-1500 it may "
             f"be optimized, then {_NO_OPTIMIZED}"
         )
+    if code == OUT_OF_RANGE:
+        return f"the controller has no such address {where}: correct it, or the block is optimized: {_NO_OPTIMIZED}"
     if code in {NO_SUCH_TYPE, OTHER_SIZE}:
         return f"the controller does not accept data of this type or length {where}"
     return f"the controller refused it: {S7_RETURN_CODES.get(code, 'no text known')} {where}"

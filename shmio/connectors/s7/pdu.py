@@ -50,8 +50,11 @@ _ACK, _ACK_DATA = 2, 3
 READ, WRITE, _SETUP = 0x04, 0x05, 0xF0
 JOB, USERDATA = 1, 7
 """The values of ROSCTR in requests."""
-_DATA_BLOCK: Final = 0x84
+DATA_BLOCK: Final = 0x84
 TYPE_BIT, TYPE_BYTE = 1, 2
+CONNECTION_TYPES: Final = {"pg": 1, "op": 2, "basic": 3}
+_READ_ITEM = struct.Struct(">BBH")
+_IN_BITS, _IN_BYTES = {0x04, 0x05}, {0x07, 0x09}
 _BITS, _OCTETS = 0x04, 0x09  # transport sizes: whether an item's length counts bits or bytes
 
 
@@ -97,12 +100,12 @@ def request(reference: int, parameters: bytes, data: bytes = b"", rosctr: int = 
     return _frame(_COTP_DATA + header + parameters + data)
 
 
-def address(db_number: int, place: int, count: int, kind: int = TYPE_BYTE) -> bytes:
-    """Return the encoded address of ``count`` bytes or of one bit in a data block.
+def address(db_number: int, place: int, count: int, kind: int = TYPE_BYTE, area: int = DATA_BLOCK) -> bytes:
+    """Return the encoded address of ``count`` bytes or of one bit in a data block or another area.
 
-    ``place`` is the offset in bits.
+    ``place`` is the offset in bits, or the number of a timer or counter.
     """
-    return _ADDRESS.pack(0x12, 10, 0x10, kind, count, db_number, _DATA_BLOCK << 24 | place)
+    return _ADDRESS.pack(0x12, 10, 0x10, kind, count, db_number, area << 24 | place)
 
 
 def _frame(payload: bytes) -> bytes:
@@ -171,12 +174,12 @@ def _check_cotp(frame: memoryview) -> None:
 # -- session -----------------------------------------------------------------------------------------------------------
 
 
-def connect_request(rack: int, slot: int) -> bytes:
+def connect_request(local_tsap: int, remote_tsap: int) -> bytes:
     """Return the COTP connection request to a CPU.
 
-    The called TSAP contains the connection type (programming device), and rack and slot.
+    The called TSAP of most CPUs contains the connection type, and rack and slot.
     """
-    tsaps = struct.pack(">BBH BBBB BBB", 0xC1, 2, 0x0100, 0xC2, 2, 0x01, rack << 5 | slot, 0xC0, 1, _TPDU_SIZE_CODE)
+    tsaps = struct.pack(">BBH BBH BBB", 0xC1, 2, local_tsap, 0xC2, 2, remote_tsap, 0xC0, 1, _TPDU_SIZE_CODE)
     head = struct.pack(">BBHHB", 6 + len(tsaps), _COTP_CR, 0, 1, 0)
     return _frame(head + tsaps)
 
@@ -271,3 +274,38 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
     if len(frame) - _ITEM_END not in {length, length + (length & 1)}:
         raise ConnectorError(f"answer with {len(frame) - _ITEM_END} bytes of data, its header says {length}")
     return ReadAnswer(code, frame[_ITEM_END : _ITEM_END + length])
+
+
+def parse_items(frame: memoryview, sizes: Sequence[int]) -> list[ReadAnswer]:
+    """Parse an answer to a read of several items of ``sizes`` bytes; data are views of the frame.
+
+    Raises:
+        RefusedError: The controller refused the job.
+        ConnectorError: The answer is malformed.
+
+    """
+    check_answer(frame)
+    if len(frame) < HEADER_END + 2 or frame[HEADER_END] != READ or frame[HEADER_END + 1] != len(sizes):
+        raise ConnectorError(f"not an answer to a read of {len(sizes)} items")
+    answers: list[ReadAnswer] = []
+    end = HEADER_END + 2
+    for size in sizes:
+        at = end + ((end - HEADER_END) & 1 if answers else 0)  # items begin at even places
+        if at + 4 > len(frame):
+            raise ConnectorError(f"answer that ends before item {len(answers) + 1} of {len(sizes)}")
+        code, transport, length = _READ_ITEM.unpack_from(frame, at)
+        end = at + 4
+        if code != ITEM_OK:
+            answers.append(ReadAnswer(code, frame[:0]))
+            continue
+        if transport in _IN_BITS and not length & 7:
+            length >>= 3
+        elif transport not in _IN_BYTES:
+            raise ConnectorError(f"data of transport size 0x{transport:02X}, length {length}; bytes were asked for")
+        if length != size or end + size > len(frame):
+            raise ConnectorError(f"answer has {length} bytes of data, {size} were asked for")
+        answers.append(ReadAnswer(code, frame[end : end + size]))
+        end += size
+    if len(frame) - end not in {0, 1}:  # some servers pad the last item too
+        raise ConnectorError(f"answer of {len(frame)} bytes, {end} belong to its items")
+    return answers

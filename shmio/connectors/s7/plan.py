@@ -1,0 +1,123 @@
+"""Plans which items of which jobs read the registers of a tag table. No I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Final, NamedTuple
+
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.address import Area
+
+MAX_ITEMS: Final = 20
+"""Items of a job that all known controllers accept."""
+MAX_GAP: Final = 16
+"""Most unused bytes that a range includes; another item costs as much."""
+_REQUEST_HEAD, _REQUEST_ITEM = 12, 12
+_ANSWER_HEAD, _ANSWER_ITEM = 14, 4
+_OPEN_JOBS: Final = 8  # jobs in which a place is sought, so that planning takes linear time
+
+
+class Field(NamedTuple):
+    """A register in the controller's memory."""
+
+    register: int
+    """Index of the register in the layout."""
+    area: Area
+    db: int
+    start: int
+    """First byte; that of a timer or counter is twice its number."""
+    stop: int
+
+
+class Range:
+    """Consecutive bytes that hold one or more fields."""
+
+    def __init__(self, fields: Sequence[Field]) -> None:
+        self.fields = tuple(fields)
+        self.area, self.db = Area(fields[0].area), fields[0].db
+        self.start = min(one.start for one in fields)
+        self.stop = max(one.stop for one in fields)
+        self.alone = False
+        """Whether it needs a job of its own, because a job with others was refused."""
+        self.last = b""
+        """The bytes that were stored last."""
+
+    def halves(self) -> list[Range]:
+        """Return the range as two, each with half of the fields; the range itself if it has one."""
+        middle = len(self.fields) // 2
+        if not middle:
+            return [self]
+        found = [Range(self.fields[:middle]), Range(self.fields[middle:])]
+        for one in found:
+            one.alone = self.alone
+        return found
+
+
+class Piece(NamedTuple):
+    """The part of a range that one item reads; nearly always all of it."""
+
+    range: Range
+    start: int
+    size: int
+
+    @property
+    def address(self) -> bytes:
+        """The item's encoded address."""
+        area = self.range.area
+        if area.numbered:
+            return pdu.address(0, self.start // 2, self.size // 2, area, area)  # type and area have the same code
+        return pdu.address(self.range.db, 8 * self.start, self.size, area=area)
+
+
+Job = tuple[Piece, ...]
+
+
+def merge(fields: Iterable[Field], most: int, max_gap: int = MAX_GAP) -> list[Range]:
+    """Return ranges that cover the fields; a range has at most ``most`` bytes unless one field has more."""
+    ranges: list[Range] = []
+    run: list[Field] = []
+    stop = 0
+    for one in sorted(fields, key=lambda field: (field.area, field.db, field.start, field.stop)):
+        if run and (
+            (one.area, one.db) != (run[0].area, run[0].db)
+            or one.start > stop + (0 if one.area.numbered else max_gap)
+            or max(stop, one.stop) - run[0].start > most
+        ):
+            ranges.append(Range(run))
+            run = []
+        stop = max(stop, one.stop) if run else one.stop
+        run.append(one)
+    if run:
+        ranges.append(Range(run))
+    return ranges
+
+
+def most_bytes(pdu_size: int) -> int:
+    """Return the most bytes of an item; even, as timers and counters have two bytes each."""
+    return pdu_size - _ANSWER_HEAD - _ANSWER_ITEM & ~1
+
+
+def pack(ranges: Iterable[Range], pdu_size: int) -> list[Job]:
+    """Return jobs whose requests and answers fit a PDU, with at most ``MAX_ITEMS`` items each."""
+    jobs: list[list[Piece]] = []
+    room: list[tuple[int, int]] = []  # of each job: bytes left in the answer, and items left
+    items = min(MAX_ITEMS, (pdu_size - _REQUEST_HEAD) // _REQUEST_ITEM)
+    whole = pdu_size - _ANSWER_HEAD
+    for piece in _pieces(ranges, most_bytes(pdu_size)):
+        need = _ANSWER_ITEM + piece.size + (piece.size & 1)
+        place = len(jobs)
+        if not piece.range.alone:
+            recent = range(max(0, len(jobs) - _OPEN_JOBS), len(jobs))
+            place = next((at for at in recent if room[at][0] >= need and room[at][1]), place)
+        if place == len(jobs):
+            jobs.append([])
+            room.append((whole, 1 if piece.range.alone else items))
+        jobs[place].append(piece)
+        room[place] = room[place][0] - need, room[place][1] - 1
+    return [tuple(job) for job in jobs]
+
+
+def _pieces(ranges: Iterable[Range], most: int) -> Iterator[Piece]:
+    for one in ranges:
+        for start in range(one.start, one.stop, most):
+            yield Piece(one, start, min(most, one.stop - start))

@@ -1,0 +1,464 @@
+"""The S7 connector for tag tables: registers at addresses in several blocks and areas.
+
+Ranges that the controller refuses are halved within the same read, until the refused registers are
+known. These are bad by themselves, are tried again now and then, and join the others when the
+controller has them again. All this is remembered when the connection is lost.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from bisect import insort
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final
+
+from shmio.connectors.base import Connector
+from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.address import parse
+from shmio.connectors.s7.blocks import ITEM_OVERHEAD, JOB_OVERHEAD, BlockWrite, WriteItem, bit_item, byte_item, touches
+from shmio.connectors.s7.connector import MAX_DEPTH, Read, S7Options, S7Session
+from shmio.connectors.s7.explain import (
+    ACCESS_DENIED,
+    ITEM_OK,
+    NO_SUCH_OBJECT,
+    NO_SUCH_TYPE,
+    OTHER_SIZE,
+    OUT_OF_RANGE,
+    RefusedError,
+    explain_item,
+)
+from shmio.connectors.s7.plan import Field, Job, Piece, Range, merge, most_bytes, pack
+from shmio.connectors.s7.tag import Tag
+from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.model import Layout, Register, bit_positions
+from shmio.layout.values.write import Write, apply
+from shmio.model.statuses import (
+    BAD_COMMUNICATION_ERROR,
+    BAD_NODE_ID_UNKNOWN,
+    BAD_NOT_SUPPORTED,
+    BAD_OUT_OF_RANGE,
+    BAD_TYPE_MISMATCH,
+    BAD_USER_ACCESS_DENIED,
+)
+
+RETRY_NS: Final = 10_000_000_000
+"""How long a register that the controller refuses is left alone."""
+MAX_RETRIED: Final = 20
+"""Most refused registers that one read tries again."""
+_STATUS: Final = {
+    ACCESS_DENIED: BAD_USER_ACCESS_DENIED,
+    OUT_OF_RANGE: BAD_OUT_OF_RANGE,
+    NO_SUCH_TYPE: BAD_NOT_SUPPORTED,
+    OTHER_SIZE: BAD_TYPE_MISMATCH,
+    NO_SUCH_OBJECT: BAD_NODE_ID_UNKNOWN,
+}
+_MOST_LOGGED: Final = 20  # refused registers that the log names one by one
+
+log = logging.getLogger("shmio.source")
+
+
+class Planner:
+    """Knows which ranges to read, and which registers the controller refuses."""
+
+    def __init__(self, tags: Sequence[Tag]) -> None:
+        self._tags = tags
+        self.pdu_size = 0
+        self._ranges: list[Range] = []
+        self._jobs: list[Job] | None = None
+        self.refused: dict[Field, tuple[int, int]] = {}
+        """By refused field: the status, and when to try it again, ns of CLOCK_MONOTONIC."""
+
+    def use(self, pdu_size: int) -> None:
+        """Plan for the PDU size of a new session; what is known is kept."""
+        if pdu_size != self.pdu_size:
+            self.pdu_size = pdu_size
+            self._merge()
+
+    def jobs(self, now_ns: int) -> list[Job]:
+        """Return the jobs of a read, with some refused registers if it is time to try these again."""
+        if self._jobs is None:
+            self._jobs = pack(self._ranges, self.pdu_size)
+        if not self.refused:
+            return self._jobs
+        due: list[Range] = []
+        for field, (status, at_ns) in self.refused.items():
+            if at_ns <= now_ns and len(due) < MAX_RETRIED:
+                due.append(Range([field]))
+                self.refused[field] = status, now_ns + RETRY_NS
+        return self._jobs + pack(due, self.pdu_size) if due else self._jobs
+
+    def split(self, whole: Range, parts: Sequence[Range]) -> None:
+        """Read the parts of a range from now on, if the range is still in use."""
+        if whole in self._ranges:
+            place = self._ranges.index(whole)
+            self._ranges[place : place + 1] = parts
+            self._jobs = None
+
+    def replan(self) -> None:
+        """Divide the ranges among jobs again, because it has changed which need their own."""
+        self._jobs = None
+
+    def together(self, ranges: Iterable[Range]) -> None:
+        """Let ranges share jobs again, because it is known now what was wrong."""
+        for whole in ranges:
+            if whole.alone:
+                whole.alone = False
+                self._jobs = None
+
+    def refuse(self, part: Range, status: int, why: str) -> None:
+        """Leave the only field of a range alone for a while."""
+        field = part.fields[0]
+        if field not in self.refused:
+            self._note(field, why)
+        self.refused[field] = status, time.monotonic_ns() + RETRY_NS
+        self.split(part, ())
+
+    def accept(self, part: Range) -> None:
+        """Read a range's fields with the others again, if they were refused."""
+        if self.refused and any(field in self.refused for field in part.fields):
+            for field in part.fields:
+                if self.refused.pop(field, None):
+                    log.info("%s can be read again", self._named(field))
+            self._merge()
+
+    def _merge(self) -> None:
+        fields = (tag.field for tag in self._tags if tag.field not in self.refused)
+        self._ranges = merge(fields, most_bytes(self.pdu_size))
+        self._jobs = None
+
+    def _named(self, field: Field) -> str:
+        tag = self._tags[field.register]
+        return f"{tag.register.path} ({tag.address.text})"
+
+    def _note(self, field: Field, why: str) -> None:
+        if len(self.refused) < _MOST_LOGGED:
+            log.warning("%s is bad: %s", self._named(field), why)
+        elif len(self.refused) == _MOST_LOGGED:
+            log.warning("more registers are refused; they are not listed here, but their status says why")
+
+
+class TableRead:
+    """One read of all registers: its jobs, and the bytes of their answers."""
+
+    def __init__(
+        self, planner: Planner, again: Callable[[TableRead], None], store: Callable[[TableRead], bytes]
+    ) -> None:
+        """Create a read.
+
+        Args:
+            planner: What to read.
+            again: Called to queue the read again, after jobs were added to it.
+            store: Puts the results into the image, and returns it.
+
+        """
+        self._planner, self._again, self._store = planner, again, store
+        self.begin(0)
+
+    def begin(self, deadline_ns: int) -> None:
+        """Start a read that must be complete by ``deadline_ns``."""
+        self.deadline_ns = deadline_ns
+        self.refusal: RefusedError | None = None
+        self.sent = self._answered = self._denied = 0
+        self._jobs: list[Job] = list(self._planner.jobs(time.monotonic_ns())) if deadline_ns else []
+        self._denial: RefusedError | None = None
+        self._again_alone: dict[Range, None] = {}
+        self._codes: dict[Range, tuple[int, str]] = {}
+        self.data_of: dict[Range, bytearray] = {}
+        """The bytes of each range; of a refused one they mean nothing."""
+        self.statuses: dict[int, int] = {}
+        """Statuses of refused registers by index in the layout."""
+
+    @property
+    def count(self) -> int:
+        """Number of jobs so far."""
+        return len(self._jobs)
+
+    @property
+    def complete(self) -> bool:
+        """True if all registers were received or refused."""
+        return self._answered == len(self._jobs)
+
+    @property
+    def data(self) -> bytes:
+        """The image; valid only if the read is complete and was not refused as a whole."""
+        return self._store(self)
+
+    def take(self, count: int, first: int) -> bytes:
+        """Return the next requests, with references from ``first`` on (16 bits, wrapping)."""
+        begin, self.sent = self.sent, self.sent + count
+        return b"".join(
+            pdu.read_request((first + place) & 0xFFFF, [piece.address for piece in job])
+            for place, job in enumerate(self._jobs[begin : self.sent])
+        )
+
+    def accept(self, index: int, frame: memoryview) -> None:
+        """Process the answer to a job; after the last one, ask for the halves of what was refused.
+
+        Raises:
+            ConnectorError: The answer does not match the request.
+
+        """
+        job = self._jobs[index]
+        try:
+            answers = pdu.parse_items(frame, [piece.size for piece in job])
+        except RefusedError as refusal:
+            self._refuse_all(job, refusal)
+        else:
+            for piece, answer in zip(job, answers, strict=True):
+                if answer.code == ITEM_OK:
+                    self._put(piece, answer.data)
+                else:
+                    status = _STATUS.get(answer.code, BAD_COMMUNICATION_ERROR)
+                    self._codes[piece.range] = status, explain_item(answer.code)
+        self._answered += 1
+        if self.complete:
+            self._settle()
+
+    def _put(self, piece: Piece, data: memoryview) -> None:
+        whole = piece.range
+        buffer = self.data_of.get(whole)
+        if buffer is None:
+            buffer = self.data_of[whole] = bytearray(whole.stop - whole.start)
+        at = piece.start - whole.start
+        buffer[at : at + piece.size] = data
+
+    def _refuse_all(self, job: Job, refusal: RefusedError) -> None:
+        """Note a job that was refused as a whole, maybe because of one of its items."""
+        self._denied += 1
+        self._denial = refusal
+        ranges = dict.fromkeys(piece.range for piece in job)
+        for whole in ranges:
+            if len(ranges) > 1:
+                whole.alone = True
+                self._again_alone[whole] = None
+            else:
+                self._codes[whole] = BAD_COMMUNICATION_ERROR, str(refusal)
+
+    def _settle(self) -> None:
+        """Halve ranges that were refused, and note what is known now."""
+        refused, self._codes = self._codes, {}
+        parts, self._again_alone = list(self._again_alone), {}
+        planner = self._planner
+        if self._denied == len(self._jobs) and self._jobs and not parts:
+            self.refusal = self._denial  # nothing can be read, so it is not the fault of some addresses
+            planner.together(refused)
+            return
+        for whole, (status, why) in refused.items():
+            self.data_of.pop(whole, None)
+            halves = whole.halves()
+            if len(halves) > 1:
+                planner.split(whole, halves)
+                parts += halves
+            else:
+                planner.refuse(whole, status, why)
+                self.statuses[whole.fields[0].register] = status
+        if parts:
+            planner.replan()
+            self._jobs += pack(parts, planner.pdu_size)
+            self._again(self)
+            return
+        for whole in self.data_of:
+            if len(whole.fields) == 1:
+                planner.accept(whole)
+        if self.statuses:
+            planner.together(self.data_of)
+
+
+class TableWrite(BlockWrite):
+    """One wave of writes to registers of a tag table."""
+
+    def __init__(self, pdu_size: int, items: Sequence[WriteItem], outcomes: list[str], names: dict[int, str]) -> None:
+        """Create a wave; ``names`` says by index of a write which registers it sets."""
+        super().__init__(0, pdu_size, items, outcomes)
+        self._names = names
+
+    def _reason(self, item: WriteItem, code: int) -> str:
+        return f"{self._names[item.write]}: {explain_item(code)}"
+
+
+class S7TableConnector(S7Session, Connector):
+    """Reads and writes registers at the addresses of a tag table."""
+
+    Options = S7Options
+    can_write = True
+    register_quality = True
+
+    def __init__(self, options: S7Options, layout: Layout) -> None:
+        """Create the connector without connecting it.
+
+        Raises:
+            ConfigError: A register has no address, or one that does not fit its type.
+
+        """
+        super().__init__(options)
+        if options.dbNumber is not None:
+            raise ConfigError("dbNumber: leave it out: each address of a tag table names its block")
+        self._layout = layout
+        self._tags: list[Tag] = []
+        for index, register in enumerate(layout.registers):
+            try:
+                address = parse(register)
+                if register.writable and address.area.read_only:
+                    raise ValueError(f"writable: {address.area.read_only}")
+            except ValueError as error:
+                raise ConfigError(f"layout: {register.path}: {error}") from None
+            self._tags.append(Tag(index, register, address, layout.byte_order))
+        self._planner = Planner(self._tags)
+        self._image = RegisterImage(layout) if layout.status_offset is not None else None
+
+    def describe(self) -> str:
+        """Return the peer, the parameters of the session and the requests of a cycle as a text for logs."""
+        requests = len(self._planner.jobs(0))
+        return (
+            f"to {self.options.peer} {len(self._tags)} registers pdu={self.pdu_size} jobs={self.jobs} "
+            f"depth={self.depth} in {requests} {'request' if requests == 1 else 'requests'} a cycle"
+        )
+
+    # -- reading -------------------------------------------------------------------------------------------------------
+
+    def _reads(self) -> list[Read]:
+        if self._image is None:
+            raise ConnectorError("the layout has no status area")
+        limit = self.options.packetSize or self.pdu_size
+        self._planner.use(min(self.pdu_size, max(pdu.MIN_PDU_SIZE, limit + pdu.READ_OVERHEAD)))
+        requests = max(1, len(self._planner.jobs(0)))
+        depth = min(max(1, self.jobs // requests), MAX_DEPTH)
+        return [TableRead(self._planner, self._queue_again, self._store) for _ in range(depth)]
+
+    def _queue_again(self, read: TableRead) -> None:
+        self._window.add(read, urgent=True)
+
+    def _store(self, read: TableRead) -> bytes:
+        """Put the results of a read into the image, and return a copy of it."""
+        image = self._image
+        assert image is not None  # noqa: S101 - _reads() checked it
+        for index, status in read.statuses.items():
+            image.fail(index, status)
+        for whole, data in read.data_of.items():
+            if whole.last == data:  # then the registers have these values already
+                continue
+            whole.last = bytes(data)
+            for field in whole.fields:
+                tag = self._tags[field.register]
+                found = tag.image_bytes(whole.last[field.start - whole.start : field.stop - whole.start])
+                if found is None:
+                    image.fail(field.register, BAD_OUT_OF_RANGE)
+                else:
+                    image.put_bytes(field.register, found)
+        return bytes(image)
+
+    # -- writing -------------------------------------------------------------------------------------------------------
+
+    def _waves(self, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
+        wave: list[WriteItem] = []
+        names: dict[int, str] = {}
+        spans: list[tuple[int, int]] = []  # sorted ranges of bits that the wave writes
+        for place, write in enumerate(writes):
+            try:
+                steps = list(self._steps(write))
+            except ValueError as error:
+                outcomes[place] = str(error)
+                continue
+            for tag, start, bit, data in steps:
+                first = _linear(tag, start, bit)
+                span = first, first + (8 * len(data) if bit is None else 1)
+                if wave and touches(spans, span):
+                    yield TableWrite(self.pdu_size, wave, outcomes, names)
+                    wave, spans = [], []
+                insort(spans, span)
+                names[place] = f"{tag.register.path} ({tag.address.text})"
+                wave += self._items(place, tag, start, bit, data)
+        if wave:
+            yield TableWrite(self.pdu_size, wave, outcomes, names)
+
+    def _items(self, place: int, tag: Tag, start: int, bit: int | None, data: bytes) -> Iterator[WriteItem]:
+        area, db = tag.address.area, tag.address.db
+        if bit is not None:
+            yield WriteItem(place, start, bit_item(db, start, bit, bool(data[0]), area))
+            return
+        most = self.pdu_size - JOB_OVERHEAD - ITEM_OVERHEAD
+        for at in range(0, len(data), most):
+            part = data[at : at + most]
+            yield WriteItem(place, start + at + len(part) - 1, byte_item(db, start + at, part, area))
+
+    def _steps(self, write: Write) -> Iterator[tuple[Tag, int, int | None, bytes]]:
+        """Yield (tag, first byte, bit, data) of each change that a write makes in the controller.
+
+        Raises:
+            ValueError: The controller cannot take the value, or the write names nothing that can be written.
+
+        """
+        offset, mask, data = write
+        touched = False
+        for tag in self._tags:
+            register = tag.register
+            if register.offset + register.size <= offset or register.offset >= offset + len(data):
+                continue
+            if register.bit is not None and not register.dims and mask and mask != 1 << register.bit:
+                continue
+            touched = True
+            if tag.address.area.read_only:
+                raise ValueError(f"{register.path} ({tag.address.text}): {tag.address.area.read_only}")
+            start = tag.address.start
+            if tag.address.bit is not None:
+                value = data[register.offset - offset] >> (register.bit or 0) & 1
+                yield tag, start, tag.address.bit, bytes((value,))
+            elif mask:
+                byte = start + tag.device_bit(offset - register.offset)
+                yield tag, byte, mask.bit_length() - 1, bytes((bool(data[0] & mask),))
+            else:
+                yield from self._elements(tag, write)
+        if not touched:
+            raise ValueError("no register of the tag table is there")
+
+    def _elements(self, tag: Tag, write: Write) -> Iterator[tuple[Tag, int, int | None, bytes]]:
+        """Yield the changes of a write of bytes to one register."""
+        register = tag.register
+        image, covered = bytearray(self._layout.size), bytearray(self._layout.size)
+        apply(write, image)
+        apply(Write(write.offset, 0, b"\xff" * len(write.data)), covered)
+        own = bytes(image[register.offset : register.offset + register.size])
+        there = covered[register.offset : register.offset + register.size]
+        start = tag.address.start
+        if register.type == "BOOL":
+            if all(there):
+                yield tag, start, None, own
+                return
+            for byte, bit in bit_positions(register):
+                if there[byte]:
+                    yield tag, start + byte, bit, bytes((own[byte] >> bit & 1,))
+            return
+        for first, count in _covered(register, there):
+            at, data = tag.device_bytes(own, first, count)
+            yield tag, start + at, None, data
+
+
+def _linear(tag: Tag, start: int, bit: int | None) -> int:
+    """Return a number of a bit of the controller that orders all areas and blocks."""
+    return ((tag.address.area << 16 | tag.address.db) << 24) + 8 * start + (bit or 0)
+
+
+def _covered(register: Register, there: bytes | bytearray) -> Iterator[tuple[int, int]]:
+    """Yield (first, count) of each run of elements that a write covers.
+
+    Raises:
+        ValueError: It covers only a part of an element.
+
+    """
+    size, stride = register.element.size, register.element.stride
+    first = count = 0
+    for place in range(register.count):
+        part = sum(1 for byte in there[place * stride : place * stride + size] if byte)
+        if part == size:
+            first = first if count else place
+            count += 1
+            continue
+        if part:
+            raise ValueError("a part of a value cannot be written: write the whole value")
+        if count:
+            yield first, count
+            count = 0
+    if count:
+        yield first, count
