@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.s7 import pdu
+from shmio.connectors.s7 import S7Options, pdu
 from shmio.errors import ConnectorError
 from tests.unit.connectors.s7 import noise as frames
 
@@ -25,8 +25,11 @@ def changed(frame: bytes, **at: int) -> memoryview:
 
 
 def test_connect_request_carries_rack_and_slot() -> None:
-    assert pdu.connect_request(0, 1).hex() == "0300001611e00000000100c1020100c2020101c0010a"
-    assert pdu.connect_request(2, 3)[-4] == 2 << 5 | 3
+    assert pdu.connect_request(0x0100, 0x0101).hex() == "0300001611e00000000100c1020100c2020101c0010a"
+    options = S7Options(host="plc", rack=2, slot=3)
+    assert options.called_tsap == 0x0100 | 2 << 5 | 3
+    assert S7Options(host="plc", connection="op").called_tsap == 0x0201
+    assert S7Options(host="logo", connection="basic", remote_tsap=0x2000).called_tsap == 0x2000
 
 
 def test_setup_request() -> None:

@@ -1,0 +1,87 @@
+"""The common conformance suites, run with an S7 tag table against the emulated PLC."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from shmio.config import Address
+from shmio.connectors.base import Connector
+from shmio.connectors.s7.connector import S7Connector, S7Options
+from shmio.emulators.emulator import Emulator
+from shmio.emulators.programs import generations
+from shmio.emulators.s7 import Traits
+from shmio.layout.tags import place_tags
+from shmio.model.statuses import BAD_OUT_OF_RANGE, GOOD, StatusArea
+from shmio.segment import Quality, Write
+from shmio.testing.conformance import Run
+from shmio.testing.proxy import FaultProxy
+from shmio.testing.write_conformance import SPARE, WriteConformance
+from tests.conformance.test_s7 import TAIL, Shared
+from tests.conformance.test_s7 import layout as block
+
+PART = 80
+
+
+class TableRig:
+    """The emulated PLC, read by a table of parts of its block, one of which does not exist."""
+
+    def __init__(self, proxy: FaultProxy, plc: Emulator, size: int) -> None:
+        self.proxy, self.plc = proxy, plc
+        self._counted = counted = size - TAIL
+        self._one_pdu = size <= 400
+        tags: dict[str, object] = {
+            f"data/{start}": {
+                "type": f"ARRAY[1..{min(PART, counted - start)}] OF BYTE",
+                "address": f"DB7.DBB{start}",
+            }
+            for start in range(0, counted, PART)
+        }
+        tags["spare"] = {"type": f"ARRAY[1..{SPARE}] OF BYTE", "address": f"DB7.DBB{counted}"}
+        tags["flags"] = {"type": "BYTE", "address": f"DB7.DBB{size - 2}"}
+        tags["copy"] = {"type": "BYTE", "address": f"DB7.DBB{size - 1}"}
+        tags["missing"] = {"type": "INT", "address": "DB7.DBW60000"}
+        self.layout = place_tags("device", tags).with_statuses()
+        registers = self.layout.registers
+        self.spare, self.flags, self.copy, missing = (one.offset for one in registers[-4:])
+        self.refused = Write(missing, 0, b"\1\0")
+
+    def connector(self) -> Connector:
+        address = self.proxy.address
+        options = S7Options(host=address.host, port=address.port, timeout=200)
+        return S7Connector.for_layout(self.layout)(options, self.layout)
+
+    def generation(self, raw: bytes) -> int:
+        found = generations(raw[: self._counted])
+        assert len(found) == 1 or not self._one_pdu, f"mixed cycles {found}"
+        assert found[-1] - found[0] < 10_000, f"bytes that the PLC never had: {found}"
+        if self._one_pdu:
+            assert raw[self.flags] & 0xFE == raw[self.copy], "a write has changed the neighbours of its bit"
+        return found[0]
+
+
+class TestS7Table(WriteConformance):
+    @pytest.fixture(params=[pytest.param((400, 960), id="one PDU"), pytest.param((1500, 480), id="several PDUs")])
+    def rig(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[TableRig]:
+        size, pdu_size = request.param
+        monkeypatch.setattr("shmio.emulators.programs.PROGRAMS", {"shared": Shared})
+        traits = Traits(max_pdu_size=pdu_size)
+        with (
+            Emulator(block(size), "shared", Address("127.0.0.1", 0), traits=traits) as plc,
+            FaultProxy(plc.address) as proxy,
+        ):
+            yield TableRig(proxy, plc, size)
+
+    def test_an_address_that_does_not_exist_is_bad_by_itself(self, run: Run, rig: TableRig) -> None:
+        frame = run.good()
+        area, last = StatusArea(rig.layout), len(rig.layout.registers) - 1
+        assert [area.get(frame.raw, index).code for index in range(last)] == [GOOD] * last
+        assert area.get(frame.raw, last).code == BAD_OUT_OF_RANGE
+
+    def test_a_reply_with_a_wrong_reference_is_never_accepted(self, run: Run, rig: TableRig) -> None:
+        run.good()
+        rig.proxy.rewrite_reference(lambda reference: reference + 1000, frames=1)
+        run.until(lambda frame: frame.quality is Quality.BAD)
+        rig.proxy.pass_all()
+        run.good()

@@ -1,0 +1,241 @@
+"""Tag tables read from and written to shmio's emulator and python-snap7's server."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from snap7.server import Server
+from snap7.type import SrvArea
+
+from shmio.config import Address
+from shmio.connectors.base import Connector
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.connector import S7Connector, S7Options
+from shmio.connectors.s7.table import RETRY_NS
+from shmio.emulators.s7 import Fault, S7Server, Traits
+from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.model import Layout
+from shmio.layout.tags import place_tags
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.write import encode
+from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, BAD_OUT_OF_RANGE, GOOD, StatusArea
+
+TAGS: dict[str, object] = {
+    "bit": {"type": "BOOL", "address": "DB1.DBX0.1"},
+    "int": {"type": "INT", "address": "DB1.DBW4"},
+    "text": {"type": "STRING[6]", "address": "DB1.DBB10"},
+    "time": {"type": "DTL", "address": "DB2.DBB20"},
+    "list": {"type": "ARRAY[0..2] OF REAL", "address": "DB2.DBD40"},
+    "input": {"type": "BOOL", "address": "E0.7"},
+    "word": {"type": "WORD", "address": "%IW256"},
+    "output": {"type": "BYTE", "address": "%QB4"},
+    "marker": {"type": "BOOL", "address": "%M3.7"},
+    "scaled": {"type": "REAL", "address": "%MW20 INT", "scale": [0.5, 10.0]},
+    "timer": {"type": "S5TIME", "address": "T5"},
+    "counter": {"type": "INT", "address": "Z3"},
+}
+VALUES: dict[str, Value] = {
+    "bit": True, "int": -2, "text": "abc", "time": "2024-02-29T12:34:56.000000007", "list": [1.0, -2.5, 0.0],
+    "input": True, "word": 0x1234, "output": 7, "marker": True, "scaled": 60.0, "timer": 123_000, "counter": 123,
+}  # fmt: skip
+
+
+class Plc:
+    """The memory of a controller."""
+
+    def __init__(self) -> None:
+        self.blocks = {1: bytearray(100), 2: bytearray(100)}
+        self.areas = {SrvArea.PE: bytearray(300), SrvArea.PA: bytearray(30), SrvArea.MK: bytearray(30)}
+        self.areas |= {SrvArea.TM: bytearray(30), SrvArea.CT: bytearray(30)}
+        self.blocks[1][0:16] = b"\2\0\0\0\xff\xfe\0\0\0\0\6\3abc\0"
+        self.blocks[2][20:32] = bytes.fromhex("07e8021d050c223800000007")
+        self.blocks[2][40:48] = bytes.fromhex("3f800000c0200000")
+        self.areas[SrvArea.PE][0], self.areas[SrvArea.PE][256:258] = 0x80, b"\x12\x34"
+        self.areas[SrvArea.PA][4], self.areas[SrvArea.MK][3], self.areas[SrvArea.MK][21] = 7, 0x80, 100
+        self.areas[SrvArea.TM][10:12], self.areas[SrvArea.CT][6:8] = b"\x21\x23", b"\x01\x23"
+
+
+@contextlib.contextmanager
+def served(plc: Plc, traits: Traits | None = None) -> Iterator[int]:
+    """Serve the memory with shmio's emulator, and return the port."""
+    server = S7Server(Address("127.0.0.1", 0), traits=traits)
+    for number, data in plc.blocks.items():
+        server.add_block(number, data)
+    for area, data in plc.areas.items():
+        server.add_area(area, data)
+    server.start()
+    try:
+        yield server.address.port
+    finally:
+        server.stop()
+
+
+@contextlib.contextmanager
+def served_by_snap7(plc: Plc) -> Iterator[int]:
+    """Serve the memory with python-snap7's server, and return the port."""
+    server = Server(log=False)
+    for number, data in plc.blocks.items():
+        server.register_area(SrvArea.DB, number, data)
+    for area, data in plc.areas.items():
+        server.register_area(area, 0, data)
+    server.start(0)
+    try:
+        assert server.server_socket is not None
+        yield server.server_socket.getsockname()[1]
+    finally:
+        server.stop()
+
+
+def table(tags: dict[str, object]) -> Layout:
+    return place_tags("table", tags).with_statuses()
+
+
+@contextlib.contextmanager
+def connected(layout: Layout, port: int) -> Iterator[Connector]:
+    connector = S7Connector.for_layout(layout)(S7Options(host="127.0.0.1", port=port, timeout=2000), layout)
+    try:
+        connector.connect()
+        yield connector
+    finally:
+        connector.close()
+
+
+def values(layout: Layout, raw: bytes) -> dict[str, Value]:
+    return {one.path: codec(one, layout.byte_order).decode(raw) for one in layout.registers}
+
+
+def codes(layout: Layout, raw: bytes) -> list[int]:
+    area = StatusArea(layout)
+    return [area.get(raw, index).code for index in range(len(layout.registers))]
+
+
+def write(connector: Connector, layout: Layout, path: str, value: Value) -> list[str]:
+    return connector.write(encode(layout.registers[layout.by_path[path]], value, layout.byte_order))
+
+
+@pytest.mark.parametrize("serve", [served, served_by_snap7])
+def test_all_areas_are_read_and_written(serve: Callable[[Plc], contextlib.AbstractContextManager[int]]) -> None:
+    layout, plc = table(TAGS), Plc()
+    changed: dict[str, Value] = {
+        "bit": False, "int": 300, "text": "hello", "time": "2025-01-02T03:04:05.000000000", "list": [4.0, 5.0, 6.0],
+        "output": 255, "marker": False, "scaled": -10.0,
+    }  # fmt: skip
+    with serve(plc) as port, connected(layout, port) as connector:
+        raw = connector.read()
+        assert values(layout, raw) == VALUES
+        assert codes(layout, raw) == [GOOD] * len(TAGS)
+        for path, value in changed.items():
+            assert write(connector, layout, path, value) == [""]
+        for path in ("input", "word", "timer", "counter"):
+            (refusal,) = write(connector, layout, path, VALUES[path])
+            assert "inputs cannot be written" in refusal or "can only be read" in refusal
+        assert values(layout, connector.read()) == VALUES | changed
+    assert plc.areas[SrvArea.MK][20:22] == (-40).to_bytes(2, "big", signed=True)
+
+
+def test_a_bit_is_written_without_its_neighbours() -> None:
+    layout, plc = table(TAGS), Plc()
+    plc.blocks[1][0] = 0xFF
+    with served(plc) as port, connected(layout, port) as connector:
+        assert write(connector, layout, "bit", False) == [""]
+    assert plc.blocks[1][0] == 0xFD
+
+
+def test_refused_registers_are_found_and_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of a range lies behind the end of a block, and one block is missing, until both are there."""
+    tags: dict[str, object] = {f"r{at}": {"type": "INT", "address": f"DB1.DBW{at}"} for at in range(80, 120, 2)}
+    tags["gone"] = {"type": "INT", "address": "DB3.DBW0"}
+    layout, plc = table(tags), Plc()
+    expected = [GOOD] * 10 + [BAD_OUT_OF_RANGE] * 10 + [BAD_NODE_ID_UNKNOWN]
+    with served(plc) as port, connected(layout, port) as connector:
+        assert codes(layout, connector.read()) == expected
+        connector.close()
+        connector.connect()  # what is known is kept
+        assert codes(layout, connector.read()) == expected
+        plc.blocks[1].extend(b"\0\1" * 50)
+        assert codes(layout, connector.read()) == expected
+        monkeypatch.setattr("shmio.connectors.s7.table.time.monotonic_ns", _later(RETRY_NS))
+        connector.read()
+        connector.read()
+        raw = connector.read()
+        assert codes(layout, raw) == [GOOD] * 20 + [BAD_NODE_ID_UNKNOWN]
+        assert values(layout, raw)["r118"] == 1
+        assert "in 1 request a cycle" in connector.describe()
+
+
+def _later(ns: int) -> Callable[[], int]:
+    now = time.monotonic_ns
+    return lambda: now() + ns
+
+
+def test_a_controller_that_permits_nothing_is_a_fault_of_the_source() -> None:
+    layout = table(TAGS)
+    with (
+        served(Plc(), Traits(fault=Fault.PUT_GET_OFF)) as port,
+        connected(layout, port) as connector,
+        pytest.raises(ConnectorError, match="PUT/GET"),
+    ):
+        connector.read()
+
+
+def test_digits_that_are_not_in_bcd_are_bad() -> None:
+    layout, plc = table(TAGS), Plc()
+    plc.areas[SrvArea.CT][6:8] = b"\x0a\x00"
+    with served(plc) as port, connected(layout, port) as connector:
+        assert codes(layout, connector.read()) == [GOOD] * 11 + [BAD_OUT_OF_RANGE]
+
+
+@pytest.mark.parametrize("pdu_size", [240, 480, 960])
+def test_many_registers_in_several_jobs(pdu_size: int) -> None:
+    plc = Plc()
+    plc.blocks[5] = bytearray(at // 2 % 251 if at % 2 else 0 for at in range(8000))
+    tags: dict[str, object] = {f"r{at}": {"type": "INT", "address": f"DB5.DBW{at}"} for at in range(0, 8000, 40)}
+    tags["long"] = {"type": "ARRAY[1..1500] OF BYTE", "address": "DB5.DBB0"}
+    layout = table(tags)
+    with served(plc, Traits(max_pdu_size=pdu_size)) as port, connected(layout, port) as connector:
+        found = values(layout, connector.read())
+    assert found.pop("long") == list(plc.blocks[5][:1500])
+    assert found == {f"r{at}": at // 2 % 251 for at in range(0, 8000, 40)}
+
+
+@pytest.mark.parametrize(
+    ("tag", "reason"),
+    [
+        ({"type": "BOOL", "address": "%I0.0", "writable": True}, "x: writable: inputs cannot be written"),
+        ({"type": "INT"}, "x: address: needed"),
+    ],
+)
+def test_a_wrong_table_is_a_fault_of_the_configuration(tag: object, reason: str) -> None:
+    layout = table({"y": {"type": "INT", "address": "%MW0"}, "x": tag})
+    with pytest.raises(ConfigError, match=reason):
+        S7Connector.for_layout(layout)(S7Options(host="127.0.0.1"), layout)
+
+
+def test_a_layout_without_addresses_is_read_as_a_block() -> None:
+    assert S7Connector.for_layout(place_tags("DB1", {"x": "INT"}, "big")) is S7Connector
+
+
+@given(st.binary(max_size=120), st.lists(st.integers(1, 20), min_size=1, max_size=5), st.booleans())
+def test_any_answer_is_parsed_or_a_fault(noise: bytes, sizes: list[int], headed: bool) -> None:
+    head = struct.pack(">BxH3sBB2xHHHH", 3, 0, b"\x02\xf0\x80", 0x32, 3, 1, 2, len(noise), 0) + bytes((4, len(sizes)))
+    frame = memoryview(head + noise if headed else noise.ljust(7, b"\0"))
+    with contextlib.suppress(ConnectorError):
+        answers = pdu.parse_items(frame, sizes)
+        assert [len(one.data) for one in answers if one.code == 0xFF] == [
+            size for one, size in zip(answers, sizes, strict=True) if one.code == 0xFF
+        ]
+
+
+def test_an_answer_to_other_sizes_is_refused() -> None:
+    data = b"\xff\x04\0\x10ab\xff\x04\0\x08c"
+    head = struct.pack(">BxH3sBB2xHHHH", 3, 0, b"\x02\xf0\x80", 0x32, 3, 1, 2, len(data), 0) + b"\x04\x02"
+    frame = memoryview(head + data)
+    assert [bytes(one.data) for one in pdu.parse_items(frame, [2, 1])] == [b"ab", b"c"]
+    with pytest.raises(ConnectorError, match="bytes of data"):
+        pdu.parse_items(frame, [1, 2])
