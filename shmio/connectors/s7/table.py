@@ -18,7 +18,6 @@ from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.address import parse
 from shmio.connectors.s7.blocks import ITEM_OVERHEAD, JOB_OVERHEAD, BlockWrite, WriteItem, bit_item, byte_item, touches
-from shmio.connectors.s7.connector import MAX_DEPTH, Read, S7Options, S7Session
 from shmio.connectors.s7.explain import (
     ACCESS_DENIED,
     ITEM_OK,
@@ -30,6 +29,7 @@ from shmio.connectors.s7.explain import (
     explain_item,
 )
 from shmio.connectors.s7.plan import Field, Job, Piece, Range, merge, most_bytes, pack
+from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
 from shmio.connectors.s7.tag import Tag
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout, Register, bit_positions

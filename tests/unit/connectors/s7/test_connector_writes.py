@@ -44,7 +44,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    monkeypatch.setattr("shmio.connectors.s7.connector.time", made)
+    monkeypatch.setattr("shmio.connectors.s7.session.time", made)
     monkeypatch.setattr("shmio.connectors.s7.transport.time", made)
     return made
 

@@ -1,0 +1,470 @@
+"""A session with an S7 controller: its configuration keys, reads in flight, and writes.
+
+``submit`` sends the requests of a read and returns at once. ``collect`` waits for the image. Up to
+``depth`` reads may be in flight, and you may write at any time. Use a client in one thread only.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from types import TracebackType
+from typing import Annotated, Literal, Protocol
+
+import msgspec
+
+from shmio.config.faults import meant
+from shmio.connectors.base import Lost, WriteLostError
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.blocks import BlockWrite, ends
+from shmio.connectors.s7.explain import RefusedError
+from shmio.connectors.s7.mode import ModeQuery
+from shmio.connectors.s7.transport import Operation, Transport, Window
+from shmio.errors import ConnectorError
+from shmio.layout.values.write import Write
+
+MAX_DEPTH = 4  # reads in flight at once; with more, images would only be older
+LONGEST_WRITE_S = 20  # limit for a whole batch; ``timeout`` if that is longer
+
+# The slot of the CPU in its rack by family, unless the key slot is configured.
+_CPU_SLOT = {"S7_300": 2, "S7_400": 3, "S7_1200": 1, "S7_1500": 1}
+
+
+class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """Address of the controller and parameters of the session, with the keys of ``plc.ini``.
+
+    Raises:
+        ValueError: The host or the model is invalid.
+
+    """
+
+    host: Annotated[str, msgspec.Meta(min_length=1, max_length=253)]
+    model: str | None = None
+    """``S7_300``, ``S7_400``, ``S7_1200`` or ``S7_1500``; it sets only the default of ``slot``."""
+    port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 102
+    rack: Annotated[int, msgspec.Meta(ge=0, le=7)] = 0
+    slot: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None
+    connection: Literal["pg", "op", "basic"] = "pg"
+    """Type of the connection: programming device, operator panel or other (S7 basic)."""
+    local_tsap: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] = 0x0100
+    """TSAP of this side."""
+    remote_tsap: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None = None
+    """TSAP of the controller; None: that of ``connection``, ``rack`` and ``slot``."""
+    timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
+    """Time-out in ms for connecting, for reading the block, and for each answer to a write."""
+    packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
+    """Largest number of data bytes in one read; the controller's PDU size limits it too."""
+    dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
+    """Number of the data block; None: the number in the layout's name."""
+    maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named like the other keys
+    """Largest number of requests in flight; the controller's limit applies too."""
+
+    def __post_init__(self) -> None:
+        if not _is_host(self.host):
+            raise ValueError(f"host: {self.host!r} is not a host name or address; give the port in the key port")
+        if self.model is not None and _family(self.model) not in _CPU_SLOT:
+            raise ValueError(
+                f"model: {self.model!r} is unknown; valid: {', '.join(_CPU_SLOT)}{meant(self.model, _CPU_SLOT)}"
+            )
+
+    @property
+    def cpu_slot(self) -> int:
+        """The configured slot, or the usual one of the model."""
+        if self.slot is not None:
+            return self.slot
+        return 1 if self.model is None else _CPU_SLOT[_family(self.model)]
+
+    @property
+    def called_tsap(self) -> int:
+        """The configured TSAP of the controller, or that of connection type, rack and slot."""
+        if self.remote_tsap is not None:
+            return self.remote_tsap
+        return pdu.CONNECTION_TYPES[self.connection] << 8 | self.rack << 5 | self.cpu_slot
+
+    @property
+    def peer(self) -> str:
+        """``host:port`` for messages, with IPv6 addresses in brackets."""
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def _family(model: str) -> str:
+    """Return the model as spelled in the table, for example ``S7_1500`` for ``s7-1500``."""
+    return model.strip().upper().replace("-", "_").replace(" ", "_")
+
+
+def _is_host(text: str) -> bool:
+    """Return whether the text is an IP address (IPv6 zones are allowed) or a valid host name."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return re.fullmatch(r"[^\s:/\[\]@]+", text) is not None and _is_name(text)
+    return True
+
+
+def _is_name(text: str) -> bool:
+    """Return whether every label of a host name has 1 to 63 bytes, so that it can be looked up."""
+    try:
+        text.encode("idna")
+    except UnicodeError:
+        return False
+    return True
+
+
+class Read(Operation, Protocol):
+    """A read of all values of a cycle, which may be begun again."""
+
+    deadline_ns: int
+    """Time by which it must be complete, in ns of CLOCK_MONOTONIC."""
+    refusal: RefusedError | None
+    """The controller's refusal of the whole read; None if it did not refuse."""
+
+    @property
+    def data(self) -> bytes:
+        """The image; valid only if the read is complete and was not refused."""
+
+    def begin(self, deadline_ns: int) -> None:
+        """Start a read that must be complete by ``deadline_ns``."""
+
+
+class S7Session(ABC):
+    """Keeps a session with one controller, in which several reads may be in flight.
+
+    A subclass says what is read and how writes are carried out. Any error closes the socket, so
+    that a late answer is never matched to a later request. You may call ``connect`` again
+    afterwards.
+    """
+
+    def __init__(self, options: S7Options) -> None:
+        """Create a session. It does not connect yet."""
+        self.options = options
+        self._timeout_ns = options.timeout * 1_000_000
+        self._transport: Transport | None = None
+        self._session = pdu.Session(0, 0)
+        # References continue after a reconnect, so that a late answer matches no new request.
+        self._window = Window(0, 0)
+        self._under_way: deque[Read] = deque()
+        self._idle: list[Read] = []
+        self._mode = ModeQuery()
+        self._close_on_error = _CloseOnError(self.close, options)
+
+    @property
+    def timeout_s(self) -> float:
+        """The longest time that a method takes, in s: ``timeout``, at least LONGEST_WRITE_S."""
+        return max(self.options.timeout / 1000, LONGEST_WRITE_S)
+
+    @property
+    def connected(self) -> bool:
+        """True if a session is open, as far as the client knows."""
+        return self._transport is not None
+
+    @property
+    def pdu_size(self) -> int:
+        """Largest PDU size that the controller granted, in bytes; 0 before the first session."""
+        return self._session.pdu_size
+
+    @property
+    def jobs(self) -> int:
+        """Largest number of requests in flight; 0 before the first session.
+
+        The controller grants it, and ``maxJobs`` may limit it.
+        """
+        return self._session.jobs
+
+    @property
+    def depth(self) -> int:
+        """Largest number of reads in flight in this session, at least 1."""
+        return max(1, len(self._idle) + len(self._under_way))
+
+    @property
+    def doubt(self) -> str:
+        """Reason why values may not change, such as a PLC in STOP; empty if there is none."""
+        return self._mode.doubt
+
+    def connect(self) -> None:
+        """Open a session and query the operating mode, within ``timeout`` plus the name lookup.
+
+        Raises:
+            ConnectorError: No controller answers, it does not speak S7, or it refuses the session.
+
+        """
+        self.close()
+        with _CloseOnError(self.close, self.options, opening=True):
+            self._transport = transport = Transport(self.options.host, self.options.port, self._timeout_ns)
+            deadline_ns = transport.deadline_ns
+            transport.send(pdu.connect_request(self.options.local_tsap, self.options.called_tsap), deadline_ns)
+            tpdu_size = pdu.parse_connect_confirm(transport.next_frame(deadline_ns))
+            asked = pdu.Session(min(pdu.WANTED_PDU_SIZE, tpdu_size - 3), pdu.WANTED_JOBS)
+            reference = self._window.reference
+            self._window.reference = (reference + 1) & 0xFFFF
+            transport.send(pdu.setup_request(reference, asked.jobs, asked.pdu_size), deadline_ns)
+            granted = pdu.parse_setup_answer(transport.next_frame(deadline_ns), reference, asked)
+            if transport.left:
+                raise ConnectorError("unexpected bytes after the session was set up")
+            self._use(granted, transport)
+        with self._close_on_error:
+            self._ask_mode()
+            self._flush()
+            self._finish(self._mode, deadline_ns)
+
+    def read(self) -> bytes:
+        """Read the whole block within ``timeout``. No other read may be in flight.
+
+        If the block needs several PDUs, its parts may be from different instants.
+
+        Returns:
+            ``size`` bytes as the controller sent them.
+
+        Raises:
+            ConnectorError: See :meth:`collect`.
+
+        """
+        self.submit()
+        image = None
+        while image is None:
+            image = self.collect(self._under_way[0].deadline_ns)
+        return image
+
+    def submit(self) -> None:
+        """Send the requests of one read and return. At most ``depth`` reads may be in flight.
+
+        Raises:
+            ConnectorError: There is no session, or it was lost.
+
+        """
+        if self._transport is None:
+            raise ConnectorError("not connected")
+        if not self._idle:
+            raise RuntimeError(f"no more than {self.depth} reads may be in flight")
+        with self._close_on_error:
+            read = self._idle.pop()
+            read.begin(time.monotonic_ns() + self._timeout_ns)
+            self._under_way.append(read)
+            self._window.add(read)
+            self._ask_mode()
+            self._flush()
+
+    def collect(self, until_ns: int) -> bytes | None:
+        """Wait until the oldest read is complete.
+
+        Args:
+            until_ns: Time at which to stop waiting, in ns of CLOCK_MONOTONIC.
+
+        Returns:
+            ``size`` bytes; None if the read is not complete by ``until_ns``.
+
+        Raises:
+            ConnectorError: There is no session, an answer is wrong, the controller refused the
+                read, or it did not answer within ``timeout`` of ``submit``. The session is closed.
+
+        """
+        if self._transport is None:
+            raise ConnectorError("not connected")
+        if not self._under_way:
+            raise RuntimeError("no read is in flight")
+        read = self._under_way[0]
+        with self._close_on_error:
+            if not self._advance(read, min(until_ns, read.deadline_ns)):
+                if time.monotonic_ns() >= read.deadline_ns:
+                    raise TimeoutError
+                return None
+            if read.refusal is not None:
+                raise self._explained(read.refusal, read.deadline_ns)
+            self._idle.append(self._under_way.popleft())
+            return read.data
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Write a batch, and wait until the controller has answered. Reads may be in flight.
+
+        If writes change the same bits, the last one wins. A batch that does not fit into one PDU
+        takes several jobs, and is not atomic. The controller may execute jobs in flight in any
+        order. Each answer must come within ``timeout`` of the one before.
+
+        Returns:
+            For each write, "" if the controller confirmed it, else why it refused the write.
+
+        Raises:
+            WriteLostError: The session was lost, or the batch took longer than both
+                LONGEST_WRITE_S and ``timeout``.
+
+        """
+        if self._transport is None:
+            raise WriteLostError("not connected", [Lost.UNSENT] * len(writes))
+        outcomes = [""] * len(writes)
+        begun: list[BlockWrite] = []
+        try:
+            with self._close_on_error:
+                begun_ns = time.monotonic_ns()
+                end_ns = begun_ns + round(self.timeout_s * 1e9)
+                for wave in self._waves(writes, outcomes):
+                    begun.append(wave)
+                    self._window.add(wave, urgent=True)
+                    self._flush()
+                    self._finish_wave(wave, end_ns)
+                spent_ns = time.monotonic_ns() - begun_ns  # the writes delayed these answers
+                self._mode.deadline_ns += spent_ns
+                for read in self._under_way:
+                    read.deadline_ns += spent_ns
+        except ConnectorError as error:
+            raise WriteLostError(str(error), ends(outcomes, begun)) from None
+        return outcomes
+
+    def close(self) -> None:
+        """Close the socket, if it is open."""
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+        self._window = Window(0, self._window.reference)
+        self._under_way.clear()
+        self._idle.clear()
+        self._mode.lost()
+
+    # -- session -------------------------------------------------------------------------------------------------------
+
+    def _use(self, granted: pdu.Session, transport: Transport) -> None:
+        """Create the requests and buffers for the reads of a new session."""
+        jobs = min(granted.jobs, self.options.maxJobs or granted.jobs)
+        self._session = pdu.Session(granted.pdu_size, jobs)
+        self._window = Window(jobs, self._window.reference)
+        transport.reserve(jobs, granted.pdu_size + pdu.FRAME_OVERHEAD)
+        self._idle = self._reads()
+
+    @abstractmethod
+    def _reads(self) -> list[Read]:
+        """Return the reads that may be in flight at once in the new session, at least one."""
+
+    @abstractmethod
+    def _waves(self, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
+        """Divide a batch into waves that are sent one after the other.
+
+        Each wave stores the reasons of refusals in ``outcomes``, by the write's index.
+        """
+
+    # -- requests and answers ------------------------------------------------------------------------------------------
+
+    def _ask_mode(self) -> None:
+        """Queue a mode query if one is due; raise TimeoutError if the last answer is late."""
+        now_ns = time.monotonic_ns()
+        if not self._mode.complete:  # after a long period the answer may be in the socket
+            self._advance(self._mode, now_ns)
+        if self._mode.due(now_ns):
+            self._mode.begin(now_ns, now_ns + self._timeout_ns)
+            self._window.add(self._mode)
+        elif self._mode.overdue(now_ns):
+            raise TimeoutError
+
+    def _flush(self) -> None:
+        """Send as many waiting requests as the window allows."""
+        assert self._transport is not None  # noqa: S101 - for the type checker
+        if self._window.waiting and (requests := self._window.due()):
+            try:
+                self._transport.send(requests, time.monotonic_ns() + self._timeout_ns)
+            except OSError:
+                if not self._transport.taken:
+                    self._window.take_back()
+                raise
+
+    def _advance(self, operation: Operation, until_ns: int) -> bool:
+        """Send and receive until the operation is complete, or until ``until_ns``.
+
+        Return whether it is complete.
+        """
+        while not operation.complete:
+            if self._step(until_ns) is None:
+                return False
+            if not operation.complete and time.monotonic_ns() >= until_ns:
+                return False
+        return True
+
+    def _step(self, until_ns: int) -> int | None:
+        """Receive once, then send as many waiting requests as the window allows.
+
+        Returns:
+            The number of answers; None if nothing was received until ``until_ns``.
+
+        """
+        transport, window = self._transport, self._window
+        assert transport is not None  # noqa: S101 - for the type checker
+        if not transport.receive(until_ns):
+            return None
+        answers = 0
+        while (frame := transport.frame()) is not None:
+            window.accept(frame)
+            answers += 1
+        if window.idle and transport.left:
+            raise ConnectorError("unexpected bytes after the last answer")
+        self._flush()
+        return answers
+
+    def _finish(self, operation: Operation, deadline_ns: int) -> None:
+        if not self._advance(operation, deadline_ns):
+            raise TimeoutError
+
+    def _finish_wave(self, wave: BlockWrite, end_ns: int) -> None:
+        """Wait for all jobs of a wave until ``end_ns``, and for each answer at most ``timeout``."""
+        deadline_ns = time.monotonic_ns() + self._timeout_ns
+        while not wave.complete:
+            answers = self._step(min(deadline_ns, end_ns))
+            now_ns = time.monotonic_ns()
+            if answers:
+                deadline_ns = now_ns + self._timeout_ns
+            if now_ns >= deadline_ns:
+                raise TimeoutError
+            if now_ns >= end_ns and not wave.complete:
+                raise ConnectorError(
+                    f"{self.options.peer} has not served all writes of a cycle within {self.timeout_s:g} s: write less "
+                    "at once"
+                )
+
+    def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:  # noqa: ARG002
+        """Return the refusal of a read, with more detail if there is some to be had by ``deadline_ns``."""
+        return refusal
+
+
+# -- connection errors -------------------------------------------------------------------------------------------------
+
+
+def _named(error: BaseException, options: S7Options, *, opening: bool = False) -> ConnectorError | None:
+    """Return a ConnectorError that explains a connection error; None for any other error."""
+    peer = options.peer
+    if isinstance(error, TimeoutError):
+        return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
+    if isinstance(error, ConnectionRefusedError):
+        return ConnectorError(f"connection refused by {peer}")
+    if isinstance(error, (EOFError, ConnectionError)):
+        text = f"{peer} closed the connection"
+        if opening:
+            text += (
+                f" during set-up: rack {options.rack}, slot {options.cpu_slot} may be wrong, all its connections in "
+                "use, or it is not an S7 controller"
+            )
+        return ConnectorError(text)
+    if isinstance(error, socket.gaierror):
+        return ConnectorError(f"host name {options.host!r} cannot be resolved: {error.strerror}")
+    if isinstance(error, OSError):
+        return ConnectorError(f"{peer} cannot be reached: {error.strerror or error}")
+    return None
+
+
+class _CloseOnError:
+    """Context manager that closes the connection on any error, and raises an explained error."""
+
+    def __init__(self, close: Callable[[], None], options: S7Options, *, opening: bool = False) -> None:
+        self._close = close
+        self._options = options
+        self._opening = opening
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if error is not None:
+            self._close()
+            if (clear := _named(error, self._options, opening=self._opening)) is not None:
+                raise clear from None
