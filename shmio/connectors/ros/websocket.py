@@ -21,7 +21,7 @@ from shmio.errors import ConnectorError
 from shmio.logs import printable
 
 if TYPE_CHECKING:
-    from websockets.sync.client import ClientConnection
+    from websockets.sync.connection import Connection
 
 CLOSE_S: Final = 0.2
 MAX_REPORTED: Final = 20
@@ -73,6 +73,7 @@ class Link:
 
         self._peer, self._timeout_s, self._topics = peer, timeout_s, topics
         self._closed_errors = (WebSocketException, OSError)
+        self._stack = contextlib.ExitStack()
         self._condition = threading.Condition()
         self._newest: dict[str, Received] = {}
         self._expected: tuple[str, str, Any] | None = None  # (topic, id, message)
@@ -92,10 +93,10 @@ class Link:
             channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             whole, part = divmod(timeout_s, 1)
             channel.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT.pack(int(whole), int(part * 1e6)))
-            self._socket: ClientConnection = connect(
+            self._socket: Connection = self._stack.enter_context(connect(
                 url, sock=channel, open_timeout=timeout_s, close_timeout=CLOSE_S, max_size=max_bytes, max_queue=64,
                 ping_interval=None, compression=None, proxy=None, user_agent_header="shmio",
-            )  # fmt: skip
+            ))  # fmt: skip
         except TimeoutError:
             channel.close()
             raise ConnectorError(f"no answer within {timeout_s * 1000:.0f} ms from {peer}") from None
@@ -108,7 +109,7 @@ class Link:
     def close(self) -> None:
         """Close the connection."""
         with contextlib.suppress(*self._closed_errors):
-            self._socket.close()
+            self._stack.close()
         self._socket.close_socket()
         self._thread.join(CLOSE_S)
 
