@@ -75,6 +75,10 @@ class S7Connector(S7Client, Connector):
 
     def __init__(self, options: S7Options, layout: Layout) -> None:
         number = options.dbNumber if options.dbNumber is not None else layout.number
+        if options.every:
+            raise ConfigError(
+                "every: a data block is read as a whole; name addresses in a tag table to read some less often"
+            )
         if number is None:
             raise ConfigError(
                 f"dbNumber: this key is needed, because the layout {layout.name!r} has no number in its name"

@@ -27,6 +27,8 @@ class Field(NamedTuple):
     start: int
     """First byte; that of a timer or counter is twice its number."""
     stop: int
+    every: int = 1
+    """In each how many cycles it is read once."""
 
 
 class Range:
@@ -35,6 +37,7 @@ class Range:
     def __init__(self, fields: Sequence[Field]) -> None:
         self.fields = tuple(fields)
         self.area, self.db = Area(fields[0].area), fields[0].db
+        self.every = fields[0].every
         self.start = min(one.start for one in fields)
         self.stop = max(one.stop for one in fields)
         self.alone = False
@@ -73,13 +76,16 @@ Job = tuple[Piece, ...]
 
 
 def merge(fields: Iterable[Field], most: int, max_gap: int = MAX_GAP) -> list[Range]:
-    """Return ranges that cover the fields; a range has at most ``most`` bytes unless one field has more."""
+    """Return ranges that cover the fields, those of each rate by themselves.
+
+    A range has at most ``most`` bytes unless one field has more.
+    """
     ranges: list[Range] = []
     run: list[Field] = []
     stop = 0
-    for one in sorted(fields, key=lambda field: (field.area, field.db, field.start, field.stop)):
+    for one in sorted(fields, key=lambda field: (field.every, field.area, field.db, field.start, field.stop)):
         if run and (
-            (one.area, one.db) != (run[0].area, run[0].db)
+            (one.every, one.area, one.db) != (run[0].every, run[0].area, run[0].db)
             or one.start > stop + (0 if one.area.numbered else max_gap)
             or max(stop, one.stop) - run[0].start > most
         ):

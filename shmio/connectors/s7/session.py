@@ -61,6 +61,8 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     """Largest number of data bytes in one read; the controller's PDU size limits it too."""
     dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
     """Number of the data block; None: the number in the layout's name."""
+    every: Annotated[dict[str, Annotated[int, msgspec.Meta(ge=2, le=10_000)]], msgspec.Meta(max_length=8)] = {}
+    """Of a tag table: patterns of registers that are read only in each n-th cycle, with n."""
     maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named like the other keys
     """Largest number of requests in flight; the controller's limit applies too."""
 

@@ -31,7 +31,8 @@ from shmio.connectors.s7.explain import (
 from shmio.connectors.s7.plan import Field, Job, Piece, Range, merge, most_bytes, pack
 from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
 from shmio.connectors.s7.tag import Tag
-from shmio.errors import ConfigError, ConnectorError
+from shmio.errors import ConfigError, ConnectorError, PathError
+from shmio.layout.glob import Glob
 from shmio.layout.model import Layout, Register, bit_positions
 from shmio.layout.values.write import Write, apply
 from shmio.model.statuses import (
@@ -66,46 +67,62 @@ class Planner:
         self._tags = tags
         self.pdu_size = 0
         self._ranges: list[Range] = []
-        self._jobs: list[Job] | None = None
+        self._rates = sorted({tag.field.every for tag in tags})
+        self._jobs: dict[tuple[int, ...], list[Job]] = {}  # by the rates that are due
+        self._cycle = 0
         self.refused: dict[Field, tuple[int, int]] = {}
         """By refused field: the status, and when to try it again, ns of CLOCK_MONOTONIC."""
 
     def use(self, pdu_size: int) -> None:
-        """Plan for the PDU size of a new session; what is known is kept."""
+        """Plan for the PDU size of a new session, whose first read is of all registers; what is known is kept."""
+        self._cycle = 0
         if pdu_size != self.pdu_size:
             self.pdu_size = pdu_size
             self._merge()
 
     def jobs(self, now_ns: int) -> list[Job]:
         """Return the jobs of a read, with some refused registers if it is time to try these again."""
-        if self._jobs is None:
-            self._jobs = pack(self._ranges, self.pdu_size)
+        jobs = self._due(self._cycle)
+        self._cycle += 1
         if not self.refused:
-            return self._jobs
+            return jobs
         due: list[Range] = []
         for field, (status, at_ns) in self.refused.items():
             if at_ns <= now_ns and len(due) < MAX_RETRIED:
                 due.append(Range([field]))
                 self.refused[field] = status, now_ns + RETRY_NS
-        return self._jobs + pack(due, self.pdu_size) if due else self._jobs
+        return jobs + pack(due, self.pdu_size) if due else jobs
+
+    @property
+    def count(self) -> int:
+        """Most jobs of a cycle, without those that try refused registers again."""
+        return len(self._due(0))
+
+    def _due(self, cycle: int) -> list[Job]:
+        """Return the jobs of a cycle; in cycle 0 all registers are read."""
+        rates = tuple(rate for rate in self._rates if cycle % rate == 0)
+        jobs = self._jobs.get(rates)
+        if jobs is None:
+            jobs = self._jobs[rates] = pack((one for one in self._ranges if one.every in rates), self.pdu_size)
+        return jobs
 
     def split(self, whole: Range, parts: Sequence[Range]) -> None:
         """Read the parts of a range from now on, if the range is still in use."""
         if whole in self._ranges:
             place = self._ranges.index(whole)
             self._ranges[place : place + 1] = parts
-            self._jobs = None
+            self._jobs = {}
 
     def replan(self) -> None:
         """Divide the ranges among jobs again, because it has changed which need their own."""
-        self._jobs = None
+        self._jobs = {}
 
     def together(self, ranges: Iterable[Range]) -> None:
         """Let ranges share jobs again, because it is known now what was wrong."""
         for whole in ranges:
             if whole.alone:
                 whole.alone = False
-                self._jobs = None
+                self._jobs = {}
 
     def refuse(self, part: Range, status: int, why: str) -> None:
         """Leave the only field of a range alone for a while."""
@@ -126,7 +143,7 @@ class Planner:
     def _merge(self) -> None:
         fields = (tag.field for tag in self._tags if tag.field not in self.refused)
         self._ranges = merge(fields, most_bytes(self.pdu_size))
-        self._jobs = None
+        self._jobs = {}
 
     def _named(self, field: Field) -> str:
         tag = self._tags[field.register]
@@ -159,6 +176,8 @@ class TableRead:
     def begin(self, deadline_ns: int) -> None:
         """Start a read that must be complete by ``deadline_ns``."""
         self.deadline_ns = deadline_ns
+        self.begun_ns = time.time_ns()
+        """UTC time of the start, ns since 1970."""
         self.refusal: RefusedError | None = None
         self.sent = self._answered = self._denied = 0
         self._jobs: list[Job] = list(self._planner.jobs(time.monotonic_ns())) if deadline_ns else []
@@ -297,6 +316,7 @@ class S7TableConnector(S7Session, Connector):
             raise ConfigError("dbNumber: leave it out: each address of a tag table names its block")
         self._layout = layout
         self._tags: list[Tag] = []
+        rates = _rates(options.every, layout)
         for index, register in enumerate(layout.registers):
             try:
                 address = parse(register)
@@ -304,13 +324,14 @@ class S7TableConnector(S7Session, Connector):
                     raise ValueError(f"writable: {address.area.read_only}")
             except ValueError as error:
                 raise ConfigError(f"layout: {register.path}: {error}") from None
-            self._tags.append(Tag(index, register, address, layout.byte_order))
+            rate = next((every for glob, every in rates if glob.matches(register.path)), 1)
+            self._tags.append(Tag(index, register, address, layout.byte_order, rate))
         self._planner = Planner(self._tags)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
 
     def describe(self) -> str:
         """Return the peer, the parameters of the session and the requests of a cycle as a text for logs."""
-        requests = len(self._planner.jobs(0))
+        requests = self._planner.count
         return (
             f"to {self.options.peer} {len(self._tags)} registers pdu={self.pdu_size} jobs={self.jobs} "
             f"depth={self.depth} in {requests} {'request' if requests == 1 else 'requests'} a cycle"
@@ -323,7 +344,7 @@ class S7TableConnector(S7Session, Connector):
             raise ConnectorError("the layout has no status area")
         limit = self.options.packetSize or self.pdu_size
         self._planner.use(min(self.pdu_size, max(pdu.MIN_PDU_SIZE, limit + pdu.READ_OVERHEAD)))
-        requests = max(1, len(self._planner.jobs(0)))
+        requests = max(1, self._planner.count)
         depth = min(max(1, self.jobs // requests), MAX_DEPTH)
         return [TableRead(self._planner, self._queue_again, self._store) for _ in range(depth)]
 
@@ -337,16 +358,18 @@ class S7TableConnector(S7Session, Connector):
         for index, status in read.statuses.items():
             image.fail(index, status)
         for whole, data in read.data_of.items():
-            if whole.last == data:  # then the registers have these values already
+            # A register that is read in every cycle has the time of the frame.
+            source_ns = read.begun_ns if whole.every > 1 else 0
+            if whole.last == data and not source_ns:  # then the registers have these values already
                 continue
             whole.last = bytes(data)
             for field in whole.fields:
                 tag = self._tags[field.register]
                 found = tag.image_bytes(whole.last[field.start - whole.start : field.stop - whole.start])
                 if found is None:
-                    image.fail(field.register, BAD_OUT_OF_RANGE)
+                    image.fail(field.register, BAD_OUT_OF_RANGE, source_ns)
                 else:
-                    image.put_bytes(field.register, found)
+                    image.put_bytes(field.register, found, source_ns)
         return bytes(image)
 
     # -- writing -------------------------------------------------------------------------------------------------------
@@ -433,6 +456,20 @@ class S7TableConnector(S7Session, Connector):
         for first, count in _covered(register, there):
             at, data = tag.device_bytes(own, first, count)
             yield tag, start + at, None, data
+
+
+def _rates(every: dict[str, int], layout: Layout) -> list[tuple[Glob, int]]:
+    """Return the patterns of the key ``every``; ConfigError if one is wrong or matches nothing."""
+    rates = []
+    for pattern, rate in every.items():
+        try:
+            glob = Glob(pattern)
+        except PathError as error:
+            raise ConfigError(f"every: {error}") from None
+        if not any(glob.matches(register.path) for register in layout.registers):
+            raise ConfigError(f"every: {pattern!r} matches no register of the layout")
+        rates.append((glob, rate))
+    return rates
 
 
 def _linear(tag: Tag, start: int, bit: int | None) -> int:

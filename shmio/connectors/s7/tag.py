@@ -19,12 +19,12 @@ _S5_BASES_MS: Final = (10, 100, 1000, 10_000)
 class Tag:
     """A register, its address, and the conversion of its values."""
 
-    def __init__(self, index: int, register: Register, address: Address, byte_order: ByteOrder) -> None:
+    def __init__(self, index: int, register: Register, address: Address, byte_order: ByteOrder, every: int = 1) -> None:
         self.index, self.register, self.address = index, register, address
         self._order = byte_order
         unit = 2 if address.area.numbered else 1
         start = address.start * unit
-        self.field = Field(index, address.area, address.db, start, start + address.size)
+        self.field = Field(index, address.area, address.db, start, start + address.size, every)
         element = register.element
         self._converted = (
             address.kind is not element or register.scale is not None or address.area.numbered

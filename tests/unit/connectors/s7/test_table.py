@@ -184,6 +184,45 @@ def test_a_controller_that_permits_nothing_is_a_fault_of_the_source() -> None:
         connector.read()
 
 
+def test_slow_registers_are_read_in_each_third_cycle_and_say_when() -> None:
+    tags: dict[str, object] = {
+        "fast": {"type": "INT", "address": "DB1.DBW0"},
+        "slow/a": {"type": "INT", "address": "DB1.DBW2"},
+    }
+    layout, plc = table(tags), Plc()
+    area = StatusArea(layout)
+    plc.blocks[1][:4] = bytes(4)
+    with served(plc) as port:
+        options = S7Options(host="127.0.0.1", port=port, timeout=2000, every={"slow/*": 3})
+        connector = S7Connector.for_layout(layout)(options, layout)
+        seen, times = [], []
+        try:
+            connector.connect()
+            for count in range(7):
+                plc.blocks[1][1] = plc.blocks[1][3] = count
+                raw = connector.read()
+                found = values(layout, raw)
+                seen.append((found["fast"], found["slow/a"]))
+                times.append(area.get(raw, 1).source_ns)
+                assert codes(layout, raw) == [GOOD, GOOD]
+                assert area.get(raw, 0).source_ns == 0
+            connector.close()
+            connector.connect()
+            plc.blocks[1][3] = 99
+            assert values(layout, connector.read())["slow/a"] == 99  # a new session begins with all registers
+        finally:
+            connector.close()
+    assert seen == [(0, 0), (1, 0), (2, 0), (3, 3), (4, 3), (5, 3), (6, 6)]
+    assert times[0] == times[2] < times[3] == times[5] < times[6]
+
+
+@pytest.mark.parametrize("every", [{"nothing/*": 2}, {"[": 2}])
+def test_a_rate_of_no_register_is_a_fault_of_the_configuration(every: dict[str, int]) -> None:
+    layout = table(TAGS)
+    with pytest.raises(ConfigError, match="every: "):
+        S7Connector.for_layout(layout)(S7Options(host="127.0.0.1", every=every), layout)
+
+
 def test_digits_that_are_not_in_bcd_are_bad() -> None:
     layout, plc = table(TAGS), Plc()
     plc.areas[SrvArea.CT][6:8] = b"\x0a\x00"
