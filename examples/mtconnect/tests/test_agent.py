@@ -158,6 +158,30 @@ def test_a_missing_heartbeat(agent: Agent, reader: Reader) -> None:
     assert "no answer" in reader.error()
 
 
+def test_a_stream_that_is_behind_is_uncertain(agent: Agent) -> None:
+    """It catches up, in the order of the observations."""
+    reader = Reader(agent, count=2)
+    agent.set(count="0")
+    reader.connector.connect()
+    agent.tell(silent=True)
+    for number in range(200):
+        agent.set(count=str(number))
+    agent.tell(silent=False)
+    seen: list[object] = []
+    doubts: set[bool] = set()
+
+    def caught_up(found: dict[str, object]) -> bool:
+        seen.append(found["parts"])
+        doubts.add("raise count" in reader.connector.doubt)
+        return found["parts"] == 199 and not reader.connector.doubt
+
+    reader.until(caught_up)
+    reader.connector.close()
+    numbers = [number for number in seen if isinstance(number, int)]
+    assert numbers == sorted(numbers)
+    assert doubts == {True, False}
+
+
 def test_observations_that_fell_out_of_the_buffer(agent: Agent, reader: Reader) -> None:
     """The stream ends with the agent's error, and the next connection begins with the present state."""
     reader.connector.connect()
