@@ -66,12 +66,14 @@ class Planner:
     def __init__(self, tags: Sequence[Tag]) -> None:
         self._tags = tags
         self.pdu_size = 0
-        self._ranges: list[Range] = []
+        self._ranges: dict[Range, None] = {}  # a set in order
         self._rates = sorted({tag.field.every for tag in tags})
         self._jobs: dict[tuple[int, ...], list[Job]] = {}  # by the rates that are due
         self._cycle = 0
         self.refused: dict[Field, tuple[int, int]] = {}
         """By refused field: the status, and when to try it again, ns of CLOCK_MONOTONIC."""
+        self.news: dict[int, int] = {}
+        """Statuses of refused registers, by index in the layout, that the image does not have yet."""
 
     def use(self, pdu_size: int) -> None:
         """Plan for the PDU size of a new session, whose first read is of all registers; what is known is kept."""
@@ -109,8 +111,8 @@ class Planner:
     def split(self, whole: Range, parts: Sequence[Range]) -> None:
         """Read the parts of a range from now on, if the range is still in use."""
         if whole in self._ranges:
-            place = self._ranges.index(whole)
-            self._ranges[place : place + 1] = parts
+            del self._ranges[whole]
+            self._ranges |= dict.fromkeys(parts)
             self._jobs = {}
 
     def replan(self) -> None:
@@ -130,6 +132,7 @@ class Planner:
         if field not in self.refused:
             self._note(field, why)
         self.refused[field] = status, time.monotonic_ns() + RETRY_NS
+        self.news[field.register] = status
         self.split(part, ())
 
     def accept(self, part: Range) -> None:
@@ -137,12 +140,13 @@ class Planner:
         if self.refused and any(field in self.refused for field in part.fields):
             for field in part.fields:
                 if self.refused.pop(field, None):
+                    self.news.pop(field.register, None)
                     log.info("%s can be read again", self._named(field))
             self._merge()
 
     def _merge(self) -> None:
         fields = (tag.field for tag in self._tags if tag.field not in self.refused)
-        self._ranges = merge(fields, most_bytes(self.pdu_size))
+        self._ranges = dict.fromkeys(merge(fields, most_bytes(self.pdu_size)))
         self._jobs = {}
 
     def _named(self, field: Field) -> str:
@@ -184,10 +188,11 @@ class TableRead:
         self._denial: RefusedError | None = None
         self._again_alone: dict[Range, None] = {}
         self._codes: dict[Range, tuple[int, str]] = {}
+        self._gone: set[Range] = set()  # ranges that were refused
+        self._parts: list[Range] = []  # halves of these, which the next jobs read
         self.data_of: dict[Range, bytearray] = {}
         """The bytes of each range; of a refused one they mean nothing."""
-        self.statuses: dict[int, int] = {}
-        """Statuses of refused registers by index in the layout."""
+        self._found = False  # whether it is known what was refused
 
     @property
     def count(self) -> int:
@@ -229,19 +234,39 @@ class TableRead:
                 if answer.code == ITEM_OK:
                     self._put(piece, answer.data)
                 else:
-                    status = _STATUS.get(answer.code, BAD_COMMUNICATION_ERROR)
-                    self._codes[piece.range] = status, explain_item(answer.code)
+                    self._refuse(
+                        piece.range, _STATUS.get(answer.code, BAD_COMMUNICATION_ERROR), explain_item(answer.code)
+                    )
         self._answered += 1
         if self.complete:
             self._settle()
 
     def _put(self, piece: Piece, data: memoryview) -> None:
         whole = piece.range
+        if whole in self._gone:
+            return
         buffer = self.data_of.get(whole)
         if buffer is None:
             buffer = self.data_of[whole] = bytearray(whole.stop - whole.start)
         at = piece.start - whole.start
         buffer[at : at + piece.size] = data
+
+    def _refuse(self, whole: Range, status: int, why: str) -> None:
+        """Halve a range that was refused, or note its only register.
+
+        The planner knows at once, so that each session gets further, however slow the controller is.
+        """
+        if whole in self._gone:
+            return
+        self._gone.add(whole)
+        self.data_of.pop(whole, None)
+        halves = whole.halves()
+        if len(halves) > 1:
+            self._planner.split(whole, halves)
+            self._parts += halves
+        else:
+            self._planner.refuse(whole, status, why)
+            self._found = True
 
     def _refuse_all(self, job: Job, refusal: RefusedError) -> None:
         """Note a job that was refused as a whole, maybe because of one of its items."""
@@ -258,21 +283,15 @@ class TableRead:
     def _settle(self) -> None:
         """Halve ranges that were refused, and note what is known now."""
         refused, self._codes = self._codes, {}
-        parts, self._again_alone = list(self._again_alone), {}
         planner = self._planner
-        if self._denied == len(self._jobs) and self._jobs and not parts:
+        if self._denied == len(self._jobs) and self._jobs and not self._again_alone:
             self.refusal = self._denial  # nothing can be read, so it is not the fault of some addresses
             planner.together(refused)
             return
         for whole, (status, why) in refused.items():
-            self.data_of.pop(whole, None)
-            halves = whole.halves()
-            if len(halves) > 1:
-                planner.split(whole, halves)
-                parts += halves
-            else:
-                planner.refuse(whole, status, why)
-                self.statuses[whole.fields[0].register] = status
+            self._refuse(whole, status, why)
+        parts = [*self._again_alone, *self._parts]
+        self._again_alone, self._parts = {}, []
         if parts:
             planner.replan()
             self._jobs += pack(parts, planner.pdu_size)
@@ -281,7 +300,7 @@ class TableRead:
         for whole in self.data_of:
             if len(whole.fields) == 1:
                 planner.accept(whole)
-        if self.statuses:
+        if self._found:
             planner.together(self.data_of)
 
 
@@ -355,8 +374,10 @@ class S7TableConnector(S7Session, Connector):
         """Put the results of a read into the image, and return a copy of it."""
         image = self._image
         assert image is not None  # noqa: S101 - _reads() checked it
-        for index, status in read.statuses.items():
+        planner = self._planner
+        for index, status in planner.news.items():
             image.fail(index, status)
+        planner.news.clear()
         for whole, data in read.data_of.items():
             # A register that is read in every cycle has the time of the frame.
             source_ns = read.begun_ns if whole.every > 1 else 0
@@ -364,6 +385,8 @@ class S7TableConnector(S7Session, Connector):
                 continue
             whole.last = bytes(data)
             for field in whole.fields:
+                if planner.refused and field in planner.refused:  # by another read: its value is not read again
+                    continue
                 tag = self._tags[field.register]
                 found = tag.image_bytes(whole.last[field.start - whole.start : field.stop - whole.start])
                 if found is None:

@@ -7,6 +7,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,6 +26,7 @@ from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, BAD_OUT_OF_RANGE, GOOD, StatusArea
+from shmio.testing.proxy import FaultProxy
 
 TAGS: dict[str, object] = {
     "bit": {"type": "BOOL", "address": "DB1.DBX0.1"},
@@ -167,6 +169,27 @@ def test_refused_registers_are_found_and_tried_again(monkeypatch: pytest.MonkeyP
         assert codes(layout, raw) == [GOOD] * 20 + [BAD_NODE_ID_UNKNOWN]
         assert values(layout, raw)["r118"] == 1
         assert "in 1 request a cycle" in connector.describe()
+
+
+def test_what_is_refused_is_found_in_several_sessions_if_one_is_too_short() -> None:
+    layout = table({f"r{at}": {"type": "INT", "address": f"DB3.DBW{at}"} for at in range(0, 4000, 4)})
+    options = S7Options(host="127.0.0.1", port=1, timeout=150, maxJobs=1)
+    with served(Plc()) as port, FaultProxy(Address("127.0.0.1", port), up_s=0.01) as proxy:
+        options = msgspec.structs.replace(options, port=proxy.address.port)
+        connector = S7Connector.for_layout(layout)(options, layout)
+        failures = 0
+        try:
+            while failures < 100:
+                try:
+                    connector.connect()
+                    raw = connector.read()
+                    break
+                except ConnectorError:
+                    failures += 1
+        finally:
+            connector.close()
+    assert failures > 0
+    assert codes(layout, raw) == [BAD_NODE_ID_UNKNOWN] * 1000
 
 
 def _later(ns: int) -> Callable[[], int]:
