@@ -1,7 +1,7 @@
 // An MTConnect agent for the tests, written from the public standard (parts 1 to 3, version 1.3 to 2.x).
 // It shares no code with the connector. It prints its port, and takes one command in JSON per line on its
 // standard input, answering "ok" to each: {"set": {"Xact": "1.5"}, "at": "…"}, {"restart": true},
-// {"parts": [bytes of the stream, milliseconds between its bytes]}, {"drip": true},
+// {"parts": [bytes of the stream, milliseconds between its bytes]}, {"drip": "headers" or "content"},
 // {"silent": true}, {"condition": [id, element, code, text]}, {"version": "1.3"}, {"buffer": 100}, {"raw": [begin, repeated, times]}.
 'use strict'
 const http = require('http')
@@ -110,6 +110,7 @@ function serve (request, response) {
   const verb = url.pathname.split('/').pop()
   const number = (name, otherwise) => Number(url.searchParams.get(name) || otherwise)
   const send = (text, status = 200) => { response.writeHead(status, { 'Content-Type': 'text/xml' }); response.end(text) }
+  if (drip === 'headers') { dribble(response.socket, 'HTTP/1.1 200 OK\r\nA: ' + ' '.repeat(10000), 20); return }
   if (drip) { response.writeHead(200, { 'Content-Type': 'text/xml' }); dribble(response, ' '.repeat(100000), 20); return }
   if (raw !== null) { response.writeHead(200, { 'Content-Type': 'text/xml' }); response.end(raw); return }
   if (verb === 'probe') { send(devices()); return }
@@ -162,7 +163,7 @@ readline.createInterface({ input: process.stdin }).on('line', line => {
   if ('silent' in command) silent = command.silent
   if (command.raw) raw = command.raw[0] + command.raw[1].repeat(command.raw[2])
   if (command.parts) parts = command.parts
-  if (command.drip) drip = true
+  if (command.drip) drip = command.drip
   if (command.restart) { instanceId++; begin() }
   for (const [id, text] of Object.entries(command.set || {})) add(id, ITEMS[id][1], text, command.at)
   if (command.condition) { const [id, element, code, text] = command.condition; add(id, element, text, command.at, code) }

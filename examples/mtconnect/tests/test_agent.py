@@ -219,6 +219,19 @@ def test_hostile_documents(agent: Agent, answer: tuple[str, str, int], error: st
     reader.connector.close()
 
 
+def test_an_older_observation_is_never_shown(agent: Agent, reader: Reader) -> None:
+    """The stream sends the observation again that came before the present one."""
+    agent.set(count="1")
+    agent.set(count="2")
+    head = '<MTConnectStreams><Header instanceId="1000" nextSequence="100" lastSequence="99"/><Events>'
+    old = '<PartCount dataItemId="count" sequence="12" timestamp="2024-01-01T00:00:00Z">1</PartCount>'
+    new = '<Execution dataItemId="exec" sequence="99" timestamp="2024-01-01T00:00:00Z">ACTIVE</Execution>'
+    text = f"{head}{old}{new}</Events></MTConnectStreams>"
+    agent.tell(parts=[f"{PART}Content-length: {len(text)}\r\n\r\n{text}", 0])
+    reader.connector.connect()
+    assert reader.until(lambda one: one["running"] is True)["parts"] == 2
+
+
 PART = "--part-1000\r\nContent-type: text/xml\r\n"
 
 
@@ -247,10 +260,11 @@ def test_hostile_streams(agent: Agent, parts: list[object], error: str) -> None:
     reader.connector.close()
 
 
-def test_a_document_that_drips(agent: Agent) -> None:
+@pytest.mark.parametrize("part", ["headers", "content"])
+def test_a_document_that_drips(agent: Agent, part: str) -> None:
     """It is late as a whole, although there is always another byte in time."""
     reader = Reader(agent, timeout=300)
-    agent.tell(drip=True)
+    agent.tell(drip=part)
     with pytest.raises(ConnectorError, match=r"no answer from .* within 300 ms"):
         reader.connector.connect()
     reader.connector.close()
