@@ -242,6 +242,10 @@ class Subscription:
         self.keep_alive = min(asked.RequestedMaxKeepAliveCount or MAX_KEEP_ALIVE, MAX_KEEP_ALIVE)
         self.lifetime = min(max(asked.RequestedLifetimeCount or MAX_LIFETIME, 3 * self.keep_alive), MAX_LIFETIME)
         self.most = min(asked.MaxNotificationsPerPublish or MAX_NOTIFICATIONS, MAX_NOTIFICATIONS)
+        if self._timer is not None:  # the new interval counts from now on, also if the old one was long
+            self._timer.cancel()
+            self._due_s = asyncio.get_running_loop().time()
+            self._schedule()
 
     # ---- publishing --------------------------------------------------------------------------------------------------
 

@@ -150,3 +150,26 @@ def test_each_register_has_the_status_and_time_that_its_device_gives(instance: s
     with Segment.create(instance, [spec(layout=layout)], processes()) as segment:
         serve(segment, test)
         segment.unlink()
+
+
+def test_a_queue_keeps_the_values_in_between_and_says_what_it_lost(segment: Segment) -> None:
+    async def test(one: Served) -> None:
+        one.publish(image(step=0))
+        async with one.client() as client:
+            changes = Changes()
+            subscription = await client.create_subscription(60_000, changes)
+            # The library asks for samples every 50 ms by default; values in between would rightly be missing.
+            await subscription.subscribe_data_change(node(client, "cell/step"), queuesize=3, sampling_interval=0.0)
+            prompt = Changes()
+            await (await client.create_subscription(10, prompt)).subscribe_data_change(node(client, "cell/step"))
+            for step in range(1, 6):
+                one.publish(image(step=step))
+                await prompt.until("cell/step", lambda value, step=step: value.Value.Value == step)  # type: ignore[misc]
+            await subscription.update(
+                ua.ModifySubscriptionParameters(subscription.subscription_id, 20.0, 100, 10, 0, 0)
+            )
+            await changes.until("cell/step", lambda value: value.Value.Value == 5)
+            assert [value.Value.Value for _, value in changes.seen] == [3, 4, 5]
+            assert changes.seen[0][1].StatusCode.value == 0x480
+
+    serve(segment, test)
