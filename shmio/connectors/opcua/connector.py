@@ -10,6 +10,7 @@ import threading
 import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar
 
@@ -437,7 +438,12 @@ class _Link(threading.Thread):
         limit_s = CONNECT_TIMEOUTS * self._options.timeout / 1000
         if deadline_ns is not None:
             limit_s = max(0.0, (deadline_ns - time.monotonic_ns()) / 1e9)
-        future = asyncio.run_coroutine_threadsafe(self._guarded(work), self._loop)
+        running = self._guarded(work)
+        try:
+            future = asyncio.run_coroutine_threadsafe(running, self._loop)
+        except RuntimeError:  # the loop has just ended
+            running.close()
+            raise self._failure or ConnectorError(f"the connection to {self._options.peer} was closed") from None
         try:
             return future.result(limit_s)
         except concurrent.futures.TimeoutError:
@@ -450,7 +456,8 @@ class _Link(threading.Thread):
         """End the thread; wait shortly if the sessions are in order, so that the server frees them."""
         self._closed = True
         healthy = self.ready
-        self._loop.call_soon_threadsafe(self._stopping.set) if self.is_alive() else None
+        with suppress(RuntimeError):  # the loop may have just ended
+            self._loop.call_soon_threadsafe(self._stopping.set)
         if healthy:
             self.join(CLOSE_S)
 

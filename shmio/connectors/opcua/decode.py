@@ -93,6 +93,11 @@ class Publication(NamedTuple):
     closed: int
 
 
+def check_fault(data: bytes) -> None:
+    """Raise FaultError if any response says that the server refuses the request; MalformedError."""
+    _Reader(data).header(None)
+
+
 def read_response(data: bytes) -> list[Sample]:
     """Return the values of a read response; FaultError, MalformedError."""
     reader = _Reader(data)
@@ -129,8 +134,8 @@ class _Reader:
         self._data = data
         self._at = 0
 
-    def header(self, expected: int) -> None:
-        """Check the type and the result of a response; FaultError if the server refuses the request."""
+    def header(self, expected: int | None) -> None:
+        """Check the result of a response, and its type; FaultError if the server refuses the request."""
         kind = self.type_id()
         self.skip(12)  # time, and the request's handle
         code = self.u32()
@@ -140,7 +145,7 @@ class _Reader:
         self.extension_parts()
         if kind == _SERVICE_FAULT or code >> 30:
             raise FaultError(code or 0x80000000)
-        if kind != expected:
+        if expected is not None and kind != expected:
             raise MalformedError
 
     def skip(self, size: int) -> None:

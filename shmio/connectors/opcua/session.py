@@ -13,6 +13,7 @@ import logging
 import math
 import struct
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,6 +42,8 @@ MAX_PUBLISH_REQUESTS: Final = 20
 RETRY_S: Final = 10.0
 """How often nodes that the server does not know are asked for again."""
 SESSION_TIMEOUT_MS: Final = 30_000
+PROBES: Final = 0.25
+"""How often the server is asked for a sign of life, in time-outs."""
 CLOSE_S: Final = 1.0
 _CHANNEL_LIFETIME_MS: Final = 3_600_000
 _NAMESPACES, _STATE = 2255, 2259
@@ -58,8 +61,10 @@ STATES: Final = (
     "Unknown",
 )
 _AGAIN: Final = frozenset({0x80330000, 0x80340000})  # BadNodeIdInvalid, BadNodeIdUnknown
+_UNDECIDED: Final = (GOOD, BAD_WAITING_FOR_INITIAL_DATA)
 _FILTERS: Final = frozenset({0x80430000, 0x80440000, 0x80450000, 0x808E0000})
 _BAD_TOO_MANY_PUBLISH_REQUESTS: Final = 0x80780000
+_BAD_TOO_MANY_ITEMS: Final = 0x80DB0000
 _BAD_TIMEOUT: Final = 0x800A0000
 
 log = logging.getLogger("shmio.source")
@@ -313,15 +318,28 @@ class Session:
         self._answered_ns = time.monotonic_ns()
         return bytes(body)
 
-    async def _samples(self, nodes: Sequence[Any]) -> list[Sample]:
-        """Read the values of nodes; each request has as many as the server takes."""
+    async def _response(self, kind: Any, request: Any) -> Any:
+        """Send a request; return its answer as the library decodes it. FaultError: the server refuses it."""
+        body = await self._answer(request)
+        decode.check_fault(body)  # a fault has another type, without the answer's fields
+        return ua_binary.struct_from_binary(kind, Buffer(body))
+
+    async def _samples(self, nodes: Sequence[Any], attribute: Any = ua.AttributeIds.Value) -> list[Sample]:
+        """Read the values of nodes, or another attribute; each request has as many as the server takes."""
         parts = [nodes[at : at + self._per_read] for at in range(0, len(nodes), self._per_read)]
 
         async def read(part: Sequence[Any]) -> list[Sample]:
-            ids = [ua.ReadValueId(node, ua.AttributeIds.Value) for node in part]
+            ids = [ua.ReadValueId(node, attribute) for node in part]
             request = ua.ReadRequest()
             request.Parameters = ua.ReadParameters(0, ua.TimestampsToReturn.Both, ids)
-            found = decode.read_response(await self._answer(request))
+            try:
+                found = decode.read_response(await self._answer(request))
+            except FaultError as error:
+                if not _asked_too_much(error.code) or len(part) < 2:
+                    raise
+                half = len(part) // 2
+                self._per_read = min(self._per_read, half)
+                return [*await read(part[:half]), *await read(part[half:])]
             if len(found) != len(part):
                 raise MalformedError
             return found
@@ -416,11 +434,10 @@ class Session:
         for item, elements, sample in values:
             value = ua.DataValue(_variant(sample), StatusCode=None)
             request.Parameters.NodesToWrite.append(ua.WriteValue(item.node, ua.AttributeIds.Value, elements, value))
-        reader = ua_binary.struct_from_binary(ua.WriteResponse, Buffer(await self._answer(request)))
-        reader.ResponseHeader.ServiceResult.check()
-        if len(reader.Results) != len(values):
+        answer = await self._response(ua.WriteResponse, request)
+        if len(answer.Results) != len(values):
             raise MalformedError
-        return [int(code.value) for code in reader.Results]
+        return [int(code.value) for code in answer.Results]
 
     @property
     def per_write(self) -> int:
@@ -449,39 +466,59 @@ class Session:
         for one in tuple(self._subscriptions.values()):
             if now_ns - one.alive_ns > one.silent_s * 1e9:
                 return f"no answer within {one.silent_s * 1000:.0f} ms from {options.peer}: a subscription is silent"
-        # A probe is sent every half of a time-out, and is to be answered within one.
-        if now_ns - self._answered_ns > 3 * options.timeout * 1_000_000:
-            return f"no answer within {3 * options.timeout} ms from {options.peer}"
+        # A probe is sent every quarter of a time-out, so that it has three quarters for its answer.
+        if now_ns - self._answered_ns > options.timeout * 1_000_000:
+            return f"no answer within {options.timeout} ms from {options.peer}"
         return ""
 
     # -- subscriptions -------------------------------------------------------------------------------------------------
 
     async def _subscribe(self, items: Sequence[Item]) -> None:
+        """Monitor items, in as many subscriptions as the keys and the server's limits need."""
+        left = deque(items)
         most = self._options.max_items
-        for at in range(0, len(items), most):
-            await self._fill(await self._new_subscription(), items[at : at + most])
+        while left:
+            part = [left.popleft() for _ in range(min(most, len(left)))]
+            one = await self._new_subscription()
+            await self._fill(one, part)
+            if one.items:
+                beyond = [item for item in part if item.subscription is None and item.code == _BAD_TOO_MANY_ITEMS]
+                if beyond:  # the server takes fewer in a subscription
+                    most = len(one.items)
+                    left.extendleft(reversed(beyond))
+            elif len(self._subscriptions) > 1:
+                await self._drop(one)
+
+    async def _drop(self, subscription: Subscription) -> None:
+        """End a subscription without items; there is always another one for publish requests to wait for."""
+        del self._subscriptions[subscription.number]
+        request = ua.DeleteSubscriptionsRequest()
+        request.Parameters = ua.DeleteSubscriptionsParameters([subscription.number])
+        await self._response(ua.DeleteSubscriptionsResponse, request)
 
     async def _new_subscription(self) -> Subscription:
         options = self._options
         publishing_ms = float(options.publishing_ms)
-        count = max(1, int(options.timeout / 2 / publishing_ms))
+        count = max(1, int(options.timeout * PROBES / publishing_ms))
         lifetime = max(3 * count, math.ceil(max(10 * options.timeout, SESSION_TIMEOUT_MS) / publishing_ms))
         asked = ua.CreateSubscriptionParameters(publishing_ms, lifetime, count, 0, True, 0)
         request = ua.CreateSubscriptionRequest()
         request.Parameters = asked
-        answer = ua_binary.struct_from_binary(ua.CreateSubscriptionResponse, Buffer(await self._answer(request)))
-        answer.ResponseHeader.ServiceResult.check()
+        answer = await self._response(ua.CreateSubscriptionResponse, request)
         made = answer.Parameters
         revised_ms = made.RevisedPublishingInterval
         if not 0 < revised_ms < 86_400_000 or not 0 < made.RevisedMaxKeepAliveCount < 1 << 31:
             raise MalformedError
         keep_alive_s = revised_ms * made.RevisedMaxKeepAliveCount / 1000
-        if keep_alive_s > 2 * self._timeout_s:
+        if keep_alive_s > self._timeout_s:
             log.warning(
                 "the server sends signs of life only every %.3g s: a loss may be noticed as late as that", keep_alive_s
             )
         one = Subscription(
-            int(made.SubscriptionId), revised_ms / 1000, keep_alive_s + self._timeout_s, time.monotonic_ns()
+            int(made.SubscriptionId),
+            revised_ms / 1000,
+            keep_alive_s + (1 - PROBES) * self._timeout_s,
+            time.monotonic_ns(),
         )
         self._subscriptions[one.number] = one
         self._wanted = min(2 * len(self._subscriptions) + 1, MAX_PUBLISH_REQUESTS)
@@ -491,22 +528,30 @@ class Session:
     async def _fill(self, subscription: Subscription, items: Sequence[Item], *, filters: bool = True) -> None:
         """Create monitored items; those that the server refuses have its status code."""
         unfiltered: list[Item] = []
-        for at in range(0, len(items), self._per_items):
-            part = items[at : at + self._per_items]
+        at = 0
+        while part := items[at : at + self._per_items]:
             request = ua.CreateMonitoredItemsRequest()
             request.Parameters = ua.CreateMonitoredItemsParameters(
                 subscription.number, ua.TimestampsToReturn.Both, [self._monitor(item, filters) for item in part]
             )
             for item in part:
                 item.subscription = subscription
-            answer = ua_binary.struct_from_binary(ua.CreateMonitoredItemsResponse, Buffer(await self._answer(request)))
-            answer.ResponseHeader.ServiceResult.check()
+            try:
+                answer = await self._response(ua.CreateMonitoredItemsResponse, request)
+            except FaultError as error:
+                if not _asked_too_much(error.code) or len(part) < 2:
+                    raise
+                self._per_items = len(part) // 2
+                continue
+            at += len(part)
             if len(answer.Results) != len(part):
                 raise MalformedError
             for item, result in zip(part, answer.Results, strict=True):
                 code = int(result.StatusCode.value)
                 if code >> 30 == 0:
                     item.monitored = int(result.MonitoredItemId)
+                    if item.code == _BAD_TOO_MANY_ITEMS:  # of another subscription
+                        item.code = BAD_WAITING_FOR_INITIAL_DATA
                     subscription.items.append(item)
                 elif filters and item.deadband and code & 0xFFFF0000 in _FILTERS:
                     unfiltered.append(item)
@@ -604,12 +649,12 @@ class Session:
                 return
             if found.kind == decode.INT32 and found.dims is None:
                 self.state = found.value
-            await asyncio.sleep(self._timeout_s / 2)
+            await asyncio.sleep(min(PROBES * self._timeout_s, max(0.1, self._client.session_timeout / 3000)))
 
     async def _watch(self) -> None:
         """Notice silence, and read again what was written when its older samples have come."""
         while True:
-            await asyncio.sleep(min(0.1, self._timeout_s / 4))
+            await asyncio.sleep(min(0.05, self._timeout_s / 8))
             if reason := self.check():
                 self.fail(ConnectorError(reason))
                 return
@@ -626,19 +671,38 @@ class Session:
                     return
 
     async def _retry(self) -> None:
-        """Ask again for nodes that the server did not know."""
+        """Ask again for nodes that the server did not know, or refused to monitor."""
         while True:
             await asyncio.sleep(RETRY_S)
-            unknown = [item for item in self._items if item.node is None or item.code & 0xFFFF0000 in _AGAIN]
-            if not unknown:
-                continue
+            subscribes = self._options.mode == "subscribe"
+            unknown = [
+                item
+                for item in self._items
+                if item.node is None
+                or item.code & 0xFFFF0000 in _AGAIN
+                or (subscribes and item.subscription is None)  # the server refused it
+            ]
             try:
-                await self._resolve(unknown)
-                if self._options.mode == "subscribe":
+                await self._find_removed([item for item in self._items if item.subscription is not None])
+                if unknown:
+                    await self._resolve(unknown)
+                if unknown and subscribes:
                     await self._subscribe_again([item for item in unknown if item.node is not None])
             except Exception as error:  # noqa: BLE001
                 self.fail(self.explained(error))
                 return
+
+    async def _find_removed(self, items: Sequence[Item]) -> None:
+        """Turn those bad whose nodes no longer exist: some servers just send no more changes of them."""
+        items = [item for item in items if item.code & 0xFFFF0000 not in _AGAIN]
+        found = await self._samples([item.node for item in items], ua.AttributeIds.NodeClass) if items else []
+        self._deliver(
+            [
+                (item, Sample(0, None, None, one.code, 0))
+                for item, one in zip(items, found, strict=True)
+                if one.code & 0xFFFF0000 in _AGAIN
+            ]
+        )
 
     async def _subscribe_again(self, items: Sequence[Item]) -> None:
         there = await self._samples([item.node for item in items]) if items else []
@@ -647,7 +711,7 @@ class Session:
             if item.subscription is not None:
                 request = ua.DeleteMonitoredItemsRequest()
                 request.Parameters = ua.DeleteMonitoredItemsParameters(item.subscription.number, [item.monitored])
-                await self._answer(request)
+                await self._response(ua.DeleteMonitoredItemsResponse, request)
                 item.subscription.items.remove(item)
                 item.subscription = None
             item.code = BAD_WAITING_FOR_INITIAL_DATA
@@ -661,8 +725,8 @@ class Session:
         self._report_failed(known)
 
     def _report_failed(self, items: Iterable[Item]) -> None:
-        """Deliver the status of items that cannot be read."""
-        failed = [item for item in items if item.code not in (GOOD, BAD_WAITING_FOR_INITIAL_DATA)]
+        """Deliver the status of items that cannot be read; those with a monitored item have their own samples."""
+        failed = [item for item in items if item.subscription is None and item.code not in _UNDECIDED]
         if failed:
             self._deliver([(item, Sample(0, None, None, item.code, 0)) for item in failed])
 
@@ -681,6 +745,11 @@ class _Protocol(UASocketProtocol):
         if (too_long or self._connection._incoming_size > MAX_MESSAGE_BYTES) and self.transport is not None:
             self.reason = "the server sent what is not OPC UA, or a message that is too large"
             self.transport.abort()
+
+
+def _asked_too_much(code: int) -> bool:
+    """Whether a server refuses a request only because of its size, or that of its answer."""
+    return code & 0xFFFF0000 in (0x80100000, 0x80080000, 0x80B80000, 0x80B90000)
 
 
 def _variant(sample: Sample) -> Any:

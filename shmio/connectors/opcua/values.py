@@ -70,10 +70,10 @@ class Fitting:
             self._kind, self._element = kind, self._converter(kind)
         if not register.dims and dims is None and self._element is not None:
             return self._element(found)
-        if kind == ua.BYTE_STRING and self._base in _CHARACTERS and register.dims:
+        if kind == ua.BYTE_STRING and dims is None and self._base in _CHARACTERS and register.dims:
             kind, found, dims = ua.BYTE, list(found), (len(found),)
             element = self._converter(ua.BYTE)
-        elif self._base in _OF_BYTES and (kind == ua.BYTE_STRING or (kind == ua.BYTE and dims is not None)):
+        elif self._base in _OF_BYTES and ((kind, dims) == (ua.BYTE_STRING, None) or (kind == ua.BYTE and dims)):
             found, dims = self._groups(bytes(found), dims)
             element = self._bytes
             if not register.dims and len(found) == 1:

@@ -12,9 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from asyncua import Server, ua
+from asyncua.common.utils import ServiceError
 from asyncua.crypto.permission_rules import User, UserRole
+from asyncua.server.internal_session import InternalSession
+from asyncua.server.monitored_item_service import MonitoredItemService
 
 PASSWORD = "secret password"
+CREATE, CREATE_ALL = MonitoredItemService._create_data_change_monitored_item, InternalSession.create_monitored_items
+READ, SUBSCRIBE = InternalSession.read, InternalSession.create_subscription
 
 
 class Accounts:
@@ -70,6 +75,39 @@ class Device:
     async def state(self, number: int) -> None:
         """Change the server's state."""
         await self.server.get_node(ua.NodeId(2259, 0)).write_value(ua.Variant(number, ua.VariantType.Int32))
+
+    async def limit(self, in_call: int, in_subscription: int, said: bool) -> None:
+        """Refuse larger calls, which the operation limits say or not, and more items in a subscription."""
+
+        async def create_one(service: Any, asked: Any) -> Any:
+            if len(service._monitored_items) >= in_subscription:
+                return ua.MonitoredItemCreateResult(ua.StatusCode(ua.StatusCodes.BadTooManyMonitoredItems))
+            return await CREATE(service, asked)
+
+        async def create_some(session: Any, asked: Any) -> Any:
+            if len(asked.ItemsToCreate) > in_call:
+                raise ServiceError(ua.StatusCodes.BadTooManyOperations)
+            return await CREATE_ALL(session, asked)
+
+        async def read_some(session: Any, asked: Any) -> Any:
+            if session.external and len(asked.NodesToRead) > in_call:
+                raise ServiceError(ua.StatusCodes.BadTooManyOperations)
+            return await READ(session, asked)
+
+        MonitoredItemService._create_data_change_monitored_item = create_one
+        InternalSession.create_monitored_items = create_some
+        InternalSession.read = read_some
+        for number in (11705, 11714):
+            value = ua.Variant(in_call if said else 0, ua.VariantType.UInt32)
+            await self.server.get_node(ua.NodeId(number, 0)).write_value(value)
+
+    async def refuse_subscriptions(self, code: int) -> None:
+        """Refuse further subscriptions with a status code; 0: none."""
+
+        async def refuse(*_: Any, **__: Any) -> Any:
+            raise ServiceError(code)
+
+        InternalSession.create_subscription = refuse if code else SUBSCRIBE
 
     async def clients(self) -> int:
         """Return the number of sessions of clients."""

@@ -110,6 +110,22 @@ def test_a_node_that_comes_later_is_found(device: Device, monkeypatch: pytest.Mo
     device.ask("remove", "coming")
 
 
+def test_a_node_that_is_removed_turns_bad_and_comes_back(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server does not say that it is gone: it only sends no more changes."""
+    monkeypatch.setattr("shmio.connectors.opcua.session.RETRY_S", 0.05)
+    device.ask("add", "going", "Int16", 5)
+    with connected(device.url, {"going": "INT", "mode": "INT"}) as source:
+        assert (source.value("going"), source.status("going").code) == (5, GOOD)
+        device.ask("remove", "going")
+        until(lambda: source.status("going").code == BAD_NODE_ID_UNKNOWN, "the end of the node")
+        assert source.status("mode").code == GOOD
+        device.ask("add", "going", "Int16", 6)
+        until(lambda: source.value("going") == 6 and source.status("going").code == GOOD, "the node")
+        device.ask("set", "going", "Int16", 7)
+        until(lambda: source.value("going") == 7, "a change")
+    device.ask("remove", "going")
+
+
 def test_a_namespace_that_is_unknown(device: Device) -> None:
     tags = {
         "here": {"type": "INT", "address": "nsu=http://test/device;s=mode"},

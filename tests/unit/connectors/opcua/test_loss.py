@@ -101,6 +101,19 @@ def test_writes_without_a_connection_are_unsent(device: Device) -> None:
     assert raised.value.outcomes == (Lost.UNSENT,)
 
 
+def test_a_link_that_has_just_ended_is_closed_and_lost(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its thread may end between any two steps of the poll thread."""
+    with connected(device.url, TAGS, mode="poll") as source:
+        link = source.connector._link
+        assert link is not None
+        link.close()
+        link.join(PATIENCE_S)
+        monkeypatch.setattr(link, "is_alive", lambda: True)
+        with pytest.raises(ConnectorError, match="was closed"):
+            source.connector.read()
+        source.connector.close()
+
+
 def test_threads_end(device: Device) -> None:
     before = threading.active_count()
     for _ in range(5):
