@@ -76,11 +76,24 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         help="source files of data blocks (.db, .udt, .scl), optionally after a plc.ini",
     )
+    _add_browse(verb("browse", "list what a device offers, as a tree or as a tag table"))
     text = "write a package with a connector of your own, which works and has tests; change its protocol"
     new = verb("new-connector", text, command="new_connector:new_connector")
     new.add_argument("connector", metavar="NAME", help='what connector = "NAME" in a configuration will be')
     new.add_argument("-o", dest="directory", type=Path, metavar="FOLDER", help="a new folder (default: shmio-NAME)")
     return parser
+
+
+def _add_browse(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("url", metavar="URL", help="the device, such as opc.tcp://10.76.0.30:4840")
+    parser.add_argument("paths", metavar="PATTERN", nargs="*", help="list only these paths; * and ** are wildcards")
+    parser.add_argument("-o", dest="output", type=Path, metavar="FILE.toml", help="write a tag table, a new file")
+    parser.add_argument("--writable", action="store_true", help="with -o: commands may write what the device permits")
+    text = "a key of the source, such as security=SignAndEncrypt or username=operator; repeatable"
+    parser.add_argument("--set", dest="keys", action="append", default=[], metavar="KEY=VALUE", help=text)
+    parser.add_argument("--depth", type=at_least(1), default=32, metavar="LEVELS", help="default: 32")
+    text = "the most nodes to look at (default: 100000)"
+    parser.add_argument("--limit", type=at_least(1), default=100_000, metavar="NODES", help=text)
 
 
 def _add_replay(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,8 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from shmio.errors import ConnectorError
+from shmio.connectors.browsing import Browsed, Wanted
+from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
@@ -83,6 +84,21 @@ class Connector(ABC):
         these.
         """
         return cls
+
+    @classmethod
+    def browse(cls, options: Any, wanted: Wanted) -> Browsed:  # noqa: ARG003
+        """List what a device offers, without a layout. It may take long.
+
+        Args:
+            options: An instance of ``Options``.
+            wanted: Which part to list, and the limits of the search.
+
+        Raises:
+            ConfigError: An option is wrong, or this connector cannot browse.
+            ConnectorError: The device cannot be reached, or refuses it.
+
+        """
+        raise ConfigError("this connector cannot list what a device offers")
 
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:

@@ -33,6 +33,9 @@ BUILT_IN = {
     "s7": "shmio.connectors.s7.connector:S7Connector",
 }
 
+BROWSED = {"opc.tcp": "opcua"}
+"""Which connector lists what a device offers, by the scheme of the device's URL."""
+
 
 def names() -> list[str]:
     """Return all valid values of ``connector = "…"``, sorted."""

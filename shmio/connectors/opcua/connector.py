@@ -14,8 +14,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar
 
+import msgspec
+
 from shmio.config.credentials import read_password
 from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.opcua import siemens
 from shmio.connectors.opcua.address import Address, parse
 from shmio.connectors.opcua.decode import Sample
@@ -72,8 +75,7 @@ class OpcUaConnector(Connector):
     path_options: ClassVar[tuple[str, ...]] = ("certificate", "key", "trusted", "password_file")
 
     def __init__(self, options: OpcUaOptions, layout: Layout) -> None:
-        if importlib.util.find_spec("asyncua") is None:
-            raise ConfigError(EXTRA)
+        _need_library()
         if layout.optimized and options.nodes != "siemens":
             raise ConfigError(
                 f'layout: the block {layout.name} has optimized access: set nodes = "siemens" to read it by names'
@@ -87,6 +89,15 @@ class OpcUaConnector(Connector):
         self._latest: dict[int, Sample] = {}
         self._reported: set[tuple[int, str]] = set()
         self._link: _Link | None = None
+
+    @classmethod
+    def browse(cls, options: OpcUaOptions, wanted: Wanted) -> Browsed:
+        """List the variables below the server's folder Objects, apart from its own state."""
+        _need_library()
+        from shmio.connectors.opcua.browse import browse  # noqa: PLC0415  a library that not all need
+
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+        return browse(msgspec.structs.replace(options, mode="poll"), _credentials(options), wanted)
 
     @property
     def timeout_s(self) -> float:
@@ -296,6 +307,11 @@ class OpcUaConnector(Connector):
             yield _NodeWrite(number, item, f"{first}:{last}" if last > first else str(first), sample)
         if not touched:
             raise ValueError("no register of the layout is there")
+
+
+def _need_library() -> None:
+    if importlib.util.find_spec("asyncua") is None:
+        raise ConfigError(EXTRA)
 
 
 def _address(options: OpcUaOptions, layout: Layout, register: Register) -> Address:

@@ -49,6 +49,11 @@ _CHANNEL_LIFETIME_MS: Final = 3_600_000
 _NAMESPACES, _STATE = 2255, 2259
 _LIMITS: Final = (11705, 11707, 11712, 11714)
 """The server's limits of a call: nodes of a read, of a write, of browse paths, and monitored items."""
+_HIERARCHICAL: Final = 33
+_CLASSES: Final = 1 | 2
+"""The classes of objects and variables."""
+REFERENCES_AT_ONCE: Final = 500
+_BAD_NO_CONTINUATION_POINTS: Final = 0x804B0000
 _RUNNING: Final = 0
 STATES: Final = (
     "Running",
@@ -359,8 +364,7 @@ class Session:
 
     async def _resolve(self, items: Iterable[Item]) -> None:
         """Find the node of each address."""
-        (found,) = await self._samples([ua.NodeId(_NAMESPACES)])
-        names: list[str] = found.value if found.kind == decode.STRING and found.dims is not None else []
+        names = await self.namespaces()
         paths: list[tuple[Item, BrowsePath]] = []
         for item in items:
             address = item.address
@@ -374,6 +378,11 @@ class Session:
                 item.node, item.code = None, BAD_NODE_ID_UNKNOWN
         for at in range(0, len(paths), self._per_path):
             await self._translate(paths[at : at + self._per_path])
+
+    async def namespaces(self) -> list[str]:
+        """Return the URIs of the server's namespaces, by their numbers."""
+        (found,) = await self._samples([ua.NodeId(_NAMESPACES)])
+        return found.value if found.kind == decode.STRING and found.dims is not None else []
 
     async def _translate(self, paths: Sequence[tuple[Item, BrowsePath]]) -> None:
         asked = []
@@ -396,6 +405,55 @@ class Session:
             else:
                 target = targets[0].TargetId
                 item.node = ua.NodeId(target.Identifier, target.NamespaceIndex)
+
+    async def read(self, nodes: Sequence[Any], attribute: Any) -> list[Sample]:
+        """Read an attribute of nodes."""
+        return await self._samples(nodes, attribute)
+
+    async def browse(self, nodes: Sequence[Any], most: int) -> list[list[Any]]:
+        """Return the hierarchical references from nodes to objects and variables; none of an unknown node.
+
+        Args:
+            nodes: The node ids.
+            most: Once there are more references than this, the rest is left out.
+
+        """
+        request = ua.BrowseRequest()
+        request.Parameters.RequestedMaxReferencesPerNode = REFERENCES_AT_ONCE
+        request.Parameters.NodesToBrowse = [
+            ua.BrowseDescription(node, ua.BrowseDirection.Forward, ua.NodeId(_HIERARCHICAL), True, _CLASSES, 63)
+            for node in nodes
+        ]
+        results = (await self._response(ua.BrowseResponse, request)).Results
+        if len(results) != len(nodes):
+            raise MalformedError
+        found: list[list[Any]] = [list(one.References or []) for one in results]
+        open_points = [(place, one.ContinuationPoint) for place, one in enumerate(results) if one.ContinuationPoint]
+        for place, one in enumerate(results):
+            if one.StatusCode.value & 0xFFFF0000 == _BAD_NO_CONTINUATION_POINTS and len(nodes) > 1:
+                found[place] = (await self.browse([nodes[place]], most))[0]
+        while open_points:
+            following = ua.BrowseNextRequest()
+            full = sum(map(len, found)) > most
+            following.Parameters.ReleaseContinuationPoints = full
+            following.Parameters.ContinuationPoints = [point for _, point in open_points]
+            answer = await self._response(ua.BrowseNextResponse, following)
+            if full:
+                break
+            results = answer.Parameters.Results
+            if len(results) != len(open_points):
+                raise MalformedError
+            before = sum(map(len, found))
+            for (place, _), one in zip(open_points, results, strict=True):
+                found[place] += one.References or []
+            open_points = [
+                (place, one.ContinuationPoint)
+                for (place, _), one in zip(open_points, results, strict=True)
+                if one.ContinuationPoint
+            ]
+            if open_points and sum(map(len, found)) == before:
+                raise MalformedError  # it would never end
+        return found
 
     # -- reading -------------------------------------------------------------------------------------------------------
 

@@ -39,9 +39,9 @@ class Device:
     def node(self, name: str) -> Any:
         return self.server.get_node(ua.NodeId(name, 2))
 
-    async def add(self, name: str, kind: str, value: Any, writable: bool = True) -> None:
-        """Add a variable below Objects/2:Device."""
-        parent = self.node("Device")
+    async def add(self, name: str, kind: str, value: Any, writable: bool = True, below: str = "Device") -> None:
+        """Add a variable below Objects/2:Device, or below another object."""
+        parent = self.node(below)
         variant = _variant(kind, value)
         of_type = ua.NodeId(22) if kind == "ExtensionObject" else None
         made = await parent.add_variable(ua.NodeId(name, 2), f"2:{name}", variant, None, of_type)
@@ -108,6 +108,21 @@ class Device:
             raise ServiceError(code)
 
         InternalSession.create_subscription = refuse if code else SUBSCRIBE
+
+    async def describe(self, name: str, text: str, unit: str) -> None:
+        """Give a variable a description and a unit."""
+        node = self.node(name)
+        await node.write_attribute(ua.AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(text))))
+        found = ua.EUInformation("http://www.opcfoundation.org/UA/units/un/cefact", 1, ua.LocalizedText(unit))
+        await node.add_property(ua.NodeId(f"{name} unit", 2), "0:EngineeringUnits", found)
+
+    async def group(self, name: str, parent: str) -> None:
+        """Add an object below another one."""
+        await self.node(parent).add_object(ua.NodeId(name, 2), f"2:{name}")
+
+    async def refer(self, name: str, other: str) -> None:
+        """Let a node organize another one, which may contain it."""
+        await self.node(name).add_reference(self.node(other), ua.ObjectIds.Organizes, bidirectional=False)
 
     async def clients(self) -> int:
         """Return the number of sessions of clients."""

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import pytest
 
+from shmio.connectors.browsing import Wanted
 from shmio.connectors.opcua.address import NodeAddress
 from shmio.connectors.opcua.connector import OpcUaConnector
 from shmio.connectors.opcua.options import OpcUaOptions
@@ -126,6 +127,19 @@ def test_all_registers_of_the_cell_come_from_an_independent_server(
         assert abs(area.get(image, 0).source_ns - time.time_ns()) < 600e9
     finally:
         connector.close()
+
+
+def test_all_nodes_of_an_independent_server_are_listed(server: NodeServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.connectors.opcua.session.REFERENCES_AT_ONCE", 3)  # it says where the rest is
+    found = OpcUaConnector.browse(OpcUaOptions(url=server.url, timeout=5000), Wanted(["PLC"]))
+    listed = {str(one.columns["address"]): one.type for one in found.offers if one.type}
+    axes = {f"nsu={NAMESPACE};s={node}": kind for node, kind, _ in a50_nodes().values()}
+    assert {node: listed[node] for node in axes} == {
+        node: "REAL" if kind == "Float" else f"ARRAY[0..{999 if 'Inputs' in node else 1099}] OF USINT"
+        for node, kind in axes.items()
+    }
+    assert len(listed) == len(axes) + len(MIXED_NODES)
+    assert found.incomplete == ""
 
 
 def test_types_of_an_optimized_block(server: NodeServer) -> None:

@@ -1,0 +1,100 @@
+"""``shmio-supervisor browse``: list what a device offers, as a tree or as a tag table."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+
+from shmio.connectors import registry
+from shmio.connectors.base import Connector
+from shmio.connectors.browsing import Browsed, Offer, Wanted
+from shmio.errors import ConfigError
+from shmio.layout.importing.found import Found
+from shmio.logs import printable
+
+
+def browse(arguments: argparse.Namespace) -> int:
+    """List the offers of a device; return 1 if there may be more of them."""
+    output = arguments.output
+    if output is not None and output.suffix != ".toml":
+        raise ConfigError(f"{output}: the table is TOML: have its name end in .toml")
+    if output is not None and output.exists():
+        raise ConfigError(f"{output}: exists already; remove it, or name another file")
+    wanted = Wanted(arguments.paths, depth=arguments.depth, nodes=arguments.limit)
+    connector, options = _connector(arguments.url, arguments.keys)
+    found = connector.browse(options, wanted)
+    if output is not None:
+        _write(arguments, found)
+    else:
+        for line in tree(found.offers):
+            print(printable(line))
+    if found.incomplete:
+        print(printable(f"this is not all: {found.incomplete}"), file=sys.stderr)
+    elif not found.offers:
+        raise ConfigError(f"{arguments.url}: nothing found{' that fits' if arguments.paths else ''}")
+    return 1 if found.incomplete else 0
+
+
+def _connector(url: str, keys: list[str]) -> tuple[type[Connector], Any]:
+    """Return the connector for a URL, and its options."""
+    scheme = urlsplit(url).scheme
+    if scheme not in registry.BROWSED:
+        valid = ", ".join(f"{one}://HOST:PORT" for one in registry.BROWSED)
+        raise ConfigError(f"{url}: devices with this URL cannot be browsed; those with these can: {valid}")
+    name = registry.BROWSED[scheme]
+    connector = registry.load(name)
+    assert issubclass(connector, Connector)  # noqa: S101 - for the type checker
+    texts: dict[str, str] = {}
+    for pair in keys:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {pair}: expected KEY=VALUE")
+        texts[key] = value
+    known = {field.encode_name for field in msgspec.structs.fields(connector.Options)} - {"url"}
+    if unknown := texts.keys() - known:
+        raise ConfigError(
+            f"--set {min(unknown)}: no such key of connector {name}; there are: {', '.join(sorted(known))}"
+        )
+    return connector, registry.convert_options(name, {"url": url}, texts)
+
+
+def _write(arguments: argparse.Namespace, found: Browsed) -> None:
+    table = Found("a device")
+    for one in found.offers:
+        if one.type:
+            table.add(one.names, one.type, **one.columns)
+        elif one.refused:
+            table.skip("/".join(one.names), one.refused)
+    for line in table.report():
+        print(printable(line), file=sys.stderr)
+    if not table.tags:
+        raise ConfigError(f"{arguments.url}: nothing found for a tag table")
+    try:
+        with arguments.output.open("x", encoding="utf-8") as stream:
+            stream.write(table.to_toml(arguments.url, writable=arguments.writable))
+    except FileExistsError:
+        raise ConfigError(f"{arguments.output}: exists already; remove it, or name another file") from None
+
+
+def tree(offers: list[Offer]) -> Iterator[str]:
+    """Yield the lines of a tree: each group before what is in it."""
+    by_names = {one.names: one for one in offers}
+    children: dict[tuple[str, ...], dict[tuple[str, ...], None]] = {}
+    for names in by_names:
+        for length in range(len(names), 0, -1):  # a pattern may leave out the groups above
+            children.setdefault(names[: length - 1], {})[names[:length]] = None
+    waiting = list(reversed(children.get((), {})))
+    while waiting:
+        names = waiting.pop()
+        one = by_names.get(names, Offer(names))
+        text = "  " * (len(names) - 1) + names[-1]
+        columns = one.columns
+        more = [one.type or (f"({one.refused})" if one.refused else ""), str(columns.get("address", ""))]
+        more += [str(columns.get("unit", "")), "writable" if columns.get("writable") else ""]
+        yield "  ".join([text, *filter(None, more)])
+        waiting += reversed(children.get(names, {}))
