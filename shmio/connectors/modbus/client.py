@@ -27,7 +27,7 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE, ACKNOWLEDGE, B
 NO_PATH, NO_ANSWER = 10, 11
 _NAMES: Final = {
     ILLEGAL_FUNCTION: "illegal function", ILLEGAL_ADDRESS: "illegal data address", ILLEGAL_VALUE: "illegal data value",
-    DEVICE_FAILURE: "device failure", ACKNOWLEDGE: "acknowledged, not done yet", BUSY: "device busy",
+    DEVICE_FAILURE: "device failure", ACKNOWLEDGE: "acknowledged, but not done yet; it may still be done", BUSY: "device busy",
     8: "memory parity error", NO_PATH: "gateway path unavailable",
     NO_ANSWER: "no answer from the unit behind the gateway",
 }  # fmt: skip

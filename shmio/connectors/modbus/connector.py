@@ -216,7 +216,7 @@ class ModbusConnector(Connector):
                     self._exchange(*step)
                     done = True
             except (RefusedError, ValueError) as error:
-                reason = str(error)
+                reason = f"a part was written, and then {error}" if done else str(error)
             except ConnectorError as error:
                 unsent = not (done or self._client.sent)
                 outcomes.append(Lost.UNSENT if unsent else Lost.UNKNOWN)
@@ -306,8 +306,9 @@ class ModbusConnector(Connector):
         if any(values[place] is None for place in chosen):
             raise ValueError(f"the bytes are not a valid {register.type}")
         for first, some in _runs(chosen, self._most(one)):
-            start = (address.number + first * address.width).to_bytes(2, "big")
-            yield self._request(one, start, [values[place] for place in range(first, first + some)])
+            yield from self._requests_of(
+                one, address.number + first * address.width, [values[place] for place in range(first, first + some)]
+            )
 
     def _most(self, one: _Register) -> int:
         """Return how many elements one request writes at most."""
@@ -315,24 +316,36 @@ class ModbusConnector(Connector):
             return 1
         return MAX_WRITE_BITS if one.address.table.of_bits else max(1, MAX_WRITE_WORDS // one.address.width)
 
-    def _request(self, one: _Register, start: bytes, values: list[Any]) -> tuple[int, int, bytes]:
-        """Return the request that writes consecutive elements from an address on."""
+    def _requests_of(self, one: _Register, number: int, values: list[Any]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield the requests that write consecutive elements from an address on.
+
+        That is one request, or two for a text of more than 246 characters.
+        """
         address = one.address
+        start = number.to_bytes(2, "big")
         if address.table is Table.COIL:
             if len(values) == 1:
-                return one.unit, client.WRITE_COIL, start + (b"\xff\0" if values[0] else b"\0\0")
+                yield one.unit, client.WRITE_COIL, start + (b"\xff\0" if values[0] else b"\0\0")
+                return
             packed = sum(bool(value) << bit for bit, value in enumerate(values)).to_bytes(
                 -(-len(values) // 8), "little"
             )
-            return one.unit, client.WRITE_COILS, start + len(values).to_bytes(2, "big") + bytes((len(packed),)) + packed
+            yield one.unit, client.WRITE_COILS, start + len(values).to_bytes(2, "big") + bytes((len(packed),)) + packed
+            return
         if address.bit is not None:
             bit = 1 << address.bit
             masks = (0xFFFF ^ bit).to_bytes(2, "big") + (bit if values[0] else 0).to_bytes(2, "big")
-            return one.unit, client.MASK_WORD, start + masks
+            yield one.unit, client.MASK_WORD, start + masks
+            return
         words = b"".join(map(one.codec.encode, values)) if one.codec else b""
-        if len(words) == 2:
-            return one.unit, client.WRITE_WORD, start + words
-        return one.unit, client.WRITE_WORDS, start + (len(words) // 2).to_bytes(2, "big") + bytes((len(words),)) + words
+        for at in range(0, len(words), 2 * MAX_WRITE_WORDS):
+            part = words[at : at + 2 * MAX_WRITE_WORDS]
+            start = (number + at // 2).to_bytes(2, "big")
+            if len(words) == 2:
+                yield one.unit, client.WRITE_WORD, start + part
+            else:
+                count = (len(part) // 2).to_bytes(2, "big") + bytes((len(part),))
+                yield one.unit, client.WRITE_WORDS, start + count + part
 
 
 def _places(register: Register) -> Iterator[tuple[int, int, int]]:

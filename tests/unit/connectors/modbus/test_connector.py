@@ -220,6 +220,23 @@ def test_writes_of_all_kinds(device: Device) -> None:
         assert {call[0] for call in device.calls()} == {5, 6, 15, 16, 22}
 
 
+def test_the_longest_text_that_can_be_read_can_be_written(device: Device) -> None:
+    text = "".join(chr(97 + at % 26) for at in range(250))
+    with connected(device, {"name": tag("STRING[250]", "holding 40")}) as (connector, layout):
+        assert connector.write(encode(find(layout, "name"), text, "little")) == [""]
+        assert values(connector, layout) == {"name": text}
+        assert [call[0] for call in device.calls()].count(16) == 2
+
+
+def test_a_write_that_is_refused_half_way_says_so(device: Device) -> None:
+    tags = {"list": tag("ARRAY[0..299] OF UINT", f"holding {WORDS - 200}")}
+    with connected(device, tags) as (connector, layout):
+        [reason] = connector.write(encode(find(layout, "list"), list(range(1, 301)), "little"))
+        assert "a part was written" in reason
+        assert "illegal data address" in reason
+        assert device.get("holding", WORDS - 200, 2) == [1, 2]
+
+
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
