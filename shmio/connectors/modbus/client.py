@@ -12,6 +12,7 @@ import socket
 import time
 from typing import Final
 
+from shmio.connectors import tcp
 from shmio.connectors.modbus.address import Table
 from shmio.errors import ConnectorError
 
@@ -27,7 +28,8 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE, ACKNOWLEDGE, B
 NO_PATH, NO_ANSWER = 10, 11
 _NAMES: Final = {
     ILLEGAL_FUNCTION: "illegal function", ILLEGAL_ADDRESS: "illegal data address", ILLEGAL_VALUE: "illegal data value",
-    DEVICE_FAILURE: "device failure", ACKNOWLEDGE: "acknowledged, but not done yet; it may still be done", BUSY: "device busy",
+    DEVICE_FAILURE: "device failure", BUSY: "device busy",
+    ACKNOWLEDGE: "acknowledged, but not done yet; it may still be done",
     8: "memory parity error", NO_PATH: "gateway path unavailable",
     NO_ANSWER: "no answer from the unit behind the gateway",
 }  # fmt: skip
@@ -72,8 +74,7 @@ class ModbusClient:
         """
         self.close()
         try:
-            self._socket = socket.create_connection((self._host, self._port), self._timeout_ms / 1000)
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket = tcp.connect(tcp.look_up(self._host, self._port), self._timeout_ms / 1000)
         except OSError as error:
             raise self._explained(error) from None
 

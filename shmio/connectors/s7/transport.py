@@ -8,12 +8,12 @@ answer is passed once, to the operation whose request has its reference.
 from __future__ import annotations
 
 import select
-import socket
 import time
 from collections import deque
 from contextlib import suppress
 from typing import Protocol
 
+from shmio.connectors import tcp
 from shmio.connectors.s7 import pdu
 from shmio.errors import ConnectorError
 
@@ -26,21 +26,10 @@ class Transport:
 
     def __init__(self, host: str, port: int, timeout_ns: int) -> None:
         """Connect within ``timeout_ns`` plus the host name lookup; raise OSError on failure."""
-        places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        places = tcp.look_up(host, port)
         self.deadline_ns = time.monotonic_ns() + timeout_ns
         """Time at which ``timeout_ns`` has passed, in ns of CLOCK_MONOTONIC."""
-        for attempt, (family, kind, protocol, _, address) in enumerate(places, 1):
-            self._socket = socket.socket(family, kind, protocol)
-            try:
-                self._socket.settimeout(max(0.001, (self.deadline_ns - time.monotonic_ns()) / 1e9))
-                self._socket.connect(address)
-            except BaseException as error:
-                self._socket.close()
-                if attempt == len(places) or not isinstance(error, OSError):
-                    raise
-            else:
-                break
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = tcp.connect(places, timeout_ns / 1e9)
         self._socket.setblocking(False)
         self.taken = 0
         """Number of bytes that the kernel accepted in the last ``send``, even if it failed."""

@@ -216,7 +216,7 @@ def test_writes_on_a_reset_connection_were_not_sent(plc: Plc, monkeypatch: pytes
         raise ConnectionResetError
 
     with monkeypatch.context() as patch:
-        patch.setattr("shmio.connectors.s7.transport.socket.socket.send", reset)
+        patch.setattr("socket.socket.send", reset)
         with pytest.raises(WriteLostError, match="closed the connection") as lost:
             client.write([Write(0, 0, b"one"), Write(9, 2, b"\2")])
     assert lost.value.outcomes == (Lost.UNSENT, Lost.UNSENT)
@@ -236,7 +236,7 @@ def test_partly_sent_job_has_an_unknown_outcome(plc: Plc, monkeypatch: pytest.Mo
         return sent[0]
 
     with monkeypatch.context() as patch:
-        patch.setattr("shmio.connectors.s7.transport.socket.socket.send", send_once)
+        patch.setattr("socket.socket.send", send_once)
         with pytest.raises(WriteLostError) as lost:
             client.write([Write(0, 0, b"one")])
     assert lost.value.outcomes == (Lost.UNKNOWN,)

@@ -1,0 +1,40 @@
+"""Opens TCP connections to devices."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Sequence
+from typing import Any
+
+Place = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]
+
+
+def look_up(host: str, port: int) -> Sequence[Place]:
+    """Return the addresses of a host as ``socket.getaddrinfo`` does; OSError if it has none."""
+    return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+
+
+def connect(places: Sequence[Place], timeout_s: float) -> socket.socket:
+    """Connect to the first address that answers; all of them share the time-out.
+
+    Raises:
+        OSError: No address answers; the error is that of the last one.
+
+    """
+    deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+    for attempt, (family, kind, protocol, _, address) in enumerate(places, 1):
+        opened = socket.socket(family, kind, protocol)
+        try:
+            # Equal shares of what is left, so that a silent address does not use up that of the next one.
+            left_s = (deadline_ns - time.monotonic_ns()) / 1e9
+            opened.settimeout(max(0.001, left_s / (len(places) - attempt + 1)))
+            opened.connect(address)
+            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except BaseException as error:
+            opened.close()
+            if attempt == len(places) or not isinstance(error, OSError):
+                raise
+        else:
+            return opened
+    raise OSError("the host has no address")
