@@ -2,8 +2,9 @@
 
 From python-snap7 3.3 come the memory areas, the ISO-on-TCP handshake, system status lists, block
 lists, the clock, and the start and stop of the emulated CPU. This module adds the status list with
-the operating mode, and replaces:
+the operating mode, cuts answers that do not fit a PDU into parts, and replaces:
 
+- the status lists with what the CPU is: those of python-snap7 have no heads of records;
 - jobs (set-up, read, write), which ``Jobs`` answers: python-snap7 grants one job and 480 bytes,
   writes a bit as a whole byte, stores only the first item of a write, stores part of a write past
   the end of a block, and reads several times slower;
@@ -79,8 +80,24 @@ _KEEPALIVE = {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEP
 """Socket options, in s: a client whose host is down is disconnected within a minute."""
 _SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # start; the others need no action
 _SERVICE_ARGUMENT = 8  # offset, in the parameters, of the length of the service's argument
-_MODE_LIST = 0x0424
+_MODE_LIST, _MODULE_LIST, _COMPONENT_LIST = 0x0424, 0x0011, 0x001C
 _RUN, _STOP = 0x08, 0x04  # operating modes in that list
+_ORDER_CODE = b"SHMIO EMULATED S7"
+_VERSIONS = {0x0001: b"\0\1\0\0", 0x0006: b"\0\1\0\0", 0x0007: b"V\0\1\0"}
+"""Of the module, its hardware and its firmware."""
+_COMPONENTS = {
+    0x0001: b"shmio",
+    0x0002: b"Emulated S7",
+    0x0003: b"",
+    0x0004: b"not by Siemens",
+    0x0005: b"0",
+    0x0007: b"Emulated S7",
+}
+"""Names of: the system, the module, the plant; copyright; serial number; type of the module."""
+_USERDATA_DATA = 22
+"""Offset of the data in an answer to userdata, and in a request for the next part of one."""
+_NEXT_PART = 0x12
+_EMPTY_PARAMETERS = bytes.fromhex("000112 08 12 84 01 00 00 00 0000")
 _IS_IT_RUNNING = bytes((0, 1, 0, 0, _READ))
 """Sizes and parameters of a read without items, which ``get_cpu_state()`` of python-snap7 3 sends.
 
@@ -300,6 +317,46 @@ def _write_item(item: _Item, value: memoryview) -> int:
     return _OK
 
 
+# -- answers in parts ------------------------------------------------------------------------------------------------
+
+
+class _Parts:
+    """Cuts answers to userdata that do not fit a client's PDU into parts, which the client requests one by one."""
+
+    def __init__(self) -> None:
+        self._head, self._left = b"", b""
+        self._sequence = 0
+
+    def requested(self, request: bytes, size: int) -> bytes | None:
+        """Return the next part if this is a request for one; None if it is not."""
+        if len(request) < _USERDATA_DATA or request[1] != S7PDUType.USERDATA or request[14] != _NEXT_PART:
+            return None
+        if not self._left or request[17] != self._sequence:
+            return self._part(request, b"", 0, code=_NO_SUCH_OBJECT)
+        return self._next(request, size)
+
+    def cut(self, request: bytes, answer: bytes, size: int) -> bytes:
+        """Return an answer, or its first part of at most ``size`` bytes."""
+        self._left = b""
+        if len(answer) <= size or answer[1] != S7PDUType.USERDATA:
+            return answer
+        self._head, self._left = answer[:_USERDATA_DATA], answer[_USERDATA_DATA + _ITEM_HEAD.size :]
+        self._sequence = self._sequence % 255 + 1
+        return self._next(request, size)
+
+    def _next(self, request: bytes, size: int) -> bytes:
+        most = size - _USERDATA_DATA - _ITEM_HEAD.size
+        part, self._left = self._left[:most], self._left[most:]
+        return self._part(request, part, self._sequence)
+
+    def _part(self, request: bytes, data: bytes, sequence: int, code: int = _OK) -> bytes:
+        head = bytearray(self._head or request[:10] + _EMPTY_PARAMETERS)
+        head[4:6] = request[4:6]
+        head[8:10] = (len(data) + _ITEM_HEAD.size).to_bytes(2, "big")
+        head[17], head[19] = sequence, bool(self._left)
+        return bytes(head) + _ITEM_HEAD.pack(code, 0x09 if data else 0, len(data)) + data
+
+
 # -- the server --------------------------------------------------------------------------------------------------------
 
 
@@ -477,7 +534,7 @@ class S7Server(Server):
             return
         client.setblocking(True)  # only sends time out, so a silent client may stay
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", _SEND_TIMEOUT_S, 0))
-        jobs = Jobs(self._memory, self._traits)
+        jobs, parts = Jobs(self._memory, self._traits), _Parts()
         inbox = memoryview(bytearray(_INBOX_SIZE))
         end = 0
         while received := client.recv_into(inbox[end:]):
@@ -493,7 +550,7 @@ class S7Server(Server):
                 frame = inbox[start : start + length]
                 if frame[4:7] != _DT:
                     return
-                answer = jobs.answer(frame[7:]) or self._process_request(bytes(frame[7:]), address)
+                answer = jobs.answer(frame[7:]) or self._process_in_parts(bytes(frame[7:]), address, jobs, parts)
                 if answer is None:
                     return
                 answers += (_TPKT.pack(3, len(answer) + _FRAME_OVERHEAD), _DT, answer)
@@ -507,6 +564,14 @@ class S7Server(Server):
             if start and left:
                 inbox[:left] = inbox[start:end]
             end = left
+
+    def _process_in_parts(self, request: bytes, address: tuple[str, int], jobs: Jobs, parts: _Parts) -> bytes | None:
+        size = jobs.pdu_size or MAX_PDU_SIZE
+        part = parts.requested(request, size)
+        if part is not None:
+            return part
+        answer = self._process_request(request, address)
+        return None if answer is None else parts.cut(request, answer, size)
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
         """Answer a job other than read, write and set-up: by python-snap7, if that is safe.
@@ -529,17 +594,23 @@ class S7Server(Server):
         return None
 
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
-        """Return the operating mode as in the manual of S7-300/400: one record of 20 bytes.
+        """Return the records of a list as in the manual of S7-300/400, with their head.
 
-        The previous mode, which shares the byte, is left out: with it, Snap7's
-        ``Cli_GetPlcStatus`` would report STOP for RUN after STOP.
+        Of the operating mode, the previous mode, which shares the byte, is left out: with it,
+        Snap7's ``Cli_GetPlcStatus`` would report STOP for RUN after STOP. Any index gives the whole
+        list.
         """
-        if szl_id != _MODE_LIST:
+        if szl_id == _MODE_LIST:
+            mode = _RUN if self.cpu_state == CPUState.RUN else _STOP
+            records = [struct.pack(">HBB16x", 0x4302 if mode == _RUN else 0x4303, 0xFF, mode)]
+        elif szl_id == _MODULE_LIST:
+            records = [struct.pack(">H20sH4s", index, _ORDER_CODE, 0, version) for index, version in _VERSIONS.items()]
+        elif szl_id == _COMPONENT_LIST:
+            records = [struct.pack(">H32s", index, text) for index, text in _COMPONENTS.items()]
+        else:
             found: bytes | None = super()._get_szl_data(szl_id, szl_index)
             return found
-        mode = _RUN if self.cpu_state == CPUState.RUN else _STOP
-        record = struct.pack(">HBB16x", 0x4302 if mode == _RUN else 0x4303, 0xFF, mode)
-        return struct.pack(">HH", len(record), 1) + record
+        return struct.pack(">HH", len(records[0]), len(records)) + b"".join(records)
 
 
 def _is_served(job: bytes) -> bool:

@@ -24,6 +24,7 @@ from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blocks import BlockWrite, ends
 from shmio.connectors.s7.explain import RefusedError
 from shmio.connectors.s7.mode import ModeQuery
+from shmio.connectors.s7.query import Query
 from shmio.connectors.s7.transport import Operation, Transport, Window
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
@@ -152,6 +153,8 @@ class S7Session(ABC):
         self._under_way: deque[Read] = deque()
         self._idle: list[Read] = []
         self._mode = ModeQuery()
+        self._queries: list[Query] = []
+        self._add_query(self._mode)
         self._close_on_error = _CloseOnError(self.close, options)
 
     @property
@@ -209,7 +212,7 @@ class S7Session(ABC):
                 raise ConnectorError("unexpected bytes after the session was set up")
             self._use(granted, transport)
         with self._close_on_error:
-            self._ask_mode()
+            self._ask()
             self._flush()
             self._finish(self._mode, deadline_ns)
 
@@ -247,7 +250,7 @@ class S7Session(ABC):
             read.begin(time.monotonic_ns() + self._timeout_ns)
             self._under_way.append(read)
             self._window.add(read)
-            self._ask_mode()
+            self._ask()
             self._flush()
 
     def collect(self, until_ns: int) -> bytes | None:
@@ -308,7 +311,8 @@ class S7Session(ABC):
                     self._flush()
                     self._finish_wave(wave, end_ns)
                 spent_ns = time.monotonic_ns() - begun_ns  # the writes delayed these answers
-                self._mode.deadline_ns += spent_ns
+                for query in self._queries:
+                    query.deadline_ns += spent_ns
                 for read in self._under_way:
                     read.deadline_ns += spent_ns
         except ConnectorError as error:
@@ -323,7 +327,8 @@ class S7Session(ABC):
         self._window = Window(0, self._window.reference)
         self._under_way.clear()
         self._idle.clear()
-        self._mode.lost()
+        for query in self._queries:
+            query.lost()
 
     # -- session -------------------------------------------------------------------------------------------------------
 
@@ -348,16 +353,29 @@ class S7Session(ABC):
 
     # -- requests and answers ------------------------------------------------------------------------------------------
 
-    def _ask_mode(self) -> None:
-        """Queue a mode query if one is due; raise TimeoutError if the last answer is late."""
+    def _add_query(self, query: Query) -> None:
+        """Ask this question too, from now on; the first one added has precedence."""
+        query.again = self._continue
+        self._queries.append(query)
+
+    def _continue(self, query: Query) -> None:
+        self._window.add(query)
+
+    def _ask(self) -> None:
+        """Queue a question if one is due and none is open; raise TimeoutError if an answer is late."""
         now_ns = time.monotonic_ns()
-        if not self._mode.complete:  # after a long period the answer may be in the socket
-            self._advance(self._mode, now_ns)
-        if self._mode.due(now_ns):
-            self._mode.begin(now_ns, now_ns + self._timeout_ns)
-            self._window.add(self._mode)
-        elif self._mode.overdue(now_ns):
-            raise TimeoutError
+        for query in self._queries:
+            if not query.complete:  # after a long period the answer may be in the socket
+                self._advance(query, now_ns)
+                if query.overdue(now_ns):
+                    raise TimeoutError
+                if not query.complete:
+                    return
+        for query in self._queries:
+            if query.due(now_ns):
+                query.begin(now_ns, now_ns + self._timeout_ns)
+                self._window.add(query)
+                return
 
     def _flush(self) -> None:
         """Send as many waiting requests as the window allows."""

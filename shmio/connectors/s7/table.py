@@ -10,12 +10,12 @@ from __future__ import annotations
 import logging
 import time
 from bisect import insort
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from shmio.connectors.base import Connector
 from shmio.connectors.register_image import RegisterImage
-from shmio.connectors.s7 import pdu
+from shmio.connectors.s7 import cpu, pdu
 from shmio.connectors.s7.address import parse
 from shmio.connectors.s7.blocks import ITEM_OVERHEAD, JOB_OVERHEAD, BlockWrite, WriteItem, bit_item, byte_item, touches
 from shmio.connectors.s7.explain import (
@@ -63,11 +63,12 @@ log = logging.getLogger("shmio.source")
 class Planner:
     """Knows which ranges to read, and which registers the controller refuses."""
 
-    def __init__(self, tags: Sequence[Tag]) -> None:
+    def __init__(self, tags: Mapping[int, Tag]) -> None:
+        """Plan for these tags, by index in the layout."""
         self._tags = tags
         self.pdu_size = 0
         self._ranges: dict[Range, None] = {}  # a set in order
-        self._rates = sorted({tag.field.every for tag in tags})
+        self._rates = sorted({tag.field.every for tag in tags.values()})
         self._jobs: dict[tuple[int, ...], list[Job]] = {}  # by the rates that are due
         self._cycle = 0
         self.refused: dict[Field, tuple[int, int]] = {}
@@ -145,7 +146,7 @@ class Planner:
             self._merge()
 
     def _merge(self) -> None:
-        fields = (tag.field for tag in self._tags if tag.field not in self.refused)
+        fields = (tag.field for tag in self._tags.values() if tag.field not in self.refused)
         self._ranges = dict.fromkeys(merge(fields, most_bytes(self.pdu_size)))
         self._jobs = {}
 
@@ -334,17 +335,29 @@ class S7TableConnector(S7Session, Connector):
         if options.dbNumber is not None:
             raise ConfigError("dbNumber: leave it out: each address of a tag table names its block")
         self._layout = layout
-        self._tags: list[Tag] = []
+        self._tags: dict[int, Tag] = {}
+        of_cpu: list[cpu.CpuTag] = []
         rates = _rates(options.every, layout)
         for index, register in enumerate(layout.registers):
             try:
+                if cpu.is_address(register.address):
+                    of_cpu.append(cpu.parse(index, register))
+                    continue
                 address = parse(register)
                 if register.writable and address.area.read_only:
                     raise ValueError(f"writable: {address.area.read_only}")
             except ValueError as error:
                 raise ConfigError(f"layout: {register.path}: {error}") from None
             rate = next((every for glob, every in rates if glob.matches(register.path)), 1)
-            self._tags.append(Tag(index, register, address, layout.byte_order, rate))
+            self._tags[index] = Tag(index, register, address, layout.byte_order, rate)
+        if not self._tags:
+            raise ConfigError(
+                "layout: only values of the CPU, which are asked for beside others: add a register such as %MB0"
+            )
+        self._of_cpu = of_cpu
+        self._cpu = cpu.CpuValues(of_cpu, self._mode)
+        for query in self._cpu.queries:
+            self._add_query(query)
         self._planner = Planner(self._tags)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
 
@@ -352,7 +365,7 @@ class S7TableConnector(S7Session, Connector):
         """Return the peer, the parameters of the session and the requests of a cycle as a text for logs."""
         requests = self._planner.count
         return (
-            f"to {self.options.peer} {len(self._tags)} registers pdu={self.pdu_size} jobs={self.jobs} "
+            f"to {self.options.peer} {len(self._layout.registers)} registers pdu={self.pdu_size} jobs={self.jobs} "
             f"depth={self.depth} in {requests} {'request' if requests == 1 else 'requests'} a cycle"
         )
 
@@ -361,6 +374,7 @@ class S7TableConnector(S7Session, Connector):
     def _reads(self) -> list[Read]:
         if self._image is None:
             raise ConnectorError("the layout has no status area")
+        self._cpu.begin()
         limit = self.options.packetSize or self.pdu_size
         self._planner.use(min(self.pdu_size, max(pdu.MIN_PDU_SIZE, limit + pdu.READ_OVERHEAD)))
         requests = max(1, self._planner.count)
@@ -374,6 +388,7 @@ class S7TableConnector(S7Session, Connector):
         """Put the results of a read into the image, and return a copy of it."""
         image = self._image
         assert image is not None  # noqa: S101 - _reads() checked it
+        self._cpu.store(image)
         planner = self._planner
         for index, status in planner.news.items():
             image.fail(index, status)
@@ -438,7 +453,7 @@ class S7TableConnector(S7Session, Connector):
         """
         offset, mask, data = write
         touched = False
-        for tag in self._tags:
+        for tag in self._tags.values():
             register = tag.register
             if register.offset + register.size <= offset or register.offset >= offset + len(data):
                 continue
@@ -457,6 +472,11 @@ class S7TableConnector(S7Session, Connector):
             else:
                 yield from self._elements(tag, write)
         if not touched:
+            if any(
+                one.register.offset < offset + len(data) and offset < one.register.offset + one.register.size
+                for one in self._of_cpu
+            ):
+                raise ValueError("values of the CPU can only be read")
             raise ValueError("no register of the tag table is there")
 
     def _elements(self, tag: Tag, write: Write) -> Iterator[tuple[Tag, int, int | None, bytes]]:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.s7.mode import INTERVAL_NS, ModeQuery, parse_mode_answer
+from shmio.connectors.s7.mode import INTERVAL_NS, ModeQuery
 from shmio.errors import ConnectorError
 from tests.unit.connectors.s7 import noise as frames
 
@@ -137,14 +137,19 @@ def changed(**at: int) -> memoryview:
     ],
 )
 def test_refuses_a_wrong_answer(frame: memoryview) -> None:
+    question = ModeQuery()
+    question.begin(0, 10)
     with pytest.raises(ConnectorError):
-        parse_mode_answer(frame)
+        question.accept(0, frame)
+    assert question.mode is None
 
 
 @given(frames.answers(7, GOOD[17:29], GOOD[29:]) | frames.answers(3, b"", GOOD[29:]) |
        st.binary(min_size=7, max_size=80) | st.builds(lambda cut, tail: (GOOD[:cut] + tail).ljust(7, b"\0"),
        st.integers(0, 61), st.binary(max_size=30)))  # fmt: skip
 def test_noise_gives_a_mode_or_none_or_a_connector_error(noise: bytes) -> None:
+    question = ModeQuery()
+    question.begin(0, 10)
     with contextlib.suppress(ConnectorError):
-        mode = parse_mode_answer(memoryview(noise))
-        assert mode is None or 0 <= mode <= 15
+        question.accept(0, memoryview(noise))
+        assert question.mode is None or 0 <= question.mode <= 15

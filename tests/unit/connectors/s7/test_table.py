@@ -162,7 +162,7 @@ def test_refused_registers_are_found_and_tried_again(monkeypatch: pytest.MonkeyP
         assert codes(layout, connector.read()) == expected
         plc.blocks[1].extend(b"\0\1" * 50)
         assert codes(layout, connector.read()) == expected
-        monkeypatch.setattr("shmio.connectors.s7.table.time.monotonic_ns", _later(RETRY_NS))
+        monkeypatch.setattr("shmio.connectors.s7.table.time.monotonic_ns", later(RETRY_NS))
         connector.read()
         connector.read()
         raw = connector.read()
@@ -192,7 +192,7 @@ def test_what_is_refused_is_found_in_several_sessions_if_one_is_too_short() -> N
     assert codes(layout, raw) == [BAD_NODE_ID_UNKNOWN] * 1000
 
 
-def _later(ns: int) -> Callable[[], int]:
+def later(ns: int) -> Callable[[], int]:
     now = time.monotonic_ns
     return lambda: now() + ns
 

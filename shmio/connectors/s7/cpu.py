@@ -1,0 +1,255 @@
+"""Registers of a tag table with values of the CPU itself: its mode, its clock, what it is.
+
+Their addresses are ``cpu.state``, ``cpu.clock``, ``cpu.order_code`` and the like. They are asked for
+beside the reads, and a CPU that refuses a question turns only the registers bad that need it. The
+lists and their records are those of Siemens, System Software for S7-300/400, A5E00739858, 33.3,
+33.5 and 33.21; that record 7 of list 0x0011 has the firmware also on S7-1200 and S7-1500, users of
+python-snap7 have found (its ``szl.py``).
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from shmio.config.faults import meant
+from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.s7.explain import ACCESS_DENIED, RefusedError
+from shmio.connectors.s7.mode import MODES, ModeQuery
+from shmio.connectors.s7.query import Query
+from shmio.connectors.s7.userdata import READ_CLOCK, READ_SZL, Service, parse_clock, szl_data, szl_records
+from shmio.layout.model import INTEGERS, Register
+from shmio.layout.values.codec import Value
+from shmio.model.statuses import (
+    BAD_NO_DATA,
+    BAD_NOT_SUPPORTED,
+    BAD_USER_ACCESS_DENIED,
+    BAD_WAITING_FOR_INITIAL_DATA,
+    GOOD,
+)
+
+CLOCK_INTERVAL_NS: Final = 1_000_000_000
+_PREFIX: Final = "cpu."
+_MODULES, _COMPONENTS = 0x0011, 0x001C
+_STATE, _CLOCK = "state", "clock"
+
+
+class _Text(NamedTuple):
+    """Where a list has a text."""
+
+    szl: int
+    record: int
+    start: int
+    length: int
+
+
+_TEXTS: Final[Mapping[str, _Text]] = {
+    "order_code": _Text(_MODULES, 1, 2, 20),
+    "firmware": _Text(_MODULES, 7, 24, 12),  # as text: V255.255.255
+    "name": _Text(_COMPONENTS, 1, 2, 24),
+    "module_name": _Text(_COMPONENTS, 2, 2, 24),
+    "plant": _Text(_COMPONENTS, 3, 2, 32),
+    "serial_number": _Text(_COMPONENTS, 5, 2, 24),
+    "module_type": _Text(_COMPONENTS, 7, 2, 32),
+}
+_NAMES: Final = (_STATE, _CLOCK, *_TEXTS)
+_TIMES: Final = ("DATE_AND_TIME", "DTL", "LDT")
+_LONGEST_STATE: Final = 9
+_CLOCK_LENGTH: Final = 23
+
+log = logging.getLogger("shmio.source")
+
+
+def is_address(text: str) -> bool:
+    """Return whether an address of a tag table is one of the CPU itself."""
+    return text.strip().lower().startswith(_PREFIX)
+
+
+class CpuTag(NamedTuple):
+    """A register with a value of the CPU."""
+
+    place: int
+    """The register's index in the layout."""
+    register: Register
+    name: str
+    """The address without ``cpu.``."""
+
+
+def parse(place: int, register: Register) -> CpuTag:
+    """Return the tag of a register of the CPU.
+
+    Raises:
+        ValueError: There is no such value, or it does not fit the register.
+
+    """
+    text = register.address.strip()
+    name = text.lower().removeprefix(_PREFIX)
+    if name not in _NAMES:
+        known = [_PREFIX + one for one in _NAMES]
+        raise ValueError(
+            f"address: {text[:80]!r} is none; the CPU has {', '.join(known)}{meant(text.lower()[:80], known)}"
+        )
+    if register.writable:
+        raise ValueError("writable: values of the CPU can only be read")
+    if register.dims or register.scale:
+        raise ValueError(f"{'type' if register.dims else 'scale'}: {text!r} is a single value as it is")
+    element = register.element
+    if name == _STATE:
+        length, others = _LONGEST_STATE, "BOOL, a whole number, or "
+        fits = element.base == "BOOL" or element.base in INTEGERS
+    elif name == _CLOCK:
+        length, others = _CLOCK_LENGTH, f"{', '.join(_TIMES)}, or "
+        fits = element.base in _TIMES
+    else:
+        length, others, fits = _TEXTS[name].length, "", False
+    if not fits and (element.base not in ("STRING", "WSTRING") or element.length < length):
+        raise ValueError(f"type: that of {text!r} is {others}STRING[{length}] or longer, not {register.type}")
+    return CpuTag(place, register, name)
+
+
+class CpuValues:
+    """The values of the CPU that a tag table names, and the questions for them."""
+
+    def __init__(self, tags: Sequence[CpuTag], mode: ModeQuery) -> None:
+        """Prepare the questions.
+
+        Args:
+            tags: The registers.
+            mode: The question for the operating mode, which the session asks anyhow.
+
+        """
+        self._tags = tags
+        self._mode = mode
+        self._mode_seen = -1
+        self._news: dict[int, tuple[Value, int, int]] = {}  # by index: value, status, UTC time of the answer
+        self._bad: set[int] = set()
+        self.queries: list[Query] = []
+        for szl in (_MODULES, _COMPONENTS):
+            if wanted := [tag for tag in tags if tag.name in _TEXTS and _TEXTS[tag.name].szl == szl]:
+                self.queries.append(_TextsQuery(szl, wanted, self._tell))
+        if clocks := [tag for tag in tags if tag.name == _CLOCK]:
+            self.queries.append(_ClockQuery(clocks, self._tell))
+        self._states = [tag for tag in tags if tag.name == _STATE]
+
+    def begin(self) -> None:
+        """Forget all values at the start of a session: it may be with another CPU."""
+        self._mode_seen = -1
+        for tag in self._tags:
+            if tag.place not in self._bad:  # of a bad one, its status says more
+                self._news[tag.place] = None, BAD_WAITING_FOR_INITIAL_DATA, 0
+
+    def store(self, image: RegisterImage) -> None:
+        """Put what is new into the image."""
+        if self._states:
+            self._look_at_mode()
+        for index, (value, status, source_ns) in self._news.items():
+            if value is None:
+                image.fail(index, status, source_ns)
+            else:
+                image.put(index, value, source_ns)
+        self._news.clear()
+
+    def _look_at_mode(self) -> None:
+        mode = self._mode
+        if not mode.supported:
+            if self._mode_seen:
+                self._mode_seen = 0
+                why = "the controller does not tell its operating mode"
+                self._tell(self._states, lambda _: None, BAD_NOT_SUPPORTED, why)
+        elif mode.mode is not None and mode.answered_ns != self._mode_seen:
+            self._mode_seen = mode.answered_ns
+            self._tell(self._states, self._state, BAD_NO_DATA, f"mode {mode.mode} is unknown")
+
+    def _state(self, tag: CpuTag) -> Value:
+        base, mode = tag.register.element.base, self._mode
+        if base == "BOOL":
+            return mode.runs
+        return mode.mode if base in INTEGERS else MODES.get(mode.mode or 0)
+
+    def _tell(self, tags: Iterable[CpuTag], value_of: Callable[[CpuTag], Value], status: int, why: str) -> None:
+        """Note new values, or the status of those that have none, and why."""
+        now_ns = time.time_ns()
+        for tag in tags:
+            value = value_of(tag)
+            self._news[tag.place] = value, GOOD if value is not None else status, now_ns
+            if value is not None:
+                if tag.place in self._bad:
+                    self._bad.remove(tag.place)
+                    log.info("%s (%s%s) can be read again", tag.register.path, _PREFIX, tag.name)
+            elif tag.place not in self._bad:
+                self._bad.add(tag.place)
+                log.warning("%s (%s%s) is bad: %s", tag.register.path, _PREFIX, tag.name, why)
+
+
+_Tell = Callable[[Iterable[CpuTag], Callable[[CpuTag], Value], int, str], None]
+
+
+class _CpuQuery(Query):
+    """A question for registers, which are bad if there is no answer."""
+
+    def __init__(self, service: Service, interval_ns: int | None, tags: Sequence[CpuTag], tell: _Tell) -> None:
+        super().__init__(service, interval_ns)
+        self.tags, self.tell = tags, tell
+
+    def refused(self, refusal: RefusedError) -> None:
+        """Turn the registers bad; ask again in the next session."""
+        self.rest()
+        status = BAD_USER_ACCESS_DENIED if refusal.code == ACCESS_DENIED else BAD_NOT_SUPPORTED
+        self.tell(self.tags, lambda _: None, status, f"the CPU does not tell it: {refusal}")
+
+    def given_up(self, why: str) -> None:
+        """Turn the registers bad for good."""
+        self.tell(self.tags, lambda _: None, BAD_NOT_SUPPORTED, f"the controller {why}; it is not asked any more")
+
+
+class _TextsQuery(_CpuQuery):
+    """The question for texts of a list, once in each session."""
+
+    def __init__(self, szl: int, tags: Sequence[CpuTag], tell: _Tell) -> None:
+        super().__init__(READ_SZL, None, tags, tell)
+        self._szl = szl
+
+    def data(self) -> bytes:
+        """Return the data of the request."""
+        return szl_data(self._szl)
+
+    def answered(self, data: bytes) -> None:
+        """Tell the texts of the records."""
+        records: dict[int, bytes] = {}
+        for record in szl_records(data, self._szl):
+            records.setdefault(int.from_bytes(record[:2], "big"), record)
+        self.tell(
+            self.tags, lambda tag: _text(tag.name, records), BAD_NO_DATA, f"list 0x{self._szl:04X} of the CPU has none"
+        )
+
+
+def _text(name: str, records: Mapping[int, bytes]) -> str | None:
+    """Return a text from records; None if they have none."""
+    place = _TEXTS[name]
+    record = records.get(place.record, b"")
+    if name == "firmware":
+        version = record[place.start : place.start + 4]
+        return f"V{version[1]}.{version[2]}.{version[3]}" if version[:1] == b"V" and len(version) == 4 else None
+    field = record[place.start : place.start + place.length]
+    if len(record) < place.start + place.length:
+        return None
+    return field.partition(b"\0")[0].decode("latin-1").strip()
+
+
+class _ClockQuery(_CpuQuery):
+    """The question for the time of the CPU's clock, once a second."""
+
+    def __init__(self, tags: Sequence[CpuTag], tell: _Tell) -> None:
+        super().__init__(READ_CLOCK, CLOCK_INTERVAL_NS, tags, tell)
+
+    def data(self) -> bytes:
+        """Return the data of the request: none."""
+        return b""
+
+    def answered(self, data: bytes) -> None:
+        """Tell the time."""
+        clock = parse_clock(data)
+        text = None if clock is None else clock.isoformat(timespec="milliseconds")
+        self.tell(self.tags, lambda _: text, BAD_NO_DATA, "the clock has no valid time; set it")

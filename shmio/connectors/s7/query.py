@@ -1,0 +1,136 @@
+"""A question about the controller itself, which is asked beside the reads of its data. No I/O.
+
+Only one is under way at a time, behind the requests of a read. A controller may refuse one, or
+never answer it: some close the connection instead. So a question without an answer ends the
+connection only a few times, and is not asked any more then.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Final
+
+from shmio.connectors.s7.explain import RefusedError
+from shmio.connectors.s7.userdata import Service, next_request, parse_answer, request
+from shmio.errors import ConnectorError
+
+PATIENCE: Final = 2
+"""Number of connections that a question without a valid answer may end."""
+MAX_PARTS: Final = 64
+MAX_ANSWER_BYTES: Final = 16_384
+
+
+class Query(ABC):
+    """A question that is asked again and again, or once in each session."""
+
+    def __init__(self, service: Service, interval_ns: int | None) -> None:
+        """Create a question; without an interval it is asked once in each session."""
+        self.service = service
+        self._interval_ns = interval_ns
+        self._due_ns: int | None = 0
+        self.deadline_ns = 0
+        """Time by which the answer to an open question must come, in ns of CLOCK_MONOTONIC."""
+        self._known = False  # the controller has answered at least once
+        self._failures = self._malformed = 0
+        self.supported = True
+        """False if the question is not asked any more, in any session."""
+        self.count = 1
+        self.sent = 0
+        self.complete = True
+        self._answer = bytearray()
+        self._sequence = 0
+        self.again: Callable[[Query], None] = lambda _: None
+        """Called to request the next part of an answer."""
+
+    def due(self, now_ns: int) -> bool:
+        """Return whether to ask now."""
+        return self.supported and self.complete and self._due_ns is not None and now_ns >= self._due_ns
+
+    def overdue(self, now_ns: int) -> bool:
+        """Return whether the answer is late."""
+        return not self.complete and now_ns >= self.deadline_ns
+
+    def begin(self, now_ns: int, deadline_ns: int) -> None:
+        """Ask; the answer must come by ``deadline_ns``."""
+        self._due_ns = None if self._interval_ns is None else now_ns + self._interval_ns
+        self.deadline_ns = deadline_ns
+        self.count, self.sent = 1, 0
+        self.complete = False
+        self._answer.clear()
+
+    def take(self, count: int, first: int) -> bytes:
+        """Return the request: for the answer, or for its next part."""
+        begin, self.sent = self.sent, self.sent + count
+        if begin:
+            return next_request(first & 0xFFFF, self.service, self._sequence)
+        return request(first & 0xFFFF, self.service, self.data())
+
+    def accept(self, index: int, frame: memoryview) -> None:
+        """Process the answer, or a part of it.
+
+        Raises:
+            ConnectorError: The answer does not match the request.
+
+        """
+        try:
+            try:
+                part = parse_answer(frame, self.service)
+                self._answer += part.data
+                if part.more:
+                    if index + 1 == MAX_PARTS or len(self._answer) > MAX_ANSWER_BYTES:
+                        raise RefusedError(f"the answer to '{self.service.name}' is too long")
+                    self._sequence = part.sequence
+                    self.count += 1
+                    self.again(self)
+                    return
+                self.complete = True
+                self._known = True
+                self.answered(bytes(self._answer))
+                self._malformed = 0
+            except RefusedError as refusal:
+                self.complete = True
+                self.refused(refusal)
+        except ConnectorError:
+            self.complete = True
+            self._malformed += 1
+            if self._malformed == PATIENCE:
+                self._give_up("does not answer as expected")
+            raise
+
+    def lost(self) -> None:
+        """Forget an open question, because the connection was lost.
+
+        Stop asking if connections were repeatedly lost while the question was open.
+        """
+        self._due_ns = 0
+        if self.complete:
+            return
+        self.complete = True
+        self._failures += 1
+        if not self._known and self._failures == PATIENCE:
+            self._give_up("does not answer the query")
+
+    def rest(self) -> None:
+        """Do not ask again in this session."""
+        self._due_ns = None
+
+    def _give_up(self, why: str) -> None:
+        self.supported = False
+        self.given_up(why)
+
+    @abstractmethod
+    def data(self) -> bytes:
+        """Return the data of the request."""
+
+    @abstractmethod
+    def answered(self, data: bytes) -> None:
+        """Process the data of a whole answer; raise ConnectorError if it does not match the request."""
+
+    @abstractmethod
+    def refused(self, refusal: RefusedError) -> None:
+        """Process a refusal."""
+
+    @abstractmethod
+    def given_up(self, why: str) -> None:
+        """Note that the question is not asked any more; the reason continues "the controller …"."""

@@ -1,0 +1,173 @@
+"""Encodes and parses userdata: system status lists (SZL), the clock, information about blocks. No I/O.
+
+Userdata (ROSCTR 7) are requests for what a CPU knows of itself. Names follow Wireshark's S7
+dissector. An answer that does not fit a PDU comes in parts, and each part after the first one is
+requested by itself. SZLs are described in Siemens, System Software for S7-300/400, A5E00739858,
+chapter 33.
+
+Every parser in this module raises only ConnectorError, for any input.
+"""
+
+from __future__ import annotations
+
+import struct
+from datetime import datetime
+from typing import Final, NamedTuple
+
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_error, explain_item
+from shmio.errors import ConnectorError
+
+
+class Service(NamedTuple):
+    """A function that a CPU offers by userdata."""
+
+    group: int
+    function: int
+    name: str
+
+
+READ_SZL: Final = Service(4, 1, "read SZL")
+READ_CLOCK: Final = Service(7, 1, "read clock")
+BLOCK_INFO: Final = Service(3, 3, "block info")
+
+_PARAMETERS = struct.Struct(">3s 5B BBH")  # head; length, kind, group, function, sequence; unit, last unit, error
+_PARAMETERS_HEAD = b"\x00\x01\x12"
+_REQUEST, _ANSWER = 0x11, 0x12
+_ITEM = struct.Struct(">BBH")  # return code, transport size, length in bytes
+_OCTETS = 0x09
+_SZL_HEAD = struct.Struct(">HHHH")  # SZL and index; size and number of records
+_BLOCK = struct.Struct(">12xHI 4x IHIH 2x2x2x H 24x2xH")
+"""Of the information about a block: number, bytes in load memory; ms and day of the last changes of
+its code and of its interface; bytes in work memory; checksum."""
+_DATA_BLOCK_CODE = b"0A"
+_ACTIVE = b"A"  # the block in the work memory
+
+
+class Part(NamedTuple):
+    """An answer, or a part of one."""
+
+    data: bytes
+    sequence: int
+    """With which the next part is requested."""
+    more: bool
+    """Whether another part follows."""
+
+
+def request(reference: int, service: Service, data: bytes = b"") -> bytes:
+    """Return a request with its data."""
+    parameters = _PARAMETERS_HEAD + bytes((4, _REQUEST, 0x40 | service.group, service.function, 0))
+    item = _ITEM.pack(ITEM_OK, _OCTETS, len(data)) if data else _ITEM.pack(0x0A, 0, 0)
+    return pdu.request(reference, parameters, item + data, pdu.USERDATA)
+
+
+def next_request(reference: int, service: Service, sequence: int) -> bytes:
+    """Return a request for the next part of an answer."""
+    parameters = _PARAMETERS.pack(
+        _PARAMETERS_HEAD, 8, _ANSWER, 0x40 | service.group, service.function, sequence, 0, 0, 0
+    )
+    return pdu.request(reference, parameters, _ITEM.pack(0x0A, 0, 0), pdu.USERDATA)
+
+
+def parse_answer(frame: memoryview, service: Service) -> Part:
+    """Parse an answer to a request, or one of its parts.
+
+    Raises:
+        RefusedError: The controller refused the request.
+        ConnectorError: The answer is malformed.
+
+    """
+    kind, parameters_size, data_size = pdu.check_envelope(frame)
+    what = f"not an answer to '{service.name}'"
+    if kind != pdu.USERDATA:
+        pdu.check_answer(frame)
+        raise ConnectorError(what)
+    begin = pdu.USERDATA_END + _PARAMETERS.size
+    if parameters_size != _PARAMETERS.size or begin + data_size != len(frame) or data_size < _ITEM.size:
+        raise ConnectorError(f"{what}: inconsistent lengths")
+    head, size, method, group, function, sequence, _, last, error = _PARAMETERS.unpack_from(frame, pdu.USERDATA_END)
+    if (head, size, method) != (_PARAMETERS_HEAD, 8, _ANSWER):
+        raise ConnectorError(what)
+    code, _, length = _ITEM.unpack_from(frame, begin)
+    if error:
+        raise RefusedError(explain_error(error))
+    if code != ITEM_OK:  # some servers name another service when they refuse one
+        raise RefusedError(explain_item(code), code)
+    if (group, function) != (0x80 | service.group, service.function):
+        raise ConnectorError(what)
+    if length != data_size - _ITEM.size:
+        raise ConnectorError(f"{what}: {data_size - _ITEM.size} bytes of data, its header says {length}")
+    return Part(bytes(frame[begin + _ITEM.size :]), sequence, bool(last))
+
+
+def szl_data(szl: int) -> bytes:
+    """Return the data of a request for all records of a list."""
+    return struct.pack(">HH", szl, 0)
+
+
+def szl_records(data: bytes, szl: int) -> list[bytes]:
+    """Return the records in the data of an answer; those that are cut off are left out.
+
+    Raises:
+        ConnectorError: It is another list, or the head is missing.
+
+    """
+    if len(data) < _SZL_HEAD.size:
+        raise ConnectorError(f"answer to '{READ_SZL.name}' without its head")
+    found, _, size, count = _SZL_HEAD.unpack_from(data)
+    if found != szl:
+        raise ConnectorError(f"not an answer to '{READ_SZL.name}' 0x{szl:04X}, but to 0x{found:04X}")
+    if not size:
+        return []
+    starts = range(_SZL_HEAD.size, len(data) - size + 1, size)
+    return [data[start : start + size] for start in starts[:count]]
+
+
+def parse_clock(data: bytes) -> datetime | None:
+    """Return the time of a CPU's clock, without a time zone; None if it is no valid time."""
+    digits = (
+        data[2:9].hex() + data[9:10].hex()[:1]
+    )  # after a reserved byte and the century, which CPUs fill in differently
+    if len(digits) != 15 or not digits.isdecimal():
+        return None
+    year = int(digits[:2])
+    month, day, hour, minute, second = (int(digits[at : at + 2]) for at in range(2, 12, 2))
+    try:
+        return datetime(
+            (1900 if year >= 90 else 2000) + year, month, day, hour, minute, second, 1000 * int(digits[12:])
+        )
+    except ValueError:
+        return None
+
+
+class BlockInfo(NamedTuple):
+    """What a CPU knows of a data block. Any loading of a changed block changes it."""
+
+    load_size: int
+    """Bytes in load memory."""
+    code_changed: tuple[int, int]
+    """Day since 1984-01-01, and ms of that day, of the last change of its code."""
+    interface_changed: tuple[int, int]
+    size: int
+    """Length of the data in bytes."""
+    checksum: int
+
+
+def block_data(db_number: int) -> bytes:
+    """Return the data of a request for information about a data block."""
+    return _DATA_BLOCK_CODE + f"{db_number:05d}".encode() + _ACTIVE
+
+
+def parse_block(data: bytes, db_number: int) -> BlockInfo:
+    """Return the information about a data block.
+
+    Raises:
+        ConnectorError: The information is of another block, or too short.
+
+    """
+    if len(data) < _BLOCK.size:
+        raise ConnectorError(f"answer to '{BLOCK_INFO.name}' of {len(data)} bytes is too short")
+    number, load_size, code_ms, code_day, interface_ms, interface_day, size, checksum = _BLOCK.unpack_from(data)
+    if number != db_number:
+        raise ConnectorError(f"not an answer to '{BLOCK_INFO.name}' of DB{db_number}, but of DB{number}")
+    return BlockInfo(load_size, (code_day, code_ms), (interface_day, interface_ms), size, checksum)
