@@ -4,7 +4,8 @@ From python-snap7 3.3 come the memory areas, the ISO-on-TCP handshake, system st
 lists, the clock, and the start and stop of the emulated CPU. This module adds the status list with
 the operating mode, cuts answers that do not fit a PDU into parts, and replaces:
 
-- the status lists with what the CPU is: those of python-snap7 have no heads of records;
+- the status lists with what the CPU is: those of python-snap7 have no heads of records; and the
+  information about blocks, which has no checksum there;
 - jobs (set-up, read, write), which ``Jobs`` answers: python-snap7 grants one job and 480 bytes,
   writes a bit as a whole byte, stores only the first item of a write, stores part of a write past
   the end of a block, and reads several times slower;
@@ -21,10 +22,11 @@ import logging
 import socket
 import struct
 import threading
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from snap7.datatypes import S7Area, S7WordLen
 from snap7.s7protocol import S7Function, S7PDUType
@@ -94,6 +96,8 @@ _COMPONENTS = {
     0x0007: b"Emulated S7",
 }
 """Names of: the system, the module, the plant; copyright; serial number; type of the module."""
+_BLOCK_HEAD = 36
+"""Bytes of a block in load memory besides its data."""
 _USERDATA_DATA = 22
 """Offset of the data in an answer to userdata, and in a request for the next part of one."""
 _NEXT_PART = 0x12
@@ -159,6 +163,11 @@ class Memory:
     def __init__(self, areas: Mapping[tuple[S7Area, int], bytearray]) -> None:
         self.areas = areas
         self.lock = threading.Lock()
+
+    @staticmethod
+    def size_of(block: bytearray, traits: Traits) -> int:
+        """Return the length of a data block in bytes, as a client sees it."""
+        return len(block) if traits.block_size is None else min(traits.block_size, len(block))
 
 
 class Jobs:
@@ -261,9 +270,7 @@ class Jobs:
     def _size(self, kind: S7Area | None, area: bytearray) -> int:
         if kind is not S7Area.DB:
             return len(area)
-        if self._traits.fault is Fault.OPTIMIZED:
-            return 0
-        return len(area) if self._traits.block_size is None else min(self._traits.block_size, len(area))
+        return 0 if self._traits.fault is Fault.OPTIMIZED else self._memory.size_of(area, self._traits)
 
 
 def _refusal(reference: int, error: int) -> bytes:
@@ -374,6 +381,7 @@ class S7Server(Server):
         self.lock = self._memory.lock
         self._client_sockets: set[socket.socket] = set()
         self._stopping = threading.Event()
+        self._checksums: dict[int, int] = {}
 
     def add_block(self, number: int, data: bytearray) -> None:
         """Serve ``data``, in place, as data block ``number``.
@@ -387,6 +395,7 @@ class S7Server(Server):
         if (S7Area.DB, number) in self.memory_areas:
             raise ConfigError(f"DB{number} is served already")
         self.register_area(SrvArea.DB, number, data)
+        self._checksums[number] = zlib.crc32(data) & 0xFFFF
         self.area_locks[(S7Area.DB, number)] = self.lock  # for python-snap7's own code
 
     def add_area(self, area: SrvArea, data: bytearray) -> None:
@@ -571,7 +580,12 @@ class S7Server(Server):
         if part is not None:
             return part
         answer = self._process_request(request, address)
-        return None if answer is None else parts.cut(request, answer, size)
+        if answer is None:
+            return None
+        if min(len(request) - 16, len(answer) - _USERDATA_DATA) > 0 and answer[1] == S7PDUType.USERDATA:
+            # python-snap7 refuses everything as if "read SZL" had been asked
+            answer = answer[:15] + bytes((0x80 | request[15] & 0x0F, request[16])) + answer[17:]
+        return parts.cut(request, answer, size)
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
         """Answer a job other than read, write and set-up: by python-snap7, if that is safe.
@@ -592,6 +606,33 @@ class S7Server(Server):
         if kind == S7PDUType.REQUEST:
             return _refusal(int.from_bytes(request_data[4:6], "big"), _NOT_AVAILABLE)
         return None
+
+    def load_block(self, number: int, data: bytearray) -> None:
+        """Serve other data under a number, as after loading a changed block from the programming tool."""
+        with self.lock:
+            self.memory_areas[(S7Area.DB, number)] = data
+            self._checksums[number] = zlib.crc32(data) & 0xFFFF
+
+    def _handle_get_block_info(
+        self,
+        request: dict[str, Any],
+        userdata_params: dict[str, Any],
+        client_address: tuple[str, int],  # noqa: ARG002
+    ) -> bytes:
+        """Tell a block's length as the traits have it, and a checksum of the data as they were loaded."""
+        asked = request.get("data", {}).get("data", b"")
+        digits = bytes(asked[2:7])
+        number = int(digits) if digits.isdigit() else 0
+        area = self.memory_areas.get((S7Area.DB, number))
+        if bytes(asked[:2]) != b"0A" or area is None or self._traits.fault is Fault.OPTIMIZED:
+            error: bytes = self._build_userdata_error_response(request, _NO_SUCH_OBJECT << 8)
+            return error
+        size = self._memory.size_of(area, self._traits)
+        checksum = self._checksums.get(number, 0)
+        head = struct.pack(">2s9sBHI16x", b"0A", b"", 0x0A, number, size + _BLOCK_HEAD)
+        info = head + struct.pack(">6xH8s8s8sBxH8x", size & 0xFFFF, b"shmio", b"", b"", 1, checksum)
+        answer: bytes = self._build_userdata_success_response(request, userdata_params, info)
+        return answer
 
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
         """Return the records of a list as in the manual of S7-300/400, with their head.

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from shmio.connectors.base import Connector
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blocks import BlockRead, BlockWrite, SizeProbe, waves
+from shmio.connectors.s7.drift import BlockWatch, Described
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
 from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
 from shmio.connectors.s7.table import S7TableConnector
@@ -57,7 +58,11 @@ class S7Client(S7Session):
                 self._finish(probe, deadline_ns)
         except (ConnectorError, OSError, EOFError):
             return refusal
-        return RefusedError(explain_size(self.db_number, self.size, probe.found), OUT_OF_RANGE)
+        return RefusedError(self._explain_size(probe.found), OUT_OF_RANGE)
+
+    def _explain_size(self, found: int) -> str:
+        """Return a message for a block that has only ``found`` bytes."""
+        return explain_size(self.db_number, self.size, found)
 
 
 class S7Connector(S7Client, Connector):
@@ -86,6 +91,19 @@ class S7Connector(S7Client, Connector):
         if layout.byte_order != "big":
             raise ConfigError(f"layout: {layout.name!r} is little-endian, but a controller's block is big-endian")
         super().__init__(options, number, layout.size)
+        ends = [(register.offset + register.size, register.path) for register in layout.registers]
+        self._described = Described(number, layout.name, layout.size, ends, whole=True)
+        self._watch = BlockWatch([self._described])
+        self._add_query(self._watch)
+
+    @property
+    def doubt(self) -> str:
+        """Reason why values may not change, or may be others than the layout says; empty if there is none."""
+        return "; ".join(filter(None, (*self._watch.doubts.values(), super().doubt)))
+
+    def _explain_size(self, found: int) -> str:
+        gone = self._described.beyond(found)
+        return explain_size(self.db_number, self.size, found, self._described.name, gone)
 
     def describe(self) -> str:
         """Return the peer and the parameters of the session as a text for logs."""

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 from shmio.config.faults import meant
 from shmio.connectors.register_image import RegisterImage
-from shmio.connectors.s7.explain import ACCESS_DENIED, RefusedError
+from shmio.connectors.s7.explain import ACCESS_DENIED, RefusedError, names_of
 from shmio.connectors.s7.mode import MODES, ModeQuery
 from shmio.connectors.s7.query import Query
 from shmio.connectors.s7.userdata import READ_CLOCK, READ_SZL, Service, parse_clock, szl_data, szl_records
@@ -171,16 +171,23 @@ class CpuValues:
     def _tell(self, tags: Iterable[CpuTag], value_of: Callable[[CpuTag], Value], status: int, why: str) -> None:
         """Note new values, or the status of those that have none, and why."""
         now_ns = time.time_ns()
+        good, bad = [], []
         for tag in tags:
             value = value_of(tag)
             self._news[tag.place] = value, GOOD if value is not None else status, now_ns
-            if value is not None:
-                if tag.place in self._bad:
-                    self._bad.remove(tag.place)
-                    log.info("%s (%s%s) can be read again", tag.register.path, _PREFIX, tag.name)
-            elif tag.place not in self._bad:
+            if (value is None) == (tag.place in self._bad):
+                continue
+            name = f"{tag.register.path} ({_PREFIX}{tag.name})"
+            if value is None:
                 self._bad.add(tag.place)
-                log.warning("%s (%s%s) is bad: %s", tag.register.path, _PREFIX, tag.name, why)
+                bad.append(name)
+            else:
+                self._bad.remove(tag.place)
+                good.append(name)
+        if bad:
+            log.warning("%s: bad: %s", names_of(bad), why)
+        if good:
+            log.info("%s: good again", names_of(good))
 
 
 _Tell = Callable[[Iterable[CpuTag], Callable[[CpuTag], Value], int, str], None]
@@ -197,7 +204,7 @@ class _CpuQuery(Query):
         """Turn the registers bad; ask again in the next session."""
         self.rest()
         status = BAD_USER_ACCESS_DENIED if refusal.code == ACCESS_DENIED else BAD_NOT_SUPPORTED
-        self.tell(self.tags, lambda _: None, status, f"the CPU does not tell it: {refusal}")
+        self.tell(self.tags, lambda _: None, status, str(refusal))
 
     def given_up(self, why: str) -> None:
         """Turn the registers bad for good."""

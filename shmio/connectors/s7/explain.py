@@ -6,10 +6,16 @@ real CPUs; docs/how-to/connect-an-s7-plc.md names these reports.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Final
+
 from snap7.error import S7_PROTOCOL_ERROR_CODES
 from snap7.s7protocol import S7_RETURN_CODES
 
 from shmio.errors import ConnectorError
+from shmio.layout.topic import shorten
+
+_MOST_NAMES: Final = 3
 
 # Return codes of an item.
 ITEM_OK = 0xFF
@@ -60,17 +66,36 @@ def explain_read(code: int, db_number: int, size: int) -> str:
     return f"DB{db_number}: {explain_item(code)}"
 
 
-def explain_size(db_number: int, size: int, found: int) -> str:
-    """Return a message for a block that has only ``found`` bytes, not ``size`` as in the layout."""
+def explain_size(db_number: int, size: int, found: int, name: str = "", gone: Sequence[str] = ()) -> str:
+    """Return a message for a block that has only ``found`` bytes, not ``size`` as in the layout.
+
+    ``name`` is that of the layout, and ``gone`` the registers behind the block's end.
+    """
     if not found:
         return (
             f"DB{db_number} has no byte that can be addressed (item code 0x05): it is optimized, {_NO_OPTIMIZED}; "
             "or it is empty"
         )
+    if gone:
+        return (
+            f"{block_name(db_number, name)} has {found} bytes, not {size} as its layout (item code 0x05): export it "
+            f"again; beyond its end: {names_of(gone)}"
+        )
     return (
         f"DB{db_number} has no {size} bytes but {found} bytes (item code 0x05): the layout is of another version of "
         "the block; export it again"
     )
+
+
+def block_name(db_number: int, name: str) -> str:
+    """Return a block's number, and its name if that says more."""
+    return f"DB{db_number}" if name.upper() in {"", f"DB{db_number}"} else f'DB{db_number} "{shorten(name, 40)}"'
+
+
+def names_of(paths: Sequence[str]) -> str:
+    """Return the first names of a list, and how many there are besides."""
+    text = ", ".join(shorten(path, 40) for path in paths[:_MOST_NAMES])
+    return text if len(paths) <= _MOST_NAMES else f"{text} and {len(paths) - _MOST_NAMES} more"
 
 
 def explain_write(code: int, db_number: int, last: int) -> str:
@@ -81,6 +106,24 @@ def explain_write(code: int, db_number: int, last: int) -> str:
             "it again"
         )
     return f"DB{db_number}: {explain_item(code)}"
+
+
+def explain_place(code: int, text: str, db_number: int, last: int) -> str:
+    """Return a message for the return code of a single register of a tag table.
+
+    Args:
+        code: The return code.
+        text: The register's address.
+        db_number: Number of its block; 0 in other areas.
+        last: Its last byte.
+
+    """
+    if code == OUT_OF_RANGE and db_number:
+        return (
+            f"DB{db_number} has no byte {last} (item code 0x05): correct the address {text}, or the block in the "
+            f"controller is of another version, or optimized: {_NO_OPTIMIZED}"
+        )
+    return explain_item(code)
 
 
 def explain_item(code: int) -> str:

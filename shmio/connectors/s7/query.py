@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Final
+from typing import ClassVar, Final
 
 from shmio.connectors.s7.explain import RefusedError
 from shmio.connectors.s7.userdata import Service, next_request, parse_answer, request
@@ -24,6 +24,9 @@ MAX_ANSWER_BYTES: Final = 16_384
 class Query(ABC):
     """A question that is asked again and again, or once in each session."""
 
+    optional: ClassVar[bool] = False
+    """Whether it is not asked of a controller that did not answer others at all."""
+
     def __init__(self, service: Service, interval_ns: int | None) -> None:
         """Create a question; without an interval it is asked once in each session."""
         self.service = service
@@ -35,6 +38,8 @@ class Query(ABC):
         self._failures = self._malformed = 0
         self.supported = True
         """False if the question is not asked any more, in any session."""
+        self.silent = False
+        """True if that is because the controller did not answer at all."""
         self.count = 1
         self.sent = 0
         self.complete = True
@@ -109,11 +114,16 @@ class Query(ABC):
         self.complete = True
         self._failures += 1
         if not self._known and self._failures == PATIENCE:
+            self.silent = True
             self._give_up("does not answer the query")
 
     def rest(self) -> None:
         """Do not ask again in this session."""
         self._due_ns = None
+
+    def hurry(self) -> None:
+        """Ask again at once."""
+        self._due_ns = 0
 
     def _give_up(self, why: str) -> None:
         self.supported = False

@@ -372,7 +372,7 @@ class S7Session(ABC):
                 if not query.complete:
                     return
         for query in self._queries:
-            if query.due(now_ns):
+            if query.due(now_ns) and not (query.optional and self._mode.silent):
                 query.begin(now_ns, now_ns + self._timeout_ns)
                 self._window.add(query)
                 return

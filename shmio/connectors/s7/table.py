@@ -16,8 +16,9 @@ from typing import Final
 from shmio.connectors.base import Connector
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.s7 import cpu, pdu
-from shmio.connectors.s7.address import parse
+from shmio.connectors.s7.address import Area, parse
 from shmio.connectors.s7.blocks import ITEM_OVERHEAD, JOB_OVERHEAD, BlockWrite, WriteItem, bit_item, byte_item, touches
+from shmio.connectors.s7.drift import BlockWatch, Described
 from shmio.connectors.s7.explain import (
     ACCESS_DENIED,
     ITEM_OK,
@@ -27,6 +28,7 @@ from shmio.connectors.s7.explain import (
     OUT_OF_RANGE,
     RefusedError,
     explain_item,
+    explain_place,
 )
 from shmio.connectors.s7.plan import Field, Job, Piece, Range, merge, most_bytes, pack
 from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
@@ -42,6 +44,8 @@ from shmio.model.statuses import (
     BAD_OUT_OF_RANGE,
     BAD_TYPE_MISMATCH,
     BAD_USER_ACCESS_DENIED,
+    GOOD,
+    UNCERTAIN,
 )
 
 RETRY_NS: Final = 10_000_000_000
@@ -136,6 +140,13 @@ class Planner:
         self.news[field.register] = status
         self.split(part, ())
 
+    def explain(self, part: Range, code: int) -> str:
+        """Return a message for an item's return code after a read of a range."""
+        tag = self._tags[part.fields[0].register]
+        if len(part.fields) > 1:
+            return explain_item(code)
+        return explain_place(code, tag.address.text, tag.address.db, part.stop - 1)
+
     def accept(self, part: Range) -> None:
         """Read a range's fields with the others again, if they were refused."""
         if self.refused and any(field in self.refused for field in part.fields):
@@ -144,6 +155,11 @@ class Planner:
                     self.news.pop(field.register, None)
                     log.info("%s can be read again", self._named(field))
             self._merge()
+
+    def forget(self) -> None:
+        """Store the values of all ranges again, though they may not have changed."""
+        for one in self._ranges:
+            one.last = b""
 
     def _merge(self) -> None:
         fields = (tag.field for tag in self._tags.values() if tag.field not in self.refused)
@@ -235,9 +251,8 @@ class TableRead:
                 if answer.code == ITEM_OK:
                     self._put(piece, answer.data)
                 else:
-                    self._refuse(
-                        piece.range, _STATUS.get(answer.code, BAD_COMMUNICATION_ERROR), explain_item(answer.code)
-                    )
+                    status = _STATUS.get(answer.code, BAD_COMMUNICATION_ERROR)
+                    self._refuse(piece.range, status, self._planner.explain(piece.range, answer.code))
         self._answered += 1
         if self.complete:
             self._settle()
@@ -356,7 +371,9 @@ class S7TableConnector(S7Session, Connector):
             )
         self._of_cpu = of_cpu
         self._cpu = cpu.CpuValues(of_cpu, self._mode)
-        for query in self._cpu.queries:
+        self._watch = BlockWatch(_described(self._tags.values()))
+        self._uncertain: frozenset[int] = frozenset()  # numbers of blocks that no longer fit
+        for query in (*self._cpu.queries, self._watch):
             self._add_query(query)
         self._planner = Planner(self._tags)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
@@ -393,7 +410,11 @@ class S7TableConnector(S7Session, Connector):
         for index, status in planner.news.items():
             image.fail(index, status)
         planner.news.clear()
+        if self._watch.doubts.keys() != self._uncertain:
+            self._uncertain = frozenset(self._watch.doubts)
+            planner.forget()
         for whole, data in read.data_of.items():
+            code = UNCERTAIN if whole.area is Area.BLOCK and whole.db in self._uncertain else GOOD
             # A register that is read in every cycle has the time of the frame.
             source_ns = read.begun_ns if whole.every > 1 else 0
             if whole.last == data and not source_ns:  # then the registers have these values already
@@ -407,7 +428,7 @@ class S7TableConnector(S7Session, Connector):
                 if found is None:
                     image.fail(field.register, BAD_OUT_OF_RANGE, source_ns)
                 else:
-                    image.put_bytes(field.register, found, source_ns)
+                    image.put_bytes(field.register, found, source_ns, code)
         return bytes(image)
 
     # -- writing -------------------------------------------------------------------------------------------------------
@@ -499,6 +520,20 @@ class S7TableConnector(S7Session, Connector):
         for first, count in _covered(register, there):
             at, data = tag.device_bytes(own, first, count)
             yield tag, start + at, None, data
+
+
+def _described(tags: Iterable[Tag]) -> Iterator[Described]:
+    """Yield the data blocks that tags need."""
+    fields: dict[int, list[tuple[int, int, str]]] = {}
+    for tag in tags:
+        if tag.address.area is Area.BLOCK:
+            end = tag.field.stop
+            fields.setdefault(tag.address.db, []).append(
+                (tag.field.start, end, f"{tag.register.path} ({tag.address.text})")
+            )
+    for db_number, found in sorted(fields.items()):
+        ends = [(end, name) for _, end, name in sorted(found)]
+        yield Described(db_number, "", max(end for end, _ in ends), ends, whole=False)
 
 
 def _rates(every: dict[str, int], layout: Layout) -> list[tuple[Glob, int]]:

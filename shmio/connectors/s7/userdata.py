@@ -15,7 +15,7 @@ from datetime import datetime
 from typing import Final, NamedTuple
 
 from shmio.connectors.s7 import pdu
-from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_error, explain_item
+from shmio.connectors.s7.explain import ITEM_OK, RefusedError
 from shmio.errors import ConnectorError
 
 
@@ -29,7 +29,7 @@ class Service(NamedTuple):
 
 READ_SZL: Final = Service(4, 1, "read SZL")
 READ_CLOCK: Final = Service(7, 1, "read clock")
-BLOCK_INFO: Final = Service(3, 3, "block info")
+BLOCK_INFO: Final = Service(3, 3, "tell of a block")
 
 _PARAMETERS = struct.Struct(">3s 5B BBH")  # head; length, kind, group, function, sequence; unit, last unit, error
 _PARAMETERS_HEAD = b"\x00\x01\x12"
@@ -80,7 +80,10 @@ def parse_answer(frame: memoryview, service: Service) -> Part:
     kind, parameters_size, data_size = pdu.check_envelope(frame)
     what = f"not an answer to '{service.name}'"
     if kind != pdu.USERDATA:
-        pdu.check_answer(frame)
+        try:
+            pdu.check_answer(frame)
+        except RefusedError:
+            raise _refused(service, f"error 0x{frame[17] << 8 | frame[18]:04X}") from None
         raise ConnectorError(what)
     begin = pdu.USERDATA_END + _PARAMETERS.size
     if parameters_size != _PARAMETERS.size or begin + data_size != len(frame) or data_size < _ITEM.size:
@@ -90,14 +93,18 @@ def parse_answer(frame: memoryview, service: Service) -> Part:
         raise ConnectorError(what)
     code, _, length = _ITEM.unpack_from(frame, begin)
     if error:
-        raise RefusedError(explain_error(error))
+        raise _refused(service, f"error 0x{error:04X}")
     if code != ITEM_OK:  # some servers name another service when they refuse one
-        raise RefusedError(explain_item(code), code)
+        raise _refused(service, f"item code 0x{code:02X}", code)
     if (group, function) != (0x80 | service.group, service.function):
         raise ConnectorError(what)
     if length != data_size - _ITEM.size:
         raise ConnectorError(f"{what}: {data_size - _ITEM.size} bytes of data, its header says {length}")
     return Part(bytes(frame[begin + _ITEM.size :]), sequence, bool(last))
+
+
+def _refused(service: Service, number: str, code: int = 0) -> RefusedError:
+    return RefusedError(f"the CPU refuses to '{service.name}' ({number})", code)
 
 
 def szl_data(szl: int) -> bytes:

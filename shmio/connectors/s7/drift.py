@@ -1,0 +1,151 @@
+"""Notices that a data block is not the one that its layout describes. No I/O.
+
+S7-300 and S7-400 tell a block's length and checksum, and when it was compiled. The connector asks
+for them at the beginning of each session and once a minute, and compares them with the last answer.
+S7-1200 and S7-1500 refuse the question; then a block that is too short is noticed only by reading it.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import logging
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from shmio.connectors.s7.explain import RefusedError, block_name, names_of
+from shmio.connectors.s7.query import Query
+from shmio.connectors.s7.userdata import BLOCK_INFO, BlockInfo, block_data, parse_block
+
+INTERVAL_NS: Final = 60_000_000_000
+MAX_BLOCKS: Final = 200
+"""Most blocks of a table that are watched."""
+_MOST_CHANGES: Final = 5  # of a checksum alone, which are reported
+
+log = logging.getLogger("shmio.source")
+
+
+class Described(NamedTuple):
+    """A data block as a layout or a tag table describes it."""
+
+    db_number: int
+    name: str
+    """Of the layout; empty if a tag table names only the number."""
+    size: int
+    """Bytes of the layout, or up to the last register of a tag table."""
+    ends: Sequence[tuple[int, str]]
+    """Of each register, in the order of the addresses: the byte behind its last one, and its name."""
+    whole: bool
+    """Whether the layout describes all of the block, not only some addresses."""
+
+    def beyond(self, size: int) -> list[str]:
+        """Return the names of the registers that a block of ``size`` bytes does not have."""
+        return [name for end, name in self.ends if end > size]
+
+
+class BlockWatch(Query):
+    """Asks for each block in turn, and reports those that were changed."""
+
+    optional = True
+
+    def __init__(self, blocks: Iterable[Described]) -> None:
+        """Watch these blocks."""
+        super().__init__(BLOCK_INFO, INTERVAL_NS)
+        self._blocks = list(blocks)[:MAX_BLOCKS]
+        self._round: list[Described] = []  # blocks that are still to be asked for, the next one last
+        self._refused: set[int] = set()  # numbers of blocks, in this session
+        self._last: dict[int, tuple[BlockInfo, float]] = {}
+        self._changes: dict[int, int] = {}
+        self._doubts: dict[int, str] = {}
+        self.supported = bool(self._blocks)
+
+    @property
+    def doubts(self) -> Mapping[int, str]:
+        """By number of a block that was changed and no longer fits its layout: what was changed."""
+        return self._doubts
+
+    def data(self) -> bytes:
+        """Return the data of the request."""
+        if not self._round:
+            self._round = [block for block in reversed(self._blocks) if block.db_number not in self._refused]
+        return block_data(self._round[-1].db_number)
+
+    def answered(self, data: bytes) -> None:
+        """Compare a block with its last state, and go on to the next one."""
+        block = self._round[-1]
+        self._compare(block, parse_block(data, block.db_number))
+        self._go_on()
+
+    def refused(self, refusal: RefusedError) -> None:  # noqa: ARG002 - that it is refused says enough
+        """Go on to the next block; if all are refused, ask again in the next session."""
+        self._refused.add(self._round[-1].db_number)
+        self._go_on()
+
+    def given_up(self, why: str) -> None:
+        """Log why."""
+        log.debug("the controller %s of its blocks: a change of a block will not be noticed", why)
+
+    def lost(self) -> None:
+        """Begin with the first block in the next session."""
+        self._round.clear()
+        self._refused.clear()
+        super().lost()
+
+    def _go_on(self) -> None:
+        self._round.pop()
+        if self._round:
+            self.hurry()
+        elif len(self._refused) == len(self._blocks):
+            self.rest()
+
+    def _compare(self, block: Described, info: BlockInfo) -> None:
+        known = self._last.get(block.db_number)
+        self._last[block.db_number] = info, time.time()
+        if known is None:
+            self._compare_first(block, info)
+            return
+        before, seen_s = known
+        if info == before:
+            return
+        doubt = ""
+        if info.size and info.size != before.size:
+            text = f"it had {before.size} bytes and has {info.size}"
+            if _fits(block, info.size):
+                text += ", as its layout" if block.whole else ""
+            else:
+                text += _misfit(block, info.size)
+                doubt = f"{block_name(block.db_number, block.name)} was changed in the controller: {text}"
+        else:
+            doubt = self._doubts.get(block.db_number, "")
+            changes = self._changes[block.db_number] = self._changes.get(block.db_number, 0) + 1
+            if changes > _MOST_CHANGES:
+                return
+            text = f"it has {info.size} bytes as before, but another checksum or time of compilation"
+        if doubt:
+            self._doubts[block.db_number] = doubt
+        else:
+            self._doubts.pop(block.db_number, None)
+        since = dt.datetime.fromtimestamp(seen_s, dt.UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        log.warning(
+            "%s was changed in the controller since %s: %s; compare its layout",
+            block_name(block.db_number, block.name), since, text,
+        )  # fmt: skip
+
+    def _compare_first(self, block: Described, info: BlockInfo) -> None:
+        """Report a wrong length when the block is seen first; a controller may have more than a table names."""
+        if info.size and not _fits(block, info.size):
+            log.warning(
+                "%s has %d bytes in the controller%s; compare its layout",
+                block_name(block.db_number, block.name), info.size, _misfit(block, info.size),
+            )  # fmt: skip
+
+
+def _fits(block: Described, size: int) -> bool:
+    """Return whether a block of ``size`` bytes is as its layout describes it; one may be padded to whole words."""
+    return block.size <= size <= block.size + 1 if block.whole else block.size <= size
+
+
+def _misfit(block: Described, size: int) -> str:
+    what = "its layout has" if block.whole else "its registers need"
+    gone = block.beyond(size)
+    return f", {what} {block.size}" + (f"; beyond its end: {names_of(gone)}" if gone else "")
