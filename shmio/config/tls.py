@@ -35,7 +35,7 @@ def read_tls(tls: Tls) -> TlsFiles:
     if tls.client_ca:
         _load_authority(context, tls.client_ca, "grpc.tls.client_ca")
     try:
-        _load_pair(context, tls.certificate, tls.key, "grpc.tls")
+        _load_pair(context, tls.certificate, tls.key, "grpc.tls.key")
     except ssl.SSLError as error:
         other = error.reason == "KEY_VALUES_MISMATCH"
         why = "not the key of grpc.tls.certificate" if other else f"no usable PEM private key{_detail(error)}"
@@ -43,18 +43,18 @@ def read_tls(tls: Tls) -> TlsFiles:
     return found
 
 
-def client_context(tls: MqttTls) -> ssl.SSLContext:
+def client_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
     """Return the TLS context for an external broker, or raise ConfigError.
 
     ``ca`` must have issued the broker's certificate, or one of the host's authorities if there is
-    no ``ca``.
+    no ``ca``. ``where`` begins the names of the keys, in messages.
     """
     context = ssl.create_default_context()
     if tls.ca is not None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        _load_authority(context, tls.ca, "mqtt.tls.ca")
+        _load_authority(context, tls.ca, f"{where}ca")
     if tls.certificate is not None:
-        _identify(context, tls)
+        _identify(context, tls, where)
     context.sslsocket_class = _Socket
     return context
 
@@ -65,7 +65,7 @@ def server_context(tls: MqttTls) -> ssl.SSLContext:
     With ``ca``, clients must present a certificate issued by it.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    _identify(context, tls)
+    _identify(context, tls, "mqtt.tls.")
     if tls.ca is not None:
         _load_authority(context, tls.ca, "mqtt.tls.ca")
         context.verify_mode = ssl.CERT_REQUIRED
@@ -83,21 +83,20 @@ class _Socket(ssl.SSLSocket):
             raise
 
 
-def _identify(context: ssl.SSLContext, tls: MqttTls) -> None:
-    """Load shmio's certificate and key of ``[mqtt.tls]``."""
+def _identify(context: ssl.SSLContext, tls: MqttTls, where: str) -> None:
+    """Load shmio's certificate and key of ``[mqtt.tls]``, or of a source."""
     certificate, key = str(tls.certificate), str(tls.key)
     for field, name in (("certificate", certificate), ("key", key)):
         try:
             with open(name, "rb"):  # noqa: PTH123  to tell which of both it is
                 pass
         except OSError as error:
-            raise ConfigError(f"mqtt.tls.{field}: {name}: {error.strerror}") from None
+            raise ConfigError(f"{where}{field}: {name}: {error.strerror}") from None
     try:
-        _load_pair(context, certificate, key, "mqtt.tls")
+        _load_pair(context, certificate, key, f"{where}key")
     except ssl.SSLError as error:
-        raise ConfigError(
-            f"mqtt.tls: {certificate} and {key} are not a certificate and its key{_detail(error)}"
-        ) from None
+        what = f"{certificate} and {key} are not a certificate and its key{_detail(error)}"
+        raise ConfigError(f"{where.rstrip('.') or 'certificate'}: {what}") from None
 
 
 def _read(key: str, name: str) -> bytes:
@@ -112,13 +111,13 @@ def _load_pair(context: ssl.SSLContext, certificate: str, key: str, where: str) 
 
     Raises:
         ssl.SSLError: A file is unusable, or the key belongs to another certificate.
-        ConfigError: The key needs a passphrase; the message begins with ``where``.
+        ConfigError: The key needs a passphrase; the message begins with ``where``, the key's name.
 
     """
     try:
         context.load_cert_chain(certificate, key, password=_refuse_to_ask)
     except _EncryptedError:
-        raise ConfigError(f"{where}.key: {key}: needs a passphrase; use a key without one") from None
+        raise ConfigError(f"{where}: {key}: needs a passphrase; use a key without one") from None
 
 
 def _load_authority(context: ssl.SSLContext, name: str, key: str) -> None:

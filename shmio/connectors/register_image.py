@@ -34,7 +34,7 @@ class RegisterImage:
         """Return the present image, ``layout.size`` bytes."""
         return bytes(self._image)
 
-    def put(self, index: int, value: Value, source_ns: int = 0, code: int = GOOD) -> None:
+    def put(self, index: int, value: Value, source_ns: int = 0, code: int = GOOD) -> str:
         """Store the value of a register; a value that does not fit its type turns it bad.
 
         Args:
@@ -44,12 +44,17 @@ class RegisterImage:
                 time counts.
             code: OPC UA status code. If it is bad, the value is stored nevertheless.
 
+        Returns:
+            Why the value does not fit; "" if it does.
+
         """
+        fault = ""
         try:
             codec(self._layout.registers[index], self._layout.byte_order).encode_into(value, self._image)
-        except ValueRangeError:
-            code = BAD_OUT_OF_RANGE
+        except ValueRangeError as error:
+            code, fault = BAD_OUT_OF_RANGE, str(error)
         self._area.put(self._image, index, RegisterStatus(code, source_ns))
+        return fault
 
     def put_bytes(self, index: int, data: bytes, source_ns: int = 0, code: int = GOOD) -> None:
         """Store the value of a register as its bytes in the layout, which must be ``size`` bytes."""

@@ -24,6 +24,7 @@ GROUP = "shmio.connectors"
 BUILT_IN = {
     "memory": "shmio.connectors.models.memory:Memory",
     "modbus": "shmio.connectors.modbus.connector:ModbusConnector",
+    "mqtt": "shmio.connectors.mqtt.connector:MqttConnector",
     "opcua": "shmio.connectors.opcua.connector:OpcUaConnector",
     "remote": "shmio.connectors.models.remote:Remote",
     "ros2": "shmio.connectors.ros.dds:Ros2Connector",

@@ -7,7 +7,6 @@ command must write all registers of the topic at once, so that no field is made 
 from __future__ import annotations
 
 import copy
-from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
@@ -15,10 +14,10 @@ from shmio.connectors.base import Lost
 from shmio.connectors.ros.addresses import Address, FieldError, extract, place_of
 from shmio.connectors.ros.messages import DEFINITIONS, conforms, default, plain
 from shmio.connectors.ros.topics import Topic, Topics
+from shmio.connectors.touched import touched
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Register, bit_positions
-from shmio.layout.values.codec import Value, codec
-from shmio.layout.values.write import Write, apply, bits_of
+from shmio.layout.values.codec import Value
+from shmio.layout.values.write import Write
 from shmio.model.statuses import BAD_NO_DATA
 
 _MISSING: Final = object()
@@ -95,56 +94,24 @@ def stamped(topics: Topics, topic: Topic) -> bool:
 
 def _touched(topics: Topics, write: Write, open_drafts: Mapping[str, Publication]) -> Iterator[tuple[int, Value]]:
     """Yield the registers that a write sets, with their values; ValueError."""
-    layout, touched = topics.layout, False
-    covered, image = bytearray(layout.size), bytearray(layout.size)
-    apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
-    registers, stop = layout.registers, write.offset + len(write.data)
-    first = bisect_right(registers, write.offset, key=lambda register: register.offset + register.size)
-    for index in range(first, bisect_left(registers, stop, key=lambda register: register.offset)):
-        register = registers[index]
-        wanted = bits_of(register)
-        there = covered[register.offset : register.offset + register.size]
-        share = bytes(a & b for a, b in zip(there, wanted, strict=True))
-        if not any(share):
-            continue
-        touched = True
+    for index, value in touched(topics.layout, write, lambda index: _present(topics, index, open_drafts)):
         topic = topics.by_name[topics.addresses[index].topic]
         if not topic.writable or topics.fittings[index].kind is None:
-            raise ValueError(f"{register.path}: to publish on {topic.name}, set `writable = true` in the tag table")
-        if share != wanted:
-            if not _whole_elements(register, share):
-                raise ValueError(f"{register.path}: a message has no parts of a value: write the whole register")
-            codec(register, layout.byte_order).encode_into(_present(topics, index, topic, open_drafts), image)
-        apply(write, image)
-        yield index, codec(register, layout.byte_order).decode(image)
-    if not touched:
-        raise ValueError("no register of the layout is there")
+            path = topics.layout.registers[index].path
+            raise ValueError(f"{path}: to publish on {topic.name}, set `writable = true` in the tag table")
+        yield index, value
 
 
-def _present(topics: Topics, index: int, topic: Topic, open_drafts: Mapping[str, Publication]) -> Value:
-    """Return the present value of an array of which elements are written; ValueError."""
+def _present(topics: Topics, index: int, open_drafts: Mapping[str, Publication]) -> Value:
+    """Return the present value of an array of which elements are written; ValueRangeError."""
+    topic = topics.by_name[topics.addresses[index].topic]
     draft = open_drafts.get(topic.name)
     if draft is not None and index in draft.values:
         return draft.values[index]
     try:
         return topics.fittings[index].value(extract(topic.message, topics.addresses[index]))
-    except (FieldError, ValueRangeError):
-        path = topics.layout.registers[index].path
-        raise ValueError(f"{path}: the last message does not have the other elements: write the whole array") from None
-
-
-def _whole_elements(register: Register, share: bytes) -> bool:
-    """Return whether these bits of a register are whole elements of an array."""
-    if not register.dims:
-        return False
-    if register.type == "BOOL":
-        own = bytearray(len(share))
-        for at, bit in bit_positions(register):
-            own[at] |= 1 << bit
-        return any(a & b for a, b in zip(own, share, strict=True))
-    size, stride = register.element.size, register.element.stride
-    parts = (share[place * stride : place * stride + size] for place in range(register.count))
-    return all(part in (bytes(size), b"\xff" * size) for part in parts)
+    except FieldError as error:
+        raise ValueRangeError(str(error)) from None
 
 
 def _message(topics: Topics, draft: Publication, base: Any) -> Any:

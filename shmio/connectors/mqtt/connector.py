@@ -1,0 +1,193 @@
+"""The connector ``mqtt``: a connection to a broker, the newest messages in an image, and writes."""
+
+from __future__ import annotations
+
+import secrets
+import ssl
+import time
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+from paho.mqtt.client import MQTTv5, MQTTv311
+
+from shmio.config.credentials import read_password
+from shmio.config.model import MqttTls
+from shmio.config.tls import client_context
+from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.mqtt.commands import Command, plan
+from shmio.connectors.mqtt.link import Link, UnsupportedVersionError, version_of
+from shmio.connectors.mqtt.options import MqttOptions
+from shmio.connectors.mqtt.store import Store
+from shmio.errors import ConnectorError
+from shmio.layout.model import Layout
+from shmio.layout.values.write import Write
+
+TIMEOUTS: Final = 4
+"""How many time-outs the whole of a connection may take."""
+FIRST_S: Final = 0.1
+"""How long a new connection waits for messages that the broker has kept."""
+ECHO_S: Final = 0.2
+"""How long a write waits until its message has come back to this subscriber, after it was confirmed."""
+
+
+class MqttConnector(Connector):
+    """Reads the topics of a layout's registers at a broker, and publishes commands."""
+
+    Options = MqttOptions
+    can_write = True
+    register_quality = True
+    path_options: ClassVar[tuple[str, ...]] = ("ca", "certificate", "key", "password_file")
+
+    def __init__(self, options: MqttOptions, layout: Layout) -> None:
+        self._options = options
+        self._store = Store(layout, options)
+        self._client_id = options.client_id or f"shmio-{secrets.token_hex(6)}"
+        self._version = version_of(options.version)
+        self._link: Link | None = None
+        self._last_number = 0
+        self._password = read_password(options.password_file, "password_file") if options.password_file else None
+        self._context = _context(options)
+
+    @property
+    def timeout_s(self) -> float:
+        """The longest time that any hook blocks, in s."""
+        return TIMEOUTS * self._options.timeout / 1000
+
+    def describe(self) -> str:
+        """Return the broker and how it is reached, for the log."""
+        version = "5" if self._version == MQTTv5 else "3.1.1"
+        secured = "TLS" if self._options.tls else "plain text"
+        return f"to {self._options.address} as {self._client_id}, MQTT {version}, {secured}, {self._store.describe()}"
+
+    def connect(self) -> None:
+        """Connect to the broker and subscribe; wait shortly for the messages that it has kept.
+
+        Raises:
+            ConnectorError: The broker cannot be reached, or refuses the client.
+
+        """
+        self.close()
+        self._store.reset()
+        until_s = time.monotonic() + (TIMEOUTS - 1) * self._options.timeout / 1000
+        try:
+            refused = self._open(until_s)
+        except UnsupportedVersionError:
+            if self._options.version != "auto" or self._version == MQTTv311:
+                self.close()
+                raise
+            self.close()
+            self._version = MQTTv311
+            refused = self._open(until_s)
+        for topic in refused:
+            self._store.refuse(topic)
+        link = self._link
+        assert link is not None  # noqa: S101 - for the type checker
+        number = link.ping()
+        self._store.wait(
+            lambda: self._store.complete or link.answered(number),
+            min(time.monotonic() + FIRST_S, until_s),
+        )
+        link.check()
+
+    def _open(self, until_s: float) -> list[str]:
+        store = self._store
+        link = self._link = Link(
+            self._options, self._client_id, self._password, self._context, store.take, store.wake, self._last_number
+        )
+        try:
+            return link.open(self._version, store.filters, until_s)
+        except UnsupportedVersionError:
+            raise
+        except ConnectorError:
+            self.close()
+            raise
+
+    def read(self) -> bytes:
+        """Return the image of the newest messages, if the broker certainly lives.
+
+        Raises:
+            ConnectorError: The connection is lost, or the broker is silent or behind.
+
+        """
+        link = self._link
+        if link is None:
+            raise ConnectorError(f"not connected to {self._options.address}")
+        link.check()
+        return self._store.image(time.monotonic_ns())
+
+    def close(self) -> None:
+        """Close the connection. It may be called at any time and more than once."""
+        if self._link is not None:
+            self._link.close()
+            self._last_number = self._link.last_number
+            self._link = None
+
+    # -- writing -------------------------------------------------------------------------------------------------------
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Publish messages, which the broker acknowledges.
+
+        Raises:
+            WriteLostError: The connection was lost, or the broker did not acknowledge all in time.
+
+        """
+        link = self._link
+        if link is None:
+            raise WriteLostError(f"not connected to {self._options.address}", [Lost.UNSENT] * len(writes))
+        until_s = time.monotonic() + self._options.timeout / 1000
+        commands, refusals = plan(self._store, self._options, writes)
+        outcomes: list[str | Lost] = list(refusals)
+        sent: list[Command] = []
+        try:
+            link.check()
+            for command in commands:
+                if not link.fits(command.publication):
+                    command.outcome = "the message is larger than the broker accepts"
+                    continue
+                link.await_room(until_s)
+                self._store.expect(command.publication.topic, command.publication.payload)
+                sent.append(command)  # from here on, the broker may get it
+                command.number = link.publish(command.publication)
+            self._confirm(link, sent, until_s)
+        except ConnectorError as error:
+            _mark(outcomes, commands, sent)
+            raise WriteLostError(str(error), outcomes) from None
+        finally:
+            link.forget()
+        _mark(outcomes, commands, sent)
+        if all(command.outcome == "" for command in sent):  # else the message does not come back
+            self._store.await_expected(time.monotonic() + min(ECHO_S, self._options.timeout / 1000))
+        return [str(outcome) for outcome in outcomes]
+
+    def _confirm(self, link: Link, sent: Sequence[Command], until_s: float) -> None:
+        try:
+            link.wait_acknowledged((one.number for one in sent if one.number is not None), until_s)
+            if any(one.number is None for one in sent):
+                link.wait_processed(until_s)
+                for one in sent:
+                    if one.number is None:
+                        one.outcome = ""
+        finally:
+            for one in sent:
+                if one.number is not None:
+                    one.outcome = link.outcome(one.number, one.publication.topic, retain=one.publication.retain)
+
+
+def _context(options: MqttOptions) -> ssl.SSLContext | None:
+    if not options.tls:
+        return None
+    return client_context(MqttTls(ca=options.ca, certificate=options.certificate, key=options.key), "")
+
+
+def _mark(outcomes: list[str | Lost], commands: Sequence[Command], sent: Sequence[Command]) -> None:
+    """Note what is known of each write, which may need several messages."""
+    begun = {id(command) for command in sent}
+    for number, outcome in enumerate(outcomes):
+        own = [command for command in commands if number in command.writes]
+        if outcome or not own:
+            continue
+        if refusal := next((command.outcome for command in own if command.outcome), ""):
+            outcomes[number] = refusal
+        elif any(command.outcome is None for command in own):
+            unsent = all(id(command) not in begun for command in own)
+            outcomes[number] = Lost.UNSENT if unsent else Lost.UNKNOWN

@@ -1,0 +1,472 @@
+"""One connection to a broker, whose packets a thread of its own receives.
+
+The connection keeps no session at the broker, so that nothing of an old connection is delivered on
+the next one. A PINGREQ is on its way at least every half time-out: the answer shows that the broker
+lives, and that what it sends is not behind.
+"""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv5, MQTTv311
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from shmio.config import Address
+from shmio.connectors import tcp
+from shmio.connectors.mqtt.options import MqttOptions
+from shmio.errors import ConnectorError
+from shmio.logs import printable
+
+MAX_PACKET_BYTES: Final = (1 << 24) + (1 << 17)
+"""A larger packet ends the connection. The largest payload that an option allows fits."""
+MAX_FILTERS: Final = 100
+"""Most filters of a SUBSCRIBE."""
+MAX_IN_FLIGHT: Final = 20
+HEAD_BYTES: Final = 128
+"""Maximum size of the parts of a PUBLISH other than topic and payload."""
+CLOSE_S: Final = 0.5
+_TURN_S: Final = 1.0
+# Reason codes: MQTT 5.0, section 2.4. Paho uses the same numbers for MQTT 3.1.1.
+_UNSUPPORTED: Final = "Unsupported protocol version"
+_LOGIN: Final = frozenset({0x86, 0x87})
+_TAKEN_OVER: Final = 0x8E
+_NO_SUBSCRIBERS: Final = 0x10
+
+
+class Deliver(Protocol):
+    """Takes messages."""
+
+    def __call__(self, topic: str, payload: bytes, *, retained: bool) -> None:
+        """Take a message."""
+
+
+class UnsupportedVersionError(ConnectorError):
+    """The broker does not know the version of MQTT."""
+
+
+class _Client(Client):
+    """A paho client with limits, which says when packets arrive."""
+
+    def __init__(self, opened: socket.socket, client_id: str, version: MQTTProtocolVersion, after: int) -> None:
+        super().__init__(
+            CallbackAPIVersion.VERSION2,
+            client_id,
+            clean_session=None if version == MQTTv5 else True,
+            protocol=version,
+            reconnect_on_failure=False,
+        )
+        self._opened = opened
+        self.tls_error: ssl.SSLError | None = None
+        self.violation = ""
+        """What the broker did that ends the connection."""
+        self.on_pong: Callable[[], None] = lambda: None
+        self._last_mid = after
+
+    @property
+    def last_number(self) -> int:
+        """The last packet identifier that was used."""
+        return self._last_mid
+
+    def ping(self) -> None:
+        """Send a PINGREQ, which paho sends only after its keep-alive time."""
+        self._send_pingreq()
+
+    def _create_socket(self) -> Any:
+        return self._opened
+
+    def _sock_recv(self, bufsize: int) -> bytes:
+        if bufsize > MAX_PACKET_BYTES:
+            self.violation = f"it sent a packet of {bufsize} bytes, more than the {MAX_PACKET_BYTES} that are accepted"
+            raise ConnectionAbortedError(self.violation)
+        try:
+            return super()._sock_recv(bufsize)
+        except ssl.SSLError as error:  # with TLS 1.3 a broker rejects our certificate only after the handshake
+            self.tls_error = error
+            raise
+
+    def _handle_publish(self) -> MQTTErrorCode:
+        if self._in_packet["command"] & 0x06 == 0x04:  # paho would keep it without a limit
+            self.violation = "it sent a message with QoS 2, which was not asked for"
+            return MQTTErrorCode.MQTT_ERR_PROTOCOL
+        return super()._handle_publish()
+
+    def _handle_pingresp(self) -> MQTTErrorCode:
+        code = super()._handle_pingresp()
+        self.on_pong()
+        return code
+
+
+@dataclass(frozen=True)
+class Publication:
+    """A message to publish."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+
+
+class Link:
+    """A connection; create it, then :meth:`open` it."""
+
+    def __init__(
+        self,
+        options: MqttOptions,
+        client_id: str,
+        password: str | None,
+        context: ssl.SSLContext | None,
+        deliver: Deliver,
+        wake: Callable[[], None],
+        last_number: int = 0,
+    ) -> None:
+        """Prepare the connection.
+
+        Args:
+            options: The source's keys.
+            client_id: The client's id.
+            password: The password of the user.
+            context: For TLS; None: plain text.
+            deliver: Called in the thread with each message.
+            wake: Called in the thread when the connection is lost.
+            last_number: The last packet identifier of the connection before: a late acknowledgement
+                of that one never fits this one.
+
+        """
+        self._options, self._client_id, self._password, self._context = options, client_id, password, context
+        self._deliver, self._wake = deliver, wake
+        self._condition = threading.Condition()
+        self._client: _Client | None = None
+        self._thread: threading.Thread | None = None
+        self._closing = False
+        self._failure = ""
+        self._connack: ReasonCode | None = None
+        self._subacks: dict[int, Sequence[ReasonCode]] = {}
+        self._acks: dict[int, ReasonCode] = {}
+        self._in_flight: set[int] = set()
+        """The messages of the present writes, acknowledged or not."""
+        self._limits: dict[str, Any] = {}
+        self.last_number = last_number
+        self._pinged_ns = 0
+        self._pings = self._pongs = 0
+        self.version: MQTTProtocolVersion = MQTTv5
+
+    @property
+    def peer(self) -> Address:
+        """Host and port of the broker."""
+        return self._options.address
+
+    # -- opening -------------------------------------------------------------------------------------------------------
+
+    def open(self, version: MQTTProtocolVersion, filters: Iterable[str], until_s: float) -> list[str]:
+        """Connect and subscribe.
+
+        Args:
+            version: The version of MQTT.
+            filters: What to subscribe to.
+            until_s: When to give up, s of CLOCK_MONOTONIC.
+
+        Returns:
+            The filters that the broker refuses.
+
+        Raises:
+            UnsupportedVersionError: The broker does not know the version.
+            ConnectorError: The broker cannot be reached, or refuses the client.
+
+        """
+        self.version = version
+        opened = self._connected_socket()
+        client = self._client = _Client(opened, self._client_id, version, self.last_number)
+        client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
+        client.on_subscribe, client.on_publish = self._on_subscribe, self._on_publish
+        client.on_message, client.on_pong = self._on_message, self._on_pong
+        client.on_socket_register_write = lambda *_: None  # the thread alone writes, so that packets never mix
+        client.max_inflight_messages_set(0)  # this object counts them
+        if self._options.username is not None:
+            client.username_pw_set(self._options.username, self._password)
+        given: dict[str, Any] = {"clean_start": True} if version == MQTTv5 else {}
+        try:
+            client.connect(self.peer.host, self.peer.port, self._options.keep_alive_s, **given)
+        except (OSError, ValueError) as error:
+            opened.close()
+            raise ConnectorError(f"cannot connect to {self.peer}: {error}") from None
+        self._thread = threading.Thread(target=self._run, args=(client,), name="mqtt", daemon=True)
+        self._thread.start()
+        self._wait(lambda: self._connack is not None, until_s, "to CONNECT")
+        assert self._connack is not None  # noqa: S101 - for the type checker
+        if self._connack.is_failure:
+            if str(self._connack) == _UNSUPPORTED:
+                raise UnsupportedVersionError(f"{self.peer} does not know this version of MQTT: set version")
+            raise ConnectorError(f"{self.peer} refuses the connection: {self._refusal(self._connack)}")
+        if self._options.retain and not self._limits.get("RetainAvailable", 1):
+            raise ConnectorError(f"{self.peer} keeps no messages: remove retain = true")
+        refused = self._subscribe(client, list(filters), until_s)
+        self.ping()  # what the broker has kept comes before the answer
+        return refused
+
+    def _connected_socket(self) -> socket.socket:
+        peer, timeout_s = self.peer, self._options.timeout / 1000
+        try:
+            opened = tcp.connect(tcp.look_up(peer.host, peer.port), timeout_s)
+        except TimeoutError:
+            raise ConnectorError(f"no answer within {self._options.timeout} ms from {peer}") from None
+        except OSError as error:
+            raise ConnectorError(f"cannot connect to {peer}: {error.strerror or error}") from None
+        if self._context is None:
+            return opened
+        try:
+            opened.settimeout(timeout_s)
+            return self._context.wrap_socket(opened, server_hostname=peer.host)
+        except TimeoutError:
+            opened.close()
+            raise ConnectorError(
+                f"no answer within {self._options.timeout} ms from {peer} to the TLS handshake"
+            ) from None
+        except OSError as error:
+            opened.close()
+            raise ConnectorError(f"{peer}: {_tls(error)}") from None
+
+    def _subscribe(self, client: Client, filters: list[str], until_s: float) -> list[str]:
+        asked: dict[int, list[str]] = {}
+        for at in range(0, len(filters), MAX_FILTERS):
+            part = filters[at : at + MAX_FILTERS]
+            qos = self._options.qos
+            if self.version == MQTTv5:
+                _, number = client.subscribe([(one, SubscribeOptions(qos)) for one in part])
+            else:
+                _, number = client.subscribe([(one, qos) for one in part])
+            if number is None:
+                raise ConnectorError(self._failure or f"the connection to {self.peer} was lost")
+            asked[number] = part
+        self._wait(lambda: asked.keys() <= self._subacks.keys(), until_s, "to SUBSCRIBE")
+        refused: list[str] = []
+        for number, part in asked.items():
+            codes = self._subacks[number]
+            if len(codes) != len(part):
+                raise ConnectorError(f"{self.peer} broke the protocol: it answered {len(codes)} of {len(part)} filters")
+            refused += [one for one, code in zip(part, codes, strict=True) if code.is_failure]
+        return refused
+
+    def close(self) -> None:
+        """Close the connection; it may be called more than once."""
+        self._closing = True
+        client, thread = self._client, self._thread
+        if client is None:
+            return
+        self.last_number = client.last_number
+        if thread is not None and thread.is_alive() and not self._failure:
+            client.disconnect()
+            thread.join(CLOSE_S)
+        _close_socket(client)
+        if thread is not None:
+            thread.join(CLOSE_S)
+        # The client refers to this object, and frees its sockets when it is freed.
+        client.on_connect = client.on_disconnect = client.on_subscribe = client.on_publish = client.on_message = None
+        client.on_pong = lambda: None
+        self._client = None
+
+    # -- the connection as it is ---------------------------------------------------------------------------------------
+
+    def check(self) -> None:
+        """Raise ConnectorError if the connection is lost, or the broker does not answer in time."""
+        if self._failure:
+            raise ConnectorError(self._failure)
+        now_ns, timeout_ns = time.monotonic_ns(), self._options.timeout * 1_000_000
+        if self._pongs < self._pings:
+            if now_ns - self._pinged_ns > timeout_ns:
+                raise ConnectorError(f"no answer within {self._options.timeout} ms from {self.peer}")
+        elif now_ns - self._pinged_ns > timeout_ns // 2:
+            self.ping()
+
+    def ping(self) -> int:
+        """Send a PINGREQ; return its number, for :meth:`answered`."""
+        if self._client is not None and self._pongs == self._pings:
+            self._pings += 1
+            self._pinged_ns = time.monotonic_ns()
+            self._client.ping()
+        return self._pings
+
+    def answered(self, number: int) -> bool:
+        """Return whether a PINGREQ was answered, or the connection is lost."""
+        return self._pongs >= number or bool(self._failure)
+
+    # -- publishing ----------------------------------------------------------------------------------------------------
+
+    def fits(self, publication: Publication) -> bool:
+        """Return whether the broker accepts a message of this size."""
+        size = HEAD_BYTES + len(publication.topic.encode()) + len(publication.payload)
+        return bool(size <= self._limits.get("MaximumPacketSize", size))
+
+    def await_room(self, until_s: float) -> None:
+        """Wait until few enough messages are not acknowledged; ConnectorError if that takes too long."""
+        most = min(MAX_IN_FLIGHT, self._limits.get("ReceiveMaximum", MAX_IN_FLIGHT))
+        self._wait(lambda: len(self._in_flight - self._acks.keys()) < most, until_s, "to PUBLISH")
+
+    def publish(self, publication: Publication) -> int | None:
+        """Publish a message, without waiting.
+
+        Returns:
+            Its number, for :meth:`outcome`; None if it has QoS 0.
+
+        Raises:
+            ConnectorError: The connection is lost, and nothing was sent.
+
+        """
+        client = self._client
+        if client is None or self._failure:
+            raise ConnectorError(self._failure or f"not connected to {self.peer}")
+        properties = None
+        qos = min(publication.qos, self._limits.get("MaximumQoS", 1))
+        if self.version == MQTTv5 and not publication.retain:
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            properties.MessageExpiryInterval = max(1, self._options.timeout // 1000)  # no command comes late
+        info = client.publish(publication.topic, publication.payload, qos, publication.retain, properties)
+        if info.rc == MQTTErrorCode.MQTT_ERR_NO_CONN:
+            raise ConnectorError(self._failure or f"the connection to {self.peer} was lost")
+        if not qos:
+            return None
+        self._in_flight.add(info.mid)
+        return info.mid
+
+    def wait_acknowledged(self, numbers: Iterable[int], until_s: float) -> None:
+        """Wait until messages are acknowledged; ConnectorError if that does not happen in time."""
+        wanted = set(numbers)
+        self._wait(lambda: wanted <= self._acks.keys(), until_s, "to PUBLISH")
+
+    def outcome(self, number: int, topic: str, *, retain: bool) -> str | None:
+        """Return "" if the broker has taken a message, or why it refuses it; None: no answer."""
+        code = self._acks.get(number)
+        if code is None:
+            return None
+        if code.is_failure:
+            return f"the broker refuses it: {code}"
+        if code.value == _NO_SUBSCRIBERS and not retain:
+            return f"nobody subscribes to {topic}: the broker dropped it"
+        return ""
+
+    def forget(self) -> None:
+        """Forget the messages of the last writes, whose numbers will be used again."""
+        with self._condition:
+            self._in_flight.clear()
+            self._acks.clear()
+
+    def wait_processed(self, until_s: float) -> None:
+        """Wait until the broker has read all that was published; ConnectorError if it does not say so."""
+        self._wait(lambda: self._pongs == self._pings, until_s, "")
+        number = self.ping()
+        self._wait(lambda: self._pongs >= number, until_s, "to PUBLISH")
+
+    def _wait(self, condition: Callable[[], bool], until_s: float, to_what: str) -> None:
+        with self._condition:
+            self._condition.wait_for(lambda: condition() or self._failure, max(0.0, until_s - time.monotonic()))
+            if condition():
+                return
+        raise ConnectorError(
+            self._failure or f"no answer within {self._options.timeout} ms from {self.peer} {to_what}".rstrip()
+        )
+
+    # -- in the thread -------------------------------------------------------------------------------------------------
+
+    def _run(self, client: _Client) -> None:
+        why = ""
+        try:
+            while not self._closing and client.loop(_TURN_S) == MQTTErrorCode.MQTT_ERR_SUCCESS:
+                pass
+        except Exception as error:  # noqa: BLE001  paho raises all kinds for wrong packets
+            why = f"{self.peer} sent what cannot be read: {type(error).__name__}: {printable(str(error))[:200]}"
+        _close_socket(client)
+        self._fail(why or self._why(client))
+
+    def _why(self, client: _Client) -> str:
+        if client.violation:
+            return f"{self.peer} broke the protocol: {client.violation}"
+        if client.tls_error is not None:
+            return f"{self.peer}: {_tls(client.tls_error)}"
+        if self._connack is None:
+            missing = "TLS there (mqtts://)" if self._context is None else "a client certificate (certificate, key)"
+            return f"{self.peer} closed the connection before it accepted the login: it may expect {missing}"
+        return f"the connection to {self.peer} was lost"
+
+    def _fail(self, why: str) -> None:
+        with self._condition:
+            self._failure = self._failure or why
+            self._condition.notify_all()
+        self._wake()
+
+    def _on_connect(
+        self, _client: Client, _data: Any, _flags: ConnectFlags, code: ReasonCode, properties: Properties | None
+    ) -> None:
+        self._limits = dict(vars(properties)) if properties is not None else {}
+        with self._condition:
+            self._connack = code
+            self._condition.notify_all()
+
+    def _on_disconnect(
+        self, _client: Client, _data: Any, flags: DisconnectFlags, code: ReasonCode, _properties: Properties | None
+    ) -> None:
+        if flags.is_disconnect_packet_from_server:
+            self._fail(f"{self.peer} ended the connection: {self._refusal(code)}")
+
+    def _on_subscribe(
+        self, _client: Client, _data: Any, number: int, codes: Sequence[ReasonCode], _properties: Properties | None
+    ) -> None:
+        with self._condition:
+            self._subacks[number] = codes
+            self._condition.notify_all()
+
+    def _on_publish(
+        self, _client: Client, _data: Any, number: int, code: ReasonCode, _properties: Properties | None
+    ) -> None:
+        with self._condition:
+            self._acks[number] = code
+            self._condition.notify_all()
+
+    def _on_message(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
+        with suppress(UnicodeDecodeError):  # a topic that is no text is none of ours
+            self._deliver(message.topic, bytes(message.payload), retained=message.retain)
+
+    def _on_pong(self) -> None:
+        with self._condition:
+            self._pongs = min(self._pongs + 1, self._pings)
+            self._condition.notify_all()
+        self._wake()
+
+    def _refusal(self, code: ReasonCode) -> str:
+        if code.value in _LOGIN:
+            return f"{code}: check username, password_file, and the accounts of the broker"
+        if code.value == _TAKEN_OVER:
+            return f"another client has connected as {self._client_id}: give one of them another client_id"
+        return printable(str(code))
+
+
+def version_of(name: str) -> MQTTProtocolVersion:
+    """Return paho's number of a version."""
+    return MQTTv311 if name == "3.1.1" else MQTTv5
+
+
+def _close_socket(client: Client) -> None:
+    made = client.socket()
+    if made is not None:
+        with suppress(OSError):
+            made.close()
+
+
+def _tls(error: OSError) -> str:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is not trusted ({error.verify_message}): check ca, and the host's name in url"
+    if isinstance(error, ssl.SSLError):
+        if "_ALERT_" in (error.reason or ""):
+            return f"it refuses our TLS ({error.reason}): check certificate and key, which it may require"
+        return f"the TLS handshake failed ({error.reason or 'it ended the connection'}): check the port of url"
+    return f"it ended the TLS handshake ({error.strerror or error}): check the port of url"

@@ -1,0 +1,107 @@
+"""The keys of a source with ``connector = "mqtt"``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Literal
+from urllib.parse import urlsplit
+
+import msgspec
+
+from shmio.config import Address
+
+PORT: Final = 1883
+TLS_PORT: Final = 8883
+_Age = Annotated[int, msgspec.Meta(ge=0, le=86_400_000)]
+_Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
+_Texts = Annotated[list[_Text], msgspec.Meta(min_length=1, max_length=100)]
+
+
+class Will(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """A topic that says whether a device is there, which is usually the last will of the device."""
+
+    topic: _Text
+    """The topic, with a path if its payload is JSON."""
+    good: _Texts = msgspec.field(default_factory=lambda: ["online", "true", "1", "on"])
+    """The texts that say that it is there; every other one says that it is not."""
+    match: _Text | _Texts = "**"
+    """Patterns of the registers of the device."""
+
+    @property
+    def patterns(self) -> list[str]:
+        """The patterns as a list."""
+        return [self.match] if isinstance(self.match, str) else self.match
+
+
+class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """Address of the broker, and what counts as a good value; ValueError for keys that contradict."""
+
+    url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
+    timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
+    """Milliseconds for connecting, for each answer of the broker, and for the writes of a cycle."""
+    version: Literal["auto", "5", "3.1.1"] = "auto"
+    """Version of MQTT; auto: 5, and 3.1.1 if the broker does not know that."""
+    client_id: Annotated[str, msgspec.Meta(min_length=1, max_length=128)] | None = None
+    keep_alive_s: Annotated[int, msgspec.Meta(ge=5, le=3600)] = 30
+    qos: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
+    """QoS of the subscriptions."""
+    write_qos: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
+    retain: bool = False
+    """Whether the broker keeps what is written."""
+    max_age_ms: _Age | dict[_Text, _Age] | None = None
+    """Milliseconds after which the last message is too old, for all registers or by pattern; 0: never."""
+    will: _Text | Annotated[list[Will], msgspec.Meta(max_length=1000)] = msgspec.field(default_factory=list)
+    time: _Text | None = None
+    """Path of the source time in JSON payloads."""
+    texts: tuple[_Text, _Text] = ("false", "true")
+    """What is written for a BOOL as text: for false, for true."""
+    templates: Annotated[dict[_Text, str], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=dict)
+    """The JSON into which written values are set, by topic; without one it is an empty object."""
+    rebirth: bool = True
+    """Whether Sparkplug nodes are asked for their births."""
+    max_payload_bytes: Annotated[int, msgspec.Meta(ge=100, le=1 << 24)] = 1 << 20
+    """The largest payload that is read."""
+    username: Annotated[str, msgspec.Meta(min_length=1, max_length=256)] | None = None
+    password_file: str | None = None
+    ca: str | None = None
+    certificate: str | None = None
+    key: str | None = None
+    insecure: bool = False
+    """Allow plain text beyond loopback."""
+
+    def __post_init__(self) -> None:
+        parts = urlsplit(self.url)
+        try:
+            port = parts.port
+        except ValueError:
+            port = 0
+        bare = not (parts.path.strip("/") or parts.query or parts.fragment)
+        if parts.scheme not in ("mqtt", "mqtts") or not parts.hostname or port == 0 or "@" in parts.netloc or not bare:
+            raise ValueError(f"url: expected mqtt://HOST:PORT or mqtts://HOST:PORT, without a user, found {self.url!r}")
+        for name in ("ca", "certificate", "key"):
+            if getattr(self, name) is not None and not self.tls:
+                raise ValueError(f"{name}: has no effect without TLS: write url = 'mqtts://…'")
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate: give both certificate and key, or neither")
+        if self.password_file is not None and self.username is None:
+            raise ValueError("username: set it, because password_file holds the password of this user")
+        if not (self.tls or self.address.loopback or self.insecure):
+            raise ValueError(
+                f"url: {self.address} would get plain text over the network; that needs mqtts://, or insecure = true "
+                "beside it"
+            )
+
+    @property
+    def tls(self) -> bool:
+        """Whether the connection is encrypted."""
+        return urlsplit(self.url).scheme == "mqtts"
+
+    @property
+    def address(self) -> Address:
+        """Host and port of the broker."""
+        parts = urlsplit(self.url)
+        return Address(parts.hostname or "", parts.port or (TLS_PORT if self.tls else PORT))
+
+    @property
+    def wills(self) -> list[Will]:
+        """The topics that say whether a device is there."""
+        return [Will(topic=self.will)] if isinstance(self.will, str) else self.will

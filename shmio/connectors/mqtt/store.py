@@ -1,0 +1,306 @@
+"""The newest messages of all topics of a layout, and the image that they give."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from shmio.connectors.mqtt import json_path
+from shmio.connectors.mqtt.address import Address, Metric, Place, parse
+from shmio.connectors.mqtt.faults import ValueFaultError
+from shmio.connectors.mqtt.json_path import Steps
+from shmio.connectors.mqtt.options import MqttOptions
+from shmio.connectors.mqtt.topic import Message, Origin, Topic
+from shmio.connectors.mqtt.values import Fitting
+from shmio.connectors.mqtt.watch import Watch
+from shmio.connectors.register_image import RegisterImage
+from shmio.errors import ConfigError, ConnectorError, PathError, ValueRangeError
+from shmio.layout.glob import Glob
+from shmio.layout.model import Layout
+from shmio.layout.values.codec import Value
+from shmio.logs import LogRateLimit
+from shmio.model.statuses import (
+    BAD_OUT_OF_RANGE,
+    BAD_TIMEOUT,
+    BAD_WAITING_FOR_INITIAL_DATA,
+    GOOD,
+    UNCERTAIN_LAST_USABLE_VALUE,
+    quality_of,
+)
+from shmio.model.values import Quality
+
+log = logging.getLogger("shmio.source.mqtt")
+log.addFilter(LogRateLimit())
+
+_NONE: Final = -1
+"""No status yet."""
+
+
+class Group:
+    """Registers with one origin, one limit of age, and the same wills."""
+
+    def __init__(self, origin: Origin, max_age_ns: int, watches: tuple[Watch, ...]) -> None:
+        self.origin, self.max_age_ns, self.watches = origin, max_age_ns, watches
+        self.registers: list[int] = []
+        self.shown = _NONE
+        """The status that the image shows of all registers; GOOD: each has one of its own."""
+        self.seen: Message | None = None
+        """The message that the image shows."""
+
+    def state(self, now_ns: int) -> int:
+        """Return the status that all registers have at a time of CLOCK_MONOTONIC; GOOD: each its own."""
+        message = self.origin.message
+        for watch in self.watches:
+            if fault := watch.fault(message):
+                return fault
+        if fault := self.origin.fault:
+            return fault
+        if message is None:
+            return BAD_WAITING_FOR_INITIAL_DATA
+        if self.max_age_ns:
+            if now_ns - message.monotonic_ns > self.max_age_ns:
+                return BAD_TIMEOUT
+            if message.retained:  # nobody knows how old it is
+                return UNCERTAIN_LAST_USABLE_VALUE
+        return GOOD
+
+
+class Store:
+    """All origins of a layout. One thread delivers messages, another makes images."""
+
+    def __init__(self, layout: Layout, options: MqttOptions) -> None:
+        """Read the addresses of a layout; ConfigError if one is wrong, or does not fit its register."""
+        self.layout, self._options = layout, options
+        self._changed = threading.Condition()
+        """Locks all below, and is notified with each message."""
+        self.addresses: list[Address] = []
+        self.fittings: list[Fitting] = []
+        self._topics: dict[str, Topic] = {}
+        self._watches = [Watch(will) for will in options.wills]
+        self._watched: dict[str, list[Watch]] = {}
+        for watch in self._watches:
+            self._watched.setdefault(watch.place.topic, []).append(watch)
+        self._groups: dict[tuple[object, ...], Group] = {}
+        self._group_of: list[Group] = []
+        self._ages, self._time = _Ages(options), _time_path(options)
+        self._image = RegisterImage(layout) if layout.status_offset is not None else None
+        self._codes = [GOOD] * len(layout.registers)
+        self._order = 0  # goes on from one connection to the next
+        self._expected: dict[str, bytes] = {}
+        """Payloads that were published on topics that are also read, and have not come back."""
+        for index in range(len(layout.registers)):
+            self._add(index)
+
+    def _add(self, index: int) -> None:
+        register = self.layout.registers[index]
+        try:
+            address = parse(register.address)
+            self.fittings.append(Fitting(register, self._options.texts))
+            for place in (address.source, address.target):
+                if register.dims and isinstance(place, Place) and place.steps is None:
+                    raise ValueError(f"an array is JSON: write {place.topic} $, or a path in it such as $.values")
+            source = address.source
+            if register.writable and isinstance(source, Place) and source.steps is not None and not address.target:
+                raise ValueError(
+                    "say where to publish what is written: append such as -> plant/robot/set $.pos, because it is not "
+                    "known which other members that JSON must have"
+                )
+        except ValueError as error:
+            raise ConfigError(f"layout: {register.path}: {error}") from None
+        self.addresses.append(address)
+        origin = self._origin(address, index)
+        watches = tuple(watch for watch in self._watches if watch.covers(register.path))
+        age_ns = self._ages.of(register.path, needed=not watches and isinstance(address.source, Place))
+        group = self._groups.setdefault((id(origin), age_ns, watches), Group(origin, age_ns, watches))
+        group.registers.append(index)
+        self._group_of.append(group)
+
+    def _origin(self, address: Address, index: int) -> Origin:
+        source = address.source
+        if isinstance(source, Metric):
+            raise ConfigError(f"layout: {self.layout.registers[index].path}: Sparkplug is not supported yet")
+        new = Topic(source.topic, self._time, self._options.max_payload_bytes)
+        topic = self._topics.setdefault(source.topic, new)
+        topic.places[index] = source.steps
+        return topic
+
+    def describe(self) -> str:
+        """Return what is read, for the log."""
+        return f"{len(self._topics)} topics"
+
+    @property
+    def filters(self) -> list[str]:
+        """What to subscribe to."""
+        return list(dict.fromkeys((*self._topics, *self._watched)))
+
+    # -- the thread that receives --------------------------------------------------------------------------------------
+
+    def take(self, topic: str, payload: bytes, *, retained: bool) -> None:
+        """Take a message."""
+        with self._changed:
+            self._order += 1
+            message = Message(payload, retained, self._order, time.monotonic_ns(), time.time_ns())
+            for watch in self._watched.get(topic, ()):
+                watch.take(message)
+            if (found := self._topics.get(topic)) is not None:
+                found.message = message
+            if self._expected.get(topic) == payload:
+                del self._expected[topic]
+            self._changed.notify_all()
+
+    # -- the poll thread -----------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Forget all messages: all registers wait for their first value."""
+        with self._changed:
+            for topic in self._topics.values():
+                topic.reset()
+            for watch in self._watches:
+                watch.reset()
+            self._expected.clear()
+
+    def refuse(self, topic: str) -> None:
+        """Note that the broker refuses a subscription."""
+        log.warning("the broker refuses the subscription to %s", topic)
+        with self._changed:
+            if topic in self._topics:
+                self._topics[topic].refused = True
+            for watch in self._watched.get(topic, ()):
+                watch.refuse()
+
+    def image(self, now_ns: int) -> bytes:
+        """Return the image of the newest messages at a time of CLOCK_MONOTONIC."""
+        image = self._image
+        if image is None:
+            raise ConnectorError("the layout has no status area")
+        with self._changed:
+            for group in self._groups.values():
+                state, message = group.state(now_ns), group.origin.message
+                if state != group.shown or message is not group.seen:
+                    self._show(image, group, state)
+                    group.shown, group.seen = state, message
+            return bytes(image)
+
+    def _show(self, image: RegisterImage, group: Group, state: int) -> None:
+        origin = group.origin
+        if quality_of(state) is Quality.BAD:
+            source_ns = origin.message.utc_ns if origin.message is not None else 0
+            for index in group.registers:
+                image.fail(index, state, source_ns)
+                self._codes[index] = GOOD
+            return
+        since = group.seen.order if group.seen is not None and group.shown == state else 0
+        for index in group.registers:
+            if origin.order_of(index) <= since:
+                continue
+            try:
+                value, source_ns, code = self._find(index, origin)
+            except ValueFaultError as error:
+                image.fail(index, error.code, error.source_ns)
+                self._note(index, error.code, str(error))
+            else:
+                fault = image.put(index, value, source_ns, code or state)
+                self._note(index, BAD_OUT_OF_RANGE if fault else GOOD, fault)
+
+    def _find(self, index: int, origin: Origin) -> tuple[Value, int, int]:
+        """Return the value of a register, its source time and its status; ValueFaultError."""
+        found = origin.find(index)
+        fitting = self.fittings[index]
+        try:
+            value = fitting.from_text(found.value) if found.text else fitting.from_json(found.value)
+        except ValueFaultError as error:
+            error.source_ns = found.source_ns
+            raise
+        return value, found.source_ns, found.code
+
+    def _note(self, index: int, code: int, reason: str) -> None:
+        """Log the fault of a register's value when it begins."""
+        if code != self._codes[index] and code != GOOD:
+            log.warning("%s: %s", self.layout.registers[index].path, reason)
+        self._codes[index] = code
+
+    # -- for writes ----------------------------------------------------------------------------------------------------
+
+    def offline(self, index: int) -> str:
+        """Return why a command to a register would reach nobody; "" if that is not known."""
+        with self._changed:
+            group = self._group_of[index]
+            return next((watch.problem for watch in group.watches if watch.problem), group.origin.offline)
+
+    def present(self, index: int) -> Value:
+        """Return the present value of a register; ValueRangeError if there is none."""
+        with self._changed:
+            group = self._group_of[index]
+            if group.state(time.monotonic_ns()) == GOOD:
+                try:
+                    return self._find(index, group.origin)[0]
+                except ValueFaultError:
+                    pass
+        raise ValueRangeError("there is no present value")
+
+    def expect(self, topic: str, payload: bytes) -> None:
+        """Expect a payload that is about to be published, if its topic is also read."""
+        with self._changed:
+            if topic in self._topics and not self._topics[topic].refused:
+                self._expected[topic] = payload
+
+    def await_expected(self, until_s: float) -> None:
+        """Wait until what is expected has come, at most until a time of CLOCK_MONOTONIC in s."""
+        self.wait(lambda: not self._expected, until_s)
+        with self._changed:
+            self._expected.clear()
+
+    @property
+    def complete(self) -> bool:
+        """Whether all topics have a message."""
+        return all(one.message is not None or one.refused for one in self._topics.values()) and all(
+            watch.there is not None for watch in self._watches
+        )
+
+    def wait(self, condition: Callable[[], bool], until_s: float) -> bool:
+        """Wait until a condition of the messages holds, at most until a time of CLOCK_MONOTONIC in s."""
+        with self._changed:
+            return self._changed.wait_for(condition, max(0.0, until_s - time.monotonic()))
+
+    def wake(self) -> None:
+        """Wake a thread that waits for a message."""
+        with self._changed:
+            self._changed.notify_all()
+
+
+class _Ages:
+    """The limits of age, by pattern."""
+
+    def __init__(self, options: MqttOptions) -> None:
+        given = options.max_age_ms
+        rules = given if isinstance(given, dict) else {} if given is None else {"**": given}
+        try:
+            self._rules = [(Glob(pattern), age_ms * 1_000_000) for pattern, age_ms in rules.items()]
+        except PathError as error:
+            raise ConfigError(f"max_age_ms: {error}") from None
+
+    def of(self, path: str, *, needed: bool) -> int:
+        """Return the limit of a register in ns, 0: none; ConfigError if it is needed and not given."""
+        for glob, age_ns in self._rules:
+            if glob.matches(path):
+                return age_ns
+        if needed:
+            raise ConfigError(
+                f"max_age_ms: {path} would stay good for ever after its device has died: say after how many ms its "
+                "last message is too old (0: never), or name the topic of the device's last will with will"
+            )
+        return 0
+
+
+def _time_path(options: MqttOptions) -> Steps | None:
+    if options.time is None:
+        return None
+    try:
+        if not options.time.startswith("$"):
+            raise ValueError(f"{options.time!r} is no path: write such as $.timestamp")
+        return json_path.parse(options.time)
+    except ValueError as error:
+        raise ConfigError(f"time: {error}") from None

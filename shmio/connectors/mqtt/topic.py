@@ -1,0 +1,146 @@
+"""Where registers have their values: the newest message of a topic."""
+
+from __future__ import annotations
+
+import datetime
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from typing import Any, Final, NamedTuple
+
+from shmio.connectors.mqtt import json_path
+from shmio.connectors.mqtt.faults import ValueFaultError
+from shmio.connectors.mqtt.json_path import Steps
+from shmio.connectors.mqtt.values import decode_json
+from shmio.model.statuses import BAD_OUT_OF_RANGE, BAD_USER_ACCESS_DENIED, GOOD
+
+_MAX_NS: Final = (1 << 63) - 1
+_UNITS: Final = ((1e11, 10**9), (1e14, 10**6), (1e17, 10**3))
+"""Up to which number a time has which unit, in ns: seconds, ms, µs; a larger one is in ns."""
+
+
+class Message(NamedTuple):
+    """A message; ``order`` counts the messages of the connection."""
+
+    payload: bytes
+    retained: bool
+    """Whether the broker had kept it: when it was published is unknown."""
+    order: int
+    monotonic_ns: int
+    utc_ns: int
+
+
+class Found(NamedTuple):
+    """What a message has for a register: bytes of text, or a value as in JSON."""
+
+    value: Any
+    source_ns: int
+    code: int = GOOD
+    text: bool = False
+    """Whether the value is the payload, which is text."""
+
+
+class Origin(ABC):
+    """What registers have their values of: a topic, or a device of Sparkplug."""
+
+    message: Message | None = None
+    """The newest message; None if there is none."""
+
+    @property
+    @abstractmethod
+    def fault(self) -> int:
+        """Why no register has a good value; GOOD if there is no reason."""
+
+    @property
+    def offline(self) -> str:
+        """Why a command would reach nobody; "" if that is not known."""
+        return ""
+
+    @abstractmethod
+    def order_of(self, index: int) -> int:
+        """Return the order of the message with the newest value of a register."""
+
+    @abstractmethod
+    def find(self, index: int) -> Found:
+        """Return what the newest message has for a register; ValueFaultError if it has nothing."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget all messages."""
+
+
+class Topic(Origin):
+    """A topic with text or JSON."""
+
+    def __init__(self, name: str, time: Steps | None, max_bytes: int) -> None:
+        """Create it: ``time`` is the path of the source time, ``max_bytes`` the size of the largest payload."""
+        self.name = name
+        self.places: dict[int, Steps | None] = {}
+        """The path in the JSON of each register; None: the payload is its text."""
+        self.refused = False
+        """Whether the broker refuses the subscription."""
+        self._time, self._max_bytes = time, max_bytes
+        self._document: Any = None
+        self._decoded: Message | None = None
+
+    @property
+    def fault(self) -> int:
+        """Why no register has a good value."""
+        return BAD_USER_ACCESS_DENIED if self.refused else GOOD
+
+    def order_of(self, index: int) -> int:  # noqa: ARG002  a message has all of them
+        """Return the order of the newest message."""
+        return self.message.order if self.message is not None else 0
+
+    def find(self, index: int) -> Found:
+        """Return what the newest message has for a register."""
+        message = self.message
+        assert message is not None  # noqa: S101 - as the group's state says
+        if len(message.payload) > self._max_bytes:
+            raise ValueFaultError(
+                BAD_OUT_OF_RANGE, f"a payload of {len(message.payload)} bytes is larger than max_payload_bytes"
+            )
+        steps = self.places[index]
+        if steps is None:
+            return Found(message.payload, message.utc_ns, text=True)
+        document = self._json(message)
+        return Found(json_path.extract(document, steps), self._source_ns(document) or message.utc_ns)
+
+    def _json(self, message: Message) -> Any:
+        if self._decoded is not message:
+            try:
+                self._document = decode_json(message.payload)
+            except ValueFaultError as error:
+                self._document = error
+            self._decoded = message
+        if isinstance(self._document, ValueFaultError):
+            raise self._document
+        return self._document
+
+    def _source_ns(self, document: Any) -> int:
+        if self._time is not None:
+            with suppress(ValueFaultError):
+                return time_ns(json_path.extract(document, self._time))
+        return 0
+
+    def reset(self) -> None:
+        """Forget the message."""
+        self.message = self._document = self._decoded = None
+        self.refused = False
+
+
+def time_ns(found: Any) -> int:
+    """Return a time of JSON as ns since 1970, 0 if it is none: a number of s, ms, µs or ns, or ISO 8601."""
+    if isinstance(found, str):
+        try:
+            at = datetime.datetime.fromisoformat(found[:64])
+            at = at if at.tzinfo is not None else at.replace(tzinfo=datetime.UTC)
+            since = at - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+        except (ValueError, OverflowError):
+            return 0
+        found_ns = (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
+    elif isinstance(found, int | float) and not isinstance(found, bool) and 0 < found < _MAX_NS:
+        unit_ns = next((unit for most, unit in _UNITS if found < most), 1)
+        found_ns = found * unit_ns if isinstance(found, int) else round(found * unit_ns)
+    else:
+        return 0
+    return found_ns if 0 < found_ns <= _MAX_NS else 0

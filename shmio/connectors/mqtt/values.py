@@ -1,0 +1,198 @@
+"""Fits texts and JSON values to registers, and values of registers to texts and JSON."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import msgspec
+
+from shmio.connectors.mqtt.faults import ValueFaultError
+from shmio.layout import model
+from shmio.layout.model import Register
+from shmio.layout.values.codec import Scalar, Value, flatten, nest
+from shmio.logs import printable
+from shmio.model.statuses import (
+    BAD_DECODING_ERROR,
+    BAD_INDEX_RANGE_NO_DATA,
+    BAD_NO_DATA,
+    BAD_OUT_OF_RANGE,
+    BAD_TYPE_MISMATCH,
+)
+
+_REALS: Final = frozenset({"REAL", "LREAL"})
+_TEXTS: Final = frozenset({"STRING", "WSTRING"})
+_NUMBER: Final = re.compile(r"[+-]?(?:[0-9]{1,400}(?:\.[0-9]{0,400})?|\.[0-9]{1,400})(?:[eE][+-]?[0-9]{1,4})?")
+_WHOLE: Final = re.compile(r"[+-]?[0-9]{1,20}")
+_NO_NUMBER: Final = {"nan": math.nan, "inf": math.inf, "+inf": math.inf, "-inf": -math.inf}
+_BOOLS: Final = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
+_EXACT: Final = 1 << 53
+"""Up to here, every whole number is a float of its own."""
+SHOWN: Final = 40
+"""Characters of a wrong value in a message."""
+
+
+class Fitting:
+    """Converts between what messages have and the values of a register."""
+
+    def __init__(self, register: Register, texts: Sequence[str] = ("false", "true")) -> None:
+        """Take the register, and the texts for false and true.
+
+        Raises:
+            ValueError: Messages cannot have its type.
+
+        """
+        base = register.element.base
+        if base not in (*_REALS, *_TEXTS, *model.INTEGERS, "BOOL"):
+            raise ValueError(f"a {base} cannot be read from MQTT: use BOOL, whole numbers, REAL, LREAL or STRING[n]")
+        self._register, self._base, self._scale, self._texts = register, base, register.scale, texts
+        self._bools = _BOOLS | {texts[0].casefold(): False, texts[1].casefold(): True}
+
+    # -- reading -------------------------------------------------------------------------------------------------------
+
+    def from_text(self, payload: bytes) -> Value:
+        """Return the value of a register for a payload that is plain text.
+
+        Raises:
+            ValueFaultError: It is no such value.
+            ValueRangeError: The register cannot hold it.
+
+        """
+        if not payload:
+            raise ValueFaultError(BAD_NO_DATA, "the payload is empty")
+        try:
+            return self._element(payload.decode())
+        except UnicodeDecodeError:
+            raise ValueFaultError(BAD_DECODING_ERROR, "the payload is not text in UTF-8") from None
+
+    def from_json(self, found: Any) -> Value:
+        """Return the value of a register for a value of JSON; the errors are those of :meth:`from_text`."""
+        register = self._register
+        if not register.dims:
+            return self._element(found)
+        if found is None:
+            raise ValueFaultError(BAD_NO_DATA, "the value is null")
+        if not isinstance(found, list):
+            raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, expected an array")
+        flat = list(_flat(found, len(register.dims)))
+        if len(flat) != register.count:
+            raise ValueFaultError(
+                BAD_INDEX_RANGE_NO_DATA, f"the array has {len(flat)} elements, the register {register.count}"
+            )
+        return nest([self._element(one) for one in flat], register.shape)
+
+    def _element(self, found: Any) -> Scalar:
+        if found is None:
+            raise ValueFaultError(BAD_NO_DATA, "the value is null")
+        base = self._base
+        if base in _TEXTS:
+            if isinstance(found, str):
+                return found
+        elif base == "BOOL":
+            if isinstance(found, bool):
+                return found
+            truth = self._bools.get(str(found).strip().casefold()) if isinstance(found, int | str) else None
+            if truth is not None:
+                return truth
+        else:
+            return self._number(found)
+        raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is no {self._register.type}")
+
+    def _number(self, found: Any) -> int | float:
+        """Return the value of a numeric register."""
+        if isinstance(found, str):
+            found = _parse_number(found.strip())
+        if isinstance(found, bool) or not isinstance(found, int | float):
+            raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is no number")
+        try:
+            if self._base in _REALS:
+                return float(found) if self._scale is None else float(found * self._scale[0] + self._scale[1])
+            if self._scale is not None:
+                return round(found * self._scale[0] + self._scale[1])
+        except (OverflowError, ValueError):  # an infinity, or a whole number beyond all floats
+            raise ValueFaultError(BAD_OUT_OF_RANGE, f"{_show(found)} does not fit a {self._register.type}") from None
+        if isinstance(found, float):
+            if not found.is_integer() or abs(found) > _EXACT:
+                raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is no whole number")
+            return int(found)
+        return found
+
+    # -- writing -------------------------------------------------------------------------------------------------------
+
+    def to_text(self, value: Value) -> bytes:
+        """Return a payload for a value of the register; ValueError if it has none."""
+        plain = self._plain(value)
+        if isinstance(plain, bool):
+            return self._texts[plain].encode()
+        return plain.encode() if isinstance(plain, str) else repr(plain).encode()
+
+    def to_json(self, value: Value) -> Any:
+        """Return what JSON has for a value of the register; ValueError if it has nothing."""
+        register = self._register
+        if register.dims:
+            flat = [self._json(one) for one in flatten(value, register.shape, register.path)]
+            return nest(flat, register.shape)
+        return self._json(value)
+
+    def _json(self, value: Any) -> Any:
+        plain = self._plain(value)
+        if isinstance(plain, float) and not math.isfinite(plain):
+            raise ValueError("JSON has neither NaN nor infinity: write a finite number")
+        return plain
+
+    def _plain(self, value: Any) -> bool | int | float | str:
+        """Return the device's value for that of a register, without the scale."""
+        if value is None:
+            raise ValueError("this is no valid value")
+        if self._scale is None or isinstance(value, str | bool):
+            plain: bool | int | float | str = value
+            return plain
+        number: float = (value - self._scale[1]) / self._scale[0]
+        return int(number) if self._base in model.INTEGERS and number.is_integer() else number
+
+
+def decode_json(payload: bytes) -> Any:
+    """Return the document of a payload; ValueFaultError if it is no JSON."""
+    if not payload:
+        raise ValueFaultError(BAD_NO_DATA, "the payload is empty")
+    try:
+        return msgspec.json.decode(payload)
+    except RecursionError:
+        raise ValueFaultError(BAD_DECODING_ERROR, "the JSON is nested too deeply") from None
+    except (msgspec.MsgspecError, UnicodeDecodeError, ValueError) as error:
+        raise ValueFaultError(BAD_DECODING_ERROR, f"the payload is no JSON: {printable(str(error))[:100]}") from None
+
+
+def _parse_number(text: str) -> int | float:
+    if _WHOLE.fullmatch(text):
+        return int(text)
+    if _NUMBER.fullmatch(text):
+        return float(text)
+    found = _NO_NUMBER.get(text.casefold())
+    if found is None:
+        raise ValueFaultError(BAD_DECODING_ERROR, f"{_show(text)} is no number")
+    return found
+
+
+def _flat(found: Any, depth: int) -> Iterator[Any]:
+    """Yield the elements of lists in lists, as deep as the register has dimensions."""
+    for one in found:
+        if depth > 1 and isinstance(one, list):
+            yield from _flat(one, depth - 1)
+        else:
+            yield one
+
+
+def _show(found: Any) -> str:
+    """Return a wrong value for a message, on one line and shortened."""
+    if isinstance(found, dict):
+        return "an object"
+    if isinstance(found, list):
+        return "an array"
+    if isinstance(found, int) and abs(found) >> 128:
+        return "a very large number"
+    if isinstance(found, str):
+        return printable(repr(found[:SHOWN])) + ("…" if len(found) > SHOWN else "")
+    return str(found)

@@ -1,0 +1,81 @@
+"""Whether a device is there, by the topic of its last will."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from shmio.connectors.mqtt import json_path
+from shmio.connectors.mqtt.address import place
+from shmio.connectors.mqtt.faults import ValueFaultError
+from shmio.connectors.mqtt.options import Will
+from shmio.connectors.mqtt.topic import Message
+from shmio.connectors.mqtt.values import decode_json
+from shmio.errors import ConfigError, PathError
+from shmio.layout.glob import Glob
+from shmio.logs import printable
+from shmio.model.statuses import BAD_NO_COMMUNICATION, BAD_WAITING_FOR_INITIAL_DATA, GOOD
+
+MAX_TEXT: Final = 4096
+
+
+class Watch:
+    """Follows the topic of a will."""
+
+    def __init__(self, will: Will) -> None:
+        """Take the will; ConfigError if its topic or a pattern is wrong."""
+        try:
+            self.place = place(will.topic)
+            self._globs = [Glob(pattern) for pattern in will.patterns]
+        except (ValueError, PathError) as error:
+            raise ConfigError(f"will: {error}") from None
+        self._good = frozenset(text.strip().casefold() for text in will.good)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what the topic said."""
+        self.there: bool | None = None
+        """Whether the device is there; None: the topic has not said it."""
+        self._gone_order = 0
+        self._said = ""
+
+    @property
+    def problem(self) -> str:
+        """Why the device may not be there; "" if it is."""
+        if self.there:
+            return ""
+        said = "has said nothing yet" if self.there is None else f"says {printable(self._said)[:40]!r}"
+        return f"the device is not there: {self.place.topic} {said}"
+
+    def covers(self, path: str) -> bool:
+        """Return whether a register is one of the device."""
+        return any(glob.matches(path) for glob in self._globs)
+
+    def take(self, message: Message) -> None:
+        """Take a message of the topic."""
+        try:
+            self._said = self._text(message.payload)
+            self.there = self._said.strip().casefold() in self._good
+        except ValueFaultError as error:
+            self._said, self.there = str(error), False
+        if not self.there:
+            self._gone_order = message.order
+
+    def refuse(self) -> None:
+        """Note that the broker refuses the subscription, so that nothing is known."""
+        self._said, self.there = "nothing: the broker refuses the subscription", False
+
+    def _text(self, payload: bytes) -> str:
+        if self.place.steps is None or len(payload) > MAX_TEXT:
+            return payload[:MAX_TEXT].decode(errors="replace")
+        found = json_path.extract(decode_json(payload), self.place.steps)
+        return str(found).lower() if isinstance(found, bool) else str(found)
+
+    def fault(self, message: Message | None) -> int:
+        """Return why a message of the device is not valid; GOOD if it is."""
+        if self.there is None:
+            return BAD_WAITING_FOR_INITIAL_DATA
+        if not self.there:
+            return BAD_NO_COMMUNICATION
+        if self._gone_order and message is not None and (message.retained or message.order < self._gone_order):
+            return BAD_WAITING_FOR_INITIAL_DATA  # it is of the time before the device was gone
+        return GOOD

@@ -1,0 +1,69 @@
+"""Which registers a write sets, for devices that take whole values."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator
+
+from shmio.errors import ValueRangeError
+from shmio.layout.model import Layout, Register, bit_positions
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.write import Write, apply, bits_of
+
+
+def touched(layout: Layout, write: Write, present: Callable[[int], Value]) -> Iterator[tuple[int, Value]]:
+    """Yield the registers that a write sets, with their new values.
+
+    Args:
+        layout: The layout of the block.
+        write: The write. It may set some elements of an array, and else only whole registers.
+        present: Returns the present value of an array of which some elements are written;
+            ValueRangeError if it is not known.
+
+    Yields:
+        The index of each register, and its new value.
+
+    Raises:
+        ValueError: The write sets a part of a value, or no register.
+
+    """
+    none = True
+    covered, image = bytearray(layout.size), bytearray(layout.size)
+    apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
+    registers, stop = layout.registers, write.offset + len(write.data)
+    first = bisect_right(registers, write.offset, key=lambda register: register.offset + register.size)
+    for index in range(first, bisect_left(registers, stop, key=lambda register: register.offset)):
+        register = registers[index]
+        wanted = bits_of(register)
+        there = covered[register.offset : register.offset + register.size]
+        share = bytes(a & b for a, b in zip(there, wanted, strict=True))
+        if not any(share):
+            continue
+        none = False
+        if share != wanted:
+            if not _whole_elements(register, share):
+                raise ValueError(f"{register.path}: a message has no parts of a value: write the whole register")
+            try:
+                codec(register, layout.byte_order).encode_into(present(index), image)
+            except ValueRangeError:
+                raise ValueError(
+                    f"{register.path}: the last message does not have the other elements: write the whole array"
+                ) from None
+        apply(write, image)
+        yield index, codec(register, layout.byte_order).decode(image)
+    if none:
+        raise ValueError("no register of the layout is there")
+
+
+def _whole_elements(register: Register, share: bytes) -> bool:
+    """Return whether these bits of a register are whole elements of an array."""
+    if not register.dims:
+        return False
+    if register.type == "BOOL":
+        own = bytearray(len(share))
+        for at, bit in bit_positions(register):
+            own[at] |= 1 << bit
+        return any(a & b for a, b in zip(own, share, strict=True))
+    size, stride = register.element.size, register.element.stride
+    parts = (share[place * stride : place * stride + size] for place in range(register.count))
+    return all(part in (bytes(size), b"\xff" * size) for part in parts)
