@@ -112,19 +112,22 @@ def _message(store: Store, options: MqttOptions, draft: _Draft) -> Publication:
     """Return the message of a draft; ValueError if it cannot be expressed."""
     target = draft.target
     if isinstance(target, Metric):
-        raise ValueError("Sparkplug is not supported yet")
+        topic, payload = store.command(
+            {index: store.fittings[index].to_value(value) for index, value in draft.values.items()}
+        )
+        return Publication(topic, payload, 0, retain=False)  # as the specification demands
     document: Any = None
     payload = b""
     if target.steps is not None and target.topic in options.templates:
         document = msgspec.json.decode(options.templates[target.topic])
     for index, value in draft.values.items():
-        place, fitting = _target(store, index), store.fittings[index]
+        place = _target(store, index)
         assert isinstance(place, Place)  # noqa: S101 - as all of a draft
         try:
             if place.steps is None:
-                payload = fitting.to_text(value)
+                payload = store.fittings[index].to_text(value)
             else:
-                document = json_path.assign(document, place.steps, fitting.to_json(value))
+                document = json_path.assign(document, place.steps, store.fittings[index].to_json(value))
         except ValueError as error:
             raise ValueError(f"{store.layout.registers[index].path}: {error}") from None
     if target.steps is not None:

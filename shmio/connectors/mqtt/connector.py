@@ -15,7 +15,7 @@ from shmio.config.model import MqttTls
 from shmio.config.tls import client_context
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.mqtt.commands import Command, plan
-from shmio.connectors.mqtt.link import Link, UnsupportedVersionError, version_of
+from shmio.connectors.mqtt.link import Link, Publication, UnsupportedVersionError, version_of
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
 from shmio.errors import ConnectorError
@@ -82,12 +82,19 @@ class MqttConnector(Connector):
             self._store.refuse(topic)
         link = self._link
         assert link is not None  # noqa: S101 - for the type checker
+        self._ask(link)
         number = link.ping()
         self._store.wait(
-            lambda: self._store.complete or link.answered(number),
+            lambda: self._store.complete or (not self._store.host and link.answered(number)),
             min(time.monotonic() + FIRST_S, until_s),
         )
         link.check()
+
+    def _ask(self, link: Link) -> None:
+        """Ask Sparkplug nodes for their births, if that is needed."""
+        if self._options.rebirth:
+            for topic, payload in self._store.requests(time.monotonic_ns()):
+                link.publish(Publication(topic, payload, 0, retain=False))
 
     def _open(self, until_s: float) -> list[str]:
         store = self._store
@@ -113,6 +120,7 @@ class MqttConnector(Connector):
         if link is None:
             raise ConnectorError(f"not connected to {self._options.address}")
         link.check()
+        self._ask(link)
         return self._store.image(time.monotonic_ns())
 
     def close(self) -> None:

@@ -396,7 +396,8 @@ class Link:
         if self._connack is None:
             missing = "TLS there (mqtts://)" if self._context is None else "a client certificate (certificate, key)"
             return f"{self.peer} closed the connection before it accepted the login: it may expect {missing}"
-        return f"the connection to {self.peer} was lost"
+        twin = f"; does another client connect as {self._client_id} (client_id)?" if self._options.client_id else ""
+        return f"the connection to {self.peer} was lost{twin}"
 
     def _fail(self, why: str) -> None:
         with self._condition:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 from shmio.connectors.mqtt import json_path
-from shmio.connectors.mqtt.address import Address, Metric, Place, parse
+from shmio.connectors.mqtt.address import NAMESPACE, Address, Metric, Place, parse
 from shmio.connectors.mqtt.faults import ValueFaultError
 from shmio.connectors.mqtt.json_path import Steps
 from shmio.connectors.mqtt.options import MqttOptions
+from shmio.connectors.mqtt.sparkplug import Device, Host
 from shmio.connectors.mqtt.topic import Message, Origin, Topic
 from shmio.connectors.mqtt.values import Fitting
 from shmio.connectors.mqtt.watch import Watch
@@ -33,8 +34,8 @@ from shmio.model.statuses import (
 from shmio.model.values import Quality
 
 log = logging.getLogger("shmio.source.mqtt")
-log.addFilter(LogRateLimit())
 
+_SPARKPLUG: Final = f"{NAMESPACE}/"
 _NONE: Final = -1
 """No status yet."""
 
@@ -74,10 +75,13 @@ class Store:
     def __init__(self, layout: Layout, options: MqttOptions) -> None:
         """Read the addresses of a layout; ConfigError if one is wrong, or does not fit its register."""
         self.layout, self._options = layout, options
+        log.filters[:] = [LogRateLimit()]  # a process has one source
         self._changed = threading.Condition()
         """Locks all below, and is notified with each message."""
         self.addresses: list[Address] = []
         self.fittings: list[Fitting] = []
+        self.host = Host(max_bytes=options.max_payload_bytes)
+        """The nodes of Sparkplug."""
         self._topics: dict[str, Topic] = {}
         self._watches = [Watch(will) for will in options.wills]
         self._watched: dict[str, list[Watch]] = {}
@@ -121,7 +125,7 @@ class Store:
     def _origin(self, address: Address, index: int) -> Origin:
         source = address.source
         if isinstance(source, Metric):
-            raise ConfigError(f"layout: {self.layout.registers[index].path}: Sparkplug is not supported yet")
+            return self.host.origin(source, index)
         new = Topic(source.topic, self._time, self._options.max_payload_bytes)
         topic = self._topics.setdefault(source.topic, new)
         topic.places[index] = source.steps
@@ -129,12 +133,13 @@ class Store:
 
     def describe(self) -> str:
         """Return what is read, for the log."""
-        return f"{len(self._topics)} topics"
+        nodes = f", {len(self.host)} Sparkplug nodes" if self.host else ""
+        return f"{len(self._topics)} topics{nodes}"
 
     @property
     def filters(self) -> list[str]:
         """What to subscribe to."""
-        return list(dict.fromkeys((*self._topics, *self._watched)))
+        return list(dict.fromkeys((*self._topics, *self._watched, *self.host.filters)))
 
     # -- the thread that receives --------------------------------------------------------------------------------------
 
@@ -147,6 +152,8 @@ class Store:
                 watch.take(message)
             if (found := self._topics.get(topic)) is not None:
                 found.message = message
+            elif topic.startswith(_SPARKPLUG):
+                self.host.take(message, topic)
             if self._expected.get(topic) == payload:
                 del self._expected[topic]
             self._changed.notify_all()
@@ -160,6 +167,7 @@ class Store:
                 topic.reset()
             for watch in self._watches:
                 watch.reset()
+            self.host.reset()
             self._expected.clear()
 
     def refuse(self, topic: str) -> None:
@@ -241,6 +249,30 @@ class Store:
                     pass
         raise ValueRangeError("there is no present value")
 
+    def command(self, values: Mapping[int, Any]) -> tuple[str, bytes]:
+        """Return topic and payload of a Sparkplug command to the metrics of registers of one device.
+
+        Raises:
+            ValueError: The device cannot take it.
+
+        """
+        with self._changed:
+            named: dict[str, Any] = {}
+            for index, value in values.items():
+                source = self.addresses[index].source
+                assert isinstance(source, Metric)  # noqa: S101 - for the type checker
+                named[source.name] = value
+                device = self._group_of[index].origin
+            assert isinstance(device, Device)  # noqa: S101 - for the type checker
+            return device.command(named, time.time_ns() // 1_000_000)
+
+    def requests(self, now_ns: int) -> list[tuple[str, bytes]]:
+        """Return topics and payloads of what Sparkplug nodes are to be asked."""
+        if not self.host:
+            return []
+        with self._changed:
+            return list(self.host.requests(now_ns))
+
     def expect(self, topic: str, payload: bytes) -> None:
         """Expect a payload that is about to be published, if its topic is also read."""
         with self._changed:
@@ -256,8 +288,10 @@ class Store:
     @property
     def complete(self) -> bool:
         """Whether all topics have a message."""
-        return all(one.message is not None or one.refused for one in self._topics.values()) and all(
-            watch.there is not None for watch in self._watches
+        return (
+            all(one.message is not None or one.refused for one in self._topics.values())
+            and all(watch.there is not None for watch in self._watches)
+            and self.host.complete
         )
 
     def wait(self, condition: Callable[[], bool], until_s: float) -> bool:

@@ -130,17 +130,18 @@ class Fitting:
 
     def to_json(self, value: Value) -> Any:
         """Return what JSON has for a value of the register; ValueError if it has nothing."""
-        register = self._register
-        if register.dims:
-            flat = [self._json(one) for one in flatten(value, register.shape, register.path)]
-            return nest(flat, register.shape)
-        return self._json(value)
+        found = self.to_value(value)
+        for one in flatten(found, self._register.shape, self._register.path):
+            if isinstance(one, float) and not math.isfinite(one):
+                raise ValueError("JSON has neither NaN nor infinity: write a finite number")
+        return found
 
-    def _json(self, value: Any) -> Any:
-        plain = self._plain(value)
-        if isinstance(plain, float) and not math.isfinite(plain):
-            raise ValueError("JSON has neither NaN nor infinity: write a finite number")
-        return plain
+    def to_value(self, value: Value) -> Any:
+        """Return the device's value, or nested lists of them, for a value of the register; ValueError."""
+        register = self._register
+        if not register.dims:
+            return self._plain(value)
+        return nest([self._plain(one) for one in flatten(value, register.shape, register.path)], register.shape)
 
     def _plain(self, value: Any) -> bool | int | float | str:
         """Return the device's value for that of a register, without the scale."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
 import pytest
 
 from shmio.config import Address
@@ -124,7 +125,7 @@ def connected(
 ) -> Iterator[Source]:
     layout = layout_of(tags)
     given: dict[str, Any] = {"url": f"mqtt://{address}", "timeout": 2000, "max_age_ms": 0} | options
-    connector = MqttConnector(MqttOptions(**given), layout)
+    connector = MqttConnector(msgspec.convert(given, MqttOptions), layout)
     try:
         connector.connect()
         yield Source(connector, layout)

@@ -1,0 +1,379 @@
+"""Sparkplug B as a host application sees it: births, data and deaths of edge nodes. No I/O.
+
+A node is believed from its birth on, and as long as its sequence numbers have no gap: its messages
+name metrics by aliases of the birth, and after a gap another birth may be missing. Then all its
+registers are bad, and it is asked for a new birth (Eclipse Sparkplug Specification 3.0.0, 5 and 6).
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, NamedTuple
+
+from google.protobuf.message import DecodeError
+
+from shmio.backoff import Backoff
+from shmio.connectors.mqtt import metric
+from shmio.connectors.mqtt.address import NAMESPACE, Metric
+from shmio.connectors.mqtt.faults import ValueFaultError
+from shmio.connectors.mqtt.topic import Found, Message, Origin
+from shmio.model.statuses import (
+    BAD_NO_COMMUNICATION,
+    BAD_NOT_FOUND,
+    BAD_WAITING_FOR_INITIAL_DATA,
+    GOOD,
+    UNCERTAIN_LAST_USABLE_VALUE,
+)
+from shmio.wire import sparkplug_b_pb2 as wire
+
+REBIRTH: Final = "Node Control/Rebirth"
+MAX_METRICS: Final = 100_000
+"""Most metrics of a message."""
+ASK: Final = Backoff(1.0, 60.0)
+"""Waits before a node is asked again for its birth."""
+CALM_NS: Final = 120_000_000_000
+"""After this time without a question, the waits are short again."""
+KINDS: Final = ("NBIRTH", "NDATA", "NDEATH", "DBIRTH", "DDATA", "DDEATH")
+_SEQUENCE: Final = 256
+_BAD: Final = 0x80000000
+_QUALITIES: Final = {0: _BAD, 500: UNCERTAIN_LAST_USABLE_VALUE}
+_MAX_MS: Final = ((1 << 63) - 1) // 1_000_000
+
+log = logging.getLogger("shmio.source.mqtt")
+
+
+class _Known(NamedTuple):
+    """What a birth says of a metric."""
+
+    name: str
+    alias: int | None
+    datatype: int
+    field: str | None
+    """The field of the protobuf message with its value; None if it was null."""
+
+
+class Device(Origin):
+    """A device of a node, or the node itself."""
+
+    def __init__(self, node: Node, name: str) -> None:
+        self.node, self.name = node, name
+        self.wanted: dict[str, list[int]] = {}
+        """The registers of each metric."""
+        self.metrics: dict[str, _Known] = {}
+        """The wanted metrics that the birth has."""
+        self.born = False
+        self.died = False
+        self._birth_order = 0
+        self._found: dict[int, tuple[Found | ValueFaultError, int]] = {}
+
+    def __str__(self) -> str:
+        return f"{self.node}/{self.name}" if self.name else str(self.node)
+
+    @property
+    def fault(self) -> int:
+        """Why no register has a good value."""
+        if self.born:
+            return GOOD
+        return BAD_NO_COMMUNICATION if self.died else BAD_WAITING_FOR_INITIAL_DATA
+
+    @property
+    def offline(self) -> str:
+        """Why a command would reach nobody."""
+        if self.born:
+            return ""
+        return f"{self} is not online: it {'has died' if self.died else 'has sent no birth'}"
+
+    def order_of(self, index: int) -> int:
+        """Return the order of the message with the newest value of a register."""
+        found = self._found.get(index)
+        return self._birth_order if found is None else found[1]
+
+    def find(self, index: int) -> Found:
+        """Return the newest value of a register; ValueFaultError if the birth has no such metric."""
+        found = self._found.get(index)
+        if found is None:
+            raise ValueFaultError(BAD_NOT_FOUND, f"the birth of {self} has no such metric")
+        if isinstance(found[0], ValueFaultError):
+            raise found[0]
+        return found[0]
+
+    def reset(self) -> None:
+        """Forget all messages."""
+        self.message = None
+        self.end(died=False)
+
+    def end(self, *, died: bool) -> None:
+        """Believe nothing of the device until its next birth."""
+        self.born, self.died = False, died
+        self.metrics.clear()
+        self._found.clear()
+
+    def begin(self, order: int) -> None:
+        """Begin a new life, with the metrics of a birth."""
+        self.end(died=False)
+        self.born, self._birth_order = True, order
+
+    def take(self, known: _Known, one: wire.Metric, message: Message, sent_ms: int) -> None:
+        """Take a value of a metric."""
+        at_ms = one.timestamp if one.HasField("timestamp") else sent_ms
+        source_ns = at_ms * 1_000_000 if 0 < at_ms <= _MAX_MS else message.utc_ns
+        found: Found | ValueFaultError
+        try:
+            found = Found(metric.decode(one, known.datatype), source_ns, _quality(one))
+        except ValueFaultError as error:
+            error.source_ns = source_ns
+            found = error
+        for index in self.wanted[known.name]:
+            self._found[index] = found, message.order
+
+    def command(self, values: Mapping[str, Any], now_ms: int) -> tuple[str, bytes]:
+        """Return topic and payload of a command; ValueError if the device cannot take it."""
+        payload = wire.Payload(timestamp=now_ms)
+        for name, value in values.items():
+            known = self.metrics.get(name)
+            if known is None:
+                raise ValueError(self.offline or f"the birth of {self} has no metric {name!r}")
+            one = payload.metrics.add(timestamp=now_ms)
+            if known.alias is None:
+                one.name = name
+            else:
+                one.alias = known.alias
+            metric.encode(one, known.datatype, value, known.field)
+        return self.node.topic("DCMD" if self.name else "NCMD", self.name), payload.SerializeToString()
+
+
+class Node:
+    """An edge node."""
+
+    def __init__(self, group: str, name: str) -> None:
+        self._group, self._name = group, name
+        self.devices: dict[str, Device] = {}
+        self._aliases: dict[int, tuple[Device, _Known] | None] = {}
+        """Metrics by their aliases; None for those that no register has."""
+        self._asks = 0
+        self._asked_ns = -CALM_NS
+        self.reset()
+
+    def __str__(self) -> str:
+        return f"{self._group}/{self._name}"
+
+    def topic(self, kind: str, device: str = "") -> str:
+        """Return the topic of a kind of message."""
+        return "/".join((NAMESPACE, self._group, kind, self._name, *((device,) if device else ())))
+
+    @property
+    def filters(self) -> list[str]:
+        """What to subscribe to: all messages of the node, because a gap may be in any of them."""
+        return [self.topic(kind, "+" if kind.startswith("D") else "") for kind in KINDS]
+
+    @property
+    def born(self) -> bool:
+        """Whether the node is believed."""
+        return self._born
+
+    def device(self, name: str) -> Device:
+        """Return a device, or the node itself for an empty name."""
+        return self.devices.setdefault(name, Device(self, name))
+
+    def reset(self) -> None:
+        """Forget all messages, and ask for a birth."""
+        self._born, self._ask = False, True
+        self._session: int | None = None
+        self._next: int | None = None
+        self._aliases.clear()
+        for device in self.devices.values():
+            device.reset()
+
+    # -- messages ------------------------------------------------------------------------------------------------------
+
+    def take(self, kind: str, device: str, message: Message) -> None:
+        """Take a message of the node or of one of its devices."""
+        payload = self._payload(message)
+        if payload is None:
+            self._lose("sent what is no Sparkplug payload")
+        elif kind == "NDEATH":
+            self._death(payload)
+        elif kind == "NBIRTH":
+            self._birth(payload, message)
+        elif not self._born:
+            self._ask = True
+        elif self._in_sequence(payload):
+            for one in self.devices.values():
+                one.message = message
+            self._device_message(kind, device, payload, message)
+
+    def _payload(self, message: Message) -> wire.Payload | None:
+        try:
+            payload = wire.Payload.FromString(message.payload)
+        except DecodeError:
+            return None
+        return payload if len(payload.metrics) <= MAX_METRICS else None
+
+    def _birth(self, payload: wire.Payload, message: Message) -> None:
+        self._aliases.clear()
+        for one in self.devices.values():
+            one.end(died=False)
+            one.message = message
+        self._session = _session(payload)
+        self._next = (payload.seq + 1) % _SEQUENCE if payload.HasField("seq") else None
+        self._born, self._ask = True, False
+        self._begin(self.device(""), payload, message)
+
+    def _death(self, payload: wire.Payload) -> None:
+        session = _session(payload)
+        if self._born and session is not None and self._session is not None and session != self._session:
+            log.info("%s: the last will of an earlier session is ignored", self)
+            return
+        self._born, self._ask = False, False  # it sends its birth when it is back
+        for one in self.devices.values():
+            one.end(died=True)
+
+    def _in_sequence(self, payload: wire.Payload) -> bool:
+        if not payload.HasField("seq"):
+            return True
+        if self._next is not None and payload.seq != self._next:
+            self._lose(f"a message is missing: its number is {payload.seq}, not {self._next}")
+            return False
+        self._next = (payload.seq + 1) % _SEQUENCE
+        return True
+
+    def _device_message(self, kind: str, name: str, payload: wire.Payload, message: Message) -> None:
+        device = self.devices.get(name)
+        if kind == "DBIRTH":
+            self._begin(device, payload, message)
+        elif kind == "DDEATH":
+            if device is not None:
+                device.end(died=True)
+        elif device is not None and not device.born:
+            if not device.died:
+                self._lose(f"{device} sends data without a birth")
+        else:
+            self._data(device, payload, message)
+
+    def _begin(self, device: Device | None, payload: wire.Payload, message: Message) -> None:
+        """Take the birth of a device; None: one that no register has."""
+        if device is not None:
+            self._aliases = {
+                alias: known for alias, known in self._aliases.items() if known is None or known[0] is not device
+            }
+            device.begin(message.order)
+        for one in payload.metrics:
+            alias = one.alias if one.HasField("alias") else None
+            wanted = device is not None and one.name in device.wanted
+            known = _Known(one.name, alias, one.datatype, one.WhichOneof("value"))
+            if alias is not None:
+                self._aliases[alias] = (device, known) if wanted and device is not None else None
+            if wanted and device is not None:
+                device.metrics[one.name] = known
+                device.take(known, one, message, payload.timestamp)
+
+    def _data(self, device: Device | None, payload: wire.Payload, message: Message) -> None:
+        for one in payload.metrics:
+            if one.is_historical:
+                continue
+            if one.name:
+                known = device.metrics.get(one.name) if device is not None else None
+                if device is not None and known is not None:
+                    device.take(known, one, message, payload.timestamp)
+            elif one.alias not in self._aliases:
+                self._lose(f"no birth has the alias {one.alias}")
+                return
+            elif (found := self._aliases[one.alias]) is not None:
+                found[0].take(found[1], one, message, payload.timestamp)
+
+    def _lose(self, why: str) -> None:
+        """Believe nothing of the node until its next birth, and ask for that."""
+        log.warning("%s: %s; it is asked for a new birth", self, why)
+        self._born, self._ask = False, True
+        for one in self.devices.values():
+            one.end(died=False)
+
+    def request(self, now_ns: int) -> tuple[str, bytes] | None:
+        """Return topic and payload of the command to ask for a birth, if one is needed now."""
+        if not self._ask or now_ns - self._asked_ns < self._wait_ns:
+            return None
+        self._asks = self._asks + 1 if now_ns - self._asked_ns < CALM_NS else 0
+        self._asked_ns = now_ns
+        now_ms = time.time_ns() // 1_000_000
+        payload = wire.Payload(timestamp=now_ms)
+        payload.metrics.add(name=REBIRTH, timestamp=now_ms, datatype=metric.BOOLEAN, boolean_value=True)
+        return self.topic("NCMD"), payload.SerializeToString()
+
+    @property
+    def _wait_ns(self) -> int:
+        return round(ASK.wait_s(self._asks) * 1e9)
+
+
+class Host:
+    """All nodes of a layout."""
+
+    def __init__(self, *, max_bytes: int) -> None:
+        """Create it; a message with more than ``max_bytes`` counts as one that cannot be read."""
+        self._max_bytes = max_bytes
+        self._nodes: dict[tuple[str, str], Node] = {}
+
+    def origin(self, address: Metric, index: int) -> Device:
+        """Return the device of a metric, and note that a register has this metric."""
+        node = self._nodes.setdefault((address.group, address.node), Node(address.group, address.node))
+        device = node.device(address.device)
+        device.wanted.setdefault(address.name, []).append(index)
+        return device
+
+    def __bool__(self) -> bool:
+        return bool(self._nodes)
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    @property
+    def filters(self) -> list[str]:
+        """What to subscribe to."""
+        return [one for node in self._nodes.values() for one in node.filters]
+
+    @property
+    def complete(self) -> bool:
+        """Whether all nodes and devices are born."""
+        return all(node.born and all(device.born for device in node.devices.values()) for node in self._nodes.values())
+
+    def take(self, message: Message, topic: str) -> None:
+        """Take a message; those that the broker has kept are of another time."""
+        levels = topic.split("/")
+        if message.retained or not 4 <= len(levels) <= 5 or levels[2] not in KINDS:
+            return
+        node = self._nodes.get((levels[1], levels[3]))
+        if node is None or (len(levels) == 5) != levels[2].startswith("D"):
+            return
+        if len(message.payload) > self._max_bytes:
+            message = message._replace(payload=b"\xff")
+        node.take(levels[2], levels[4] if len(levels) == 5 else "", message)
+
+    def requests(self, now_ns: int) -> Iterator[tuple[str, bytes]]:
+        """Yield topics and payloads of the commands that ask nodes for their births."""
+        for node in self._nodes.values():
+            if (found := node.request(now_ns)) is not None:
+                yield found
+
+    def reset(self) -> None:
+        """Forget all messages."""
+        for node in self._nodes.values():
+            node.reset()
+
+
+def _session(payload: wire.Payload) -> int | None:
+    """Return the number of the session, by which a birth and a last will belong together."""
+    for one in payload.metrics:
+        if one.name == "bdSeq":
+            field = one.WhichOneof("value")
+            found = getattr(one, field) if field else None
+            return found if isinstance(found, int) else None
+    return None
+
+
+def _quality(one: wire.Metric) -> int:
+    """Return the status of a metric with the property Quality (6.4.8.1)."""
+    for key, value in zip(one.properties.keys, one.properties.values, strict=False):
+        if key == "Quality":
+            return _QUALITIES.get(value.int_value, GOOD)
+    return GOOD

@@ -1,0 +1,206 @@
+"""The MQTT connector and Sparkplug B: an edge node made with Node's sparkplug-payload, and hostile messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from shmio.model import statuses
+from shmio.model.statuses import describe
+from tests.unit.connectors.mqtt.conftest import Plant
+from tests.unit.connectors.mqtt.peer import Peer, Source, connected
+
+GROUP = "spBv1.0/Line 1"
+TAGS: dict[str, Any] = {
+    "node/cpu": ("REAL", "sparkplug Line 1/cell metric cpu"),
+    "axis/pos": {"type": "LREAL", "address": "sparkplug Line 1/cell/robot metric Axis/Pos", "writable": True},
+    "axis/count": {"type": "INT", "address": "sparkplug Line 1/cell/robot metric Axis/Count", "writable": True},
+    "axis/on": {"type": "BOOL", "address": "sparkplug Line 1/cell/robot metric on", "writable": True},
+    "axis/name": ("STRING[10]", "sparkplug Line 1/cell/robot metric name"),
+    "axis/gone": ("INT", "sparkplug Line 1/cell/robot metric gone"),
+    "other": ("INT", "sparkplug Line 1/cell/other metric n"),
+}
+CODES: Callable[[Source], list[str]] = lambda source: [describe(source.code(path)).split(" ")[0] for path in TAGS]  # noqa: E731
+
+
+class Edge:
+    """An edge node that the test plays with the peer's messages."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.peer = peer
+        self.seq = 0
+        self.bd_seq = 0
+
+    def send(self, kind: str, device: str = "", *metrics: dict[str, Any], **given: Any) -> None:
+        seq = {} if kind == "NDEATH" else {"seq": self.seq}
+        topic = f"{GROUP}/{kind}/cell" + (f"/{device}" if device else "")
+        self.peer.ask("publish_sparkplug", topic, {"timestamp": 1_700_000_000_000, "metrics": metrics} | seq | given)
+        if seq:
+            self.seq = (given.get("seq", self.seq) + 1) % 256
+
+    def birth(self, **extra: Any) -> None:
+        self.seq, self.bd_seq = 0, self.bd_seq + 1
+        self.send("NBIRTH", "", self.session(), {"name": "cpu", "type": "Float", "value": 12.5, "alias": 1})
+        self.send(
+            "DBIRTH", "robot",
+            {"name": "Axis/Pos", "type": "Double", "value": 1.5, "alias": 10, "timestamp": 1_700_000_000_500} | extra,
+            {"name": "Axis/Count", "type": "Int16", "value": -3, "alias": 11},
+            {"name": "on", "type": "Boolean", "value": True},
+            {"name": "name", "type": "String", "value": "left"},
+            {"name": "unread", "type": "Int32", "value": 1, "alias": 12},
+        )  # fmt: skip
+
+    def session(self, number: int | None = None) -> dict[str, Any]:
+        return {"name": "bdSeq", "type": "UInt64", "value": self.bd_seq if number is None else number}
+
+    def asked(self) -> Any:
+        """Wait for a command to the node; return its metrics."""
+        message = self.peer.ask("next", f"{GROUP}/NCMD/cell")
+        assert (message["qos"], message["retain"]) == (0, False)
+        return self.peer.ask("decode_sparkplug", message["hex"])["metrics"]
+
+
+@pytest.fixture
+def edge(plant: Plant) -> Edge:
+    plant.device.ask("subscribe", f"{GROUP}/NCMD/cell")
+    plant.device.ask("subscribe", f"{GROUP}/DCMD/cell/robot")
+    plant.device.ask("heard")
+    return Edge(plant.device)
+
+
+WAITING, DEAD = "BadWaitingForInitialData", "BadNoCommunication"
+
+
+def born(source: Source, edge: Edge) -> None:
+    assert [(one["name"], one["value"]) for one in edge.asked()] == [("Node Control/Rebirth", True)]
+    edge.birth()
+    source.until(lambda: source.code("axis/pos") == 0)
+
+
+def test_births_data_and_deaths(plant: Plant, edge: Edge) -> None:
+    with connected(plant.address, TAGS) as source:
+        source.read()
+        assert set(CODES(source)) == {WAITING}
+        born(source, edge)
+        assert CODES(source) == ["Good"] * 5 + ["BadNotFound", WAITING]
+        assert [source.value(path) for path in TAGS][:5] == [12.5, 1.5, -3, True, "left"]
+        assert source.source_ns("axis/pos") == 1_700_000_000_500_000_000
+        assert source.source_ns("axis/on") == 1_700_000_000_000_000_000
+        edge.send(
+            "DDATA", "robot", {"alias": 11, "type": "Int16", "value": 300}, {"alias": 12, "type": "Int32", "value": 2}
+        )
+        source.until(lambda: source.value("axis/count") == 300)
+        edge.send("DDATA", "robot", {"name": "on", "type": "Boolean", "value": False})
+        source.until(lambda: source.value("axis/on") is False)
+        edge.send("DDEATH", "robot")
+        source.until(lambda: CODES(source) == ["Good", *[DEAD] * 5, WAITING])
+        edge.send("DBIRTH", "robot", {"name": "Axis/Count", "type": "Int16", "value": 4, "alias": 20})
+        source.until(lambda: source.value("axis/count") == 4)
+        assert CODES(source)[1:4] == ["BadNotFound", "Good", "BadNotFound"]
+        edge.send("NDEATH", "", edge.session(99))  # of an earlier session
+        edge.send("DDATA", "robot", {"alias": 20, "type": "Int16", "value": 5})
+        source.until(lambda: source.value("axis/count") == 5)
+        assert source.code("axis/count") == 0
+        edge.send("NDEATH", "", edge.session())
+        source.until(lambda: set(CODES(source)) == {DEAD})
+        edge.birth()
+        source.until(lambda: source.code("axis/pos") == 0)
+        assert edge.peer.ask("heard") == []  # it was asked only once
+
+
+def test_null_and_quality_and_history(plant: Plant, edge: Edge) -> None:
+    with connected(plant.address, TAGS) as source:
+        born(source, edge)
+        edge.send(
+            "DDATA", "robot",
+            {"alias": 10, "type": "Double", "value": None},
+            {"alias": 11, "type": "Int16", "value": 99, "isHistorical": True},
+            {"name": "on", "type": "Boolean", "value": True,
+             "properties": {"Quality": {"type": "Int32", "value": 500}}},
+            {"name": "name", "type": "String", "value": "far too long a text"},
+        )  # fmt: skip
+        source.until(lambda: source.code("axis/pos") == statuses.BAD_NO_DATA)
+        assert (source.value("axis/count"), source.code("axis/count")) == (-3, 0)
+        assert source.code("axis/on") == statuses.UNCERTAIN_LAST_USABLE_VALUE
+        assert source.code("axis/name") == statuses.BAD_OUT_OF_RANGE
+
+
+@pytest.mark.parametrize("fault", ["gap", "alias", "no birth", "garbage"])
+def test_what_cannot_be_trusted_is_bad_until_a_new_birth(plant: Plant, edge: Edge, fault: str) -> None:
+    with connected(plant.address, TAGS) as source:
+        born(source, edge)
+        metric = {"alias": 10, "type": "Double", "value": 2.5}
+        if fault == "gap":
+            edge.seq += 1
+            edge.send("DDATA", "robot", metric)
+        elif fault == "alias":
+            edge.send("DDATA", "robot", metric | {"alias": 77})
+        elif fault == "no birth":
+            edge.send("DDATA", "other", {"name": "n", "type": "Int32", "value": 1})
+        else:
+            edge.peer.ask("publish", f"{GROUP}/NDATA/cell", {"hex": "ffffffff"})
+        source.until(lambda: set(CODES(source)) == {WAITING})
+        assert source.value("axis/pos") == 1.5
+        edge.send("DDATA", "robot", metric)  # nothing is believed before the birth
+        # the connector asks for a birth again, after the wait since the first question
+        source.until(lambda: bool(edge.peer.ask("heard")))
+        edge.birth()
+        source.until(lambda: source.code("axis/pos") == 0)
+
+
+def test_commands(plant: Plant, edge: Edge) -> None:
+    with connected(plant.address, TAGS) as source:
+        (outcome,) = source.write(**{"axis/pos": 1.0})
+        assert "is not online" in outcome
+        born(source, edge)
+        outcomes = source.write(**{"axis/pos": 7.5, "axis/count": -300, "axis/on": False})
+        assert outcomes == ["", "", ""]
+        message = plant.device.ask("next", f"{GROUP}/DCMD/cell/robot")
+        assert (message["qos"], message["retain"]) == (0, False)
+        sent = plant.device.ask("decode_sparkplug", message["hex"])
+        assert "seq" not in sent
+        by_key = {one.get("alias") or one["name"]: one for one in sent["metrics"]}
+        assert {key: one["value"] for key, one in by_key.items()} == {10: 7.5, 11: -300, "on": False}
+        assert by_key[11]["type"] == "Int16"
+        edge.send("DDEATH", "robot")
+        source.until(lambda: source.code("axis/pos") == statuses.BAD_NO_COMMUNICATION)
+        assert "has died" in source.write(**{"axis/pos": 1.0})[0]
+
+
+def test_no_question_is_asked_if_that_is_not_wanted(plant: Plant, edge: Edge) -> None:
+    with connected(plant.address, TAGS, rebirth=False) as source:
+        source.read()
+        edge.birth()
+        source.until(lambda: source.code("axis/pos") == 0)
+        assert edge.peer.ask("heard") == []
+
+
+def test_a_node_of_shmio_itself_is_read(plant: Plant) -> None:
+    """What shmio's own bridge publishes comes back with the same values."""
+    from shmio.endpoints.mqtt.sparkplug.node import EdgeNode, Sample  # noqa: PLC0415
+    from shmio.layout.tags import place_tags  # noqa: PLC0415
+
+    kinds = {
+        "a": ("SINT", -7), "b": ("INT", -300), "c": ("DINT", -70_000), "d": ("LINT", -(1 << 40)), "e": ("USINT", 200),
+        "f": ("UINT", 60_000), "g": ("UDINT", 4_000_000_000), "h": ("ULINT", (1 << 64) - 1), "i": ("REAL", 0.5),
+        "j": ("LREAL", 1e-300), "k": ("BOOL", True), "l": ("STRING[9]", "text"), "m": ("ARRAY[1..3] OF INT", [1, -2, 3]),
+        "n": ("ARRAY[1..9] OF BOOL", [True, False, True] * 3), "o": ("ARRAY[1..2] OF LREAL", [0.25, -1.0]),
+    }  # fmt: skip
+    layout = place_tags("dev", {path: kind for path, (kind, _) in kinds.items()})
+    node = EdgeNode("G", "N")
+    node.define({"dev": layout.registers})
+    tags = {path: {"type": kind, "address": f"sparkplug G/N/dev metric {path}", "writable": True}
+            for path, (kind, _) in kinds.items()}  # fmt: skip
+    with connected(plant.address, tags) as source:
+        samples = [Sample(node.metrics["dev"][path], value, 1_700_000_000_000) for path, (_, value) in kinds.items()]
+        for message in (node.birth(), node.device_birth("dev", samples), node.data("dev", samples)):
+            plant.device.ask("publish", message.topic, {"hex": message.payload.hex()})
+        source.until(lambda: source.code("a") == 0)
+        assert {path: source.value(path) for path in kinds} == {path: value for path, (_, value) in kinds.items()}
+        plant.device.ask("subscribe", "spBv1.0/G/DCMD/N/dev")
+        assert source.write(**{path: value for path, (_, value) in kinds.items()}) == [""] * len(kinds)
+        sent = plant.device.ask("next", "spBv1.0/G/DCMD/N/dev")
+        command = node.command("spBv1.0/G/DCMD/N/dev", bytes.fromhex(sent["hex"]))
+        assert dict(command.values) == {path: value for path, (_, value) in kinds.items()}
