@@ -63,7 +63,7 @@ def parse(text: str) -> Address:
     text = text.strip()
     if not text:
         raise ValueError(f"its `address` is missing; {EXAMPLES}")
-    before, arrow, after = text.rpartition(_ARROW)
+    before, arrow, after = f" {text} ".rpartition(_ARROW)
     if text.startswith("sparkplug "):
         return Address(_metric(text), None)
     if not arrow:

@@ -203,7 +203,7 @@ class Link:
             raise ConnectorError(f"cannot connect to {self.peer}: {error}") from None
         self._thread = threading.Thread(target=self._run, args=(client,), name="mqtt", daemon=True)
         self._thread.start()
-        self._wait(lambda: self._connack is not None, until_s, "to CONNECT")
+        self._wait(lambda: self._connack is not None, self._soon(until_s), "to CONNECT")
         assert self._connack is not None  # noqa: S101 - for the type checker
         if self._connack.is_failure:
             if str(self._connack) == _UNSUPPORTED:
@@ -237,6 +237,10 @@ class Link:
             opened.close()
             raise ConnectorError(f"{peer}: {_tls(error)}") from None
 
+    def _soon(self, until_s: float) -> float:
+        """Return until when to wait for one answer, s of CLOCK_MONOTONIC."""
+        return min(until_s, time.monotonic() + self._options.timeout / 1000)
+
     def _subscribe(self, client: Client, filters: list[str], until_s: float) -> list[str]:
         asked: dict[int, list[str]] = {}
         for at in range(0, len(filters), MAX_FILTERS):
@@ -249,7 +253,7 @@ class Link:
             if number is None:
                 raise ConnectorError(self._failure or f"the connection to {self.peer} was lost")
             asked[number] = part
-        self._wait(lambda: asked.keys() <= self._subacks.keys(), until_s, "to SUBSCRIBE")
+        self._wait(lambda: asked.keys() <= self._subacks.keys(), self._soon(until_s), "to SUBSCRIBE")
         refused: list[str] = []
         for number, part in asked.items():
             codes = self._subacks[number]

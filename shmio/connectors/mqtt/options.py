@@ -80,6 +80,8 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
         for name in ("ca", "certificate", "key"):
             if getattr(self, name) is not None and not self.tls:
                 raise ValueError(f"{name}: has no effect without TLS: write url = 'mqtts://…'")
+        if self.texts[0].strip().casefold() == self.texts[1].strip().casefold():
+            raise ValueError("texts: those for false and for true must differ")
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate: give both certificate and key, or neither")
         if self.password_file is not None and self.username is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from shmio.connectors.mqtt import json_path
@@ -15,7 +15,7 @@ from shmio.connectors.mqtt.json_path import Steps
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.sparkplug import Device, Host
 from shmio.connectors.mqtt.topic import Message, Origin, Topic
-from shmio.connectors.mqtt.values import Fitting
+from shmio.connectors.mqtt.values import Fitting, decode_json
 from shmio.connectors.mqtt.watch import Watch
 from shmio.connectors.register_image import RegisterImage
 from shmio.errors import ConfigError, ConnectorError, PathError, ValueRangeError
@@ -97,6 +97,10 @@ class Store:
         """Payloads that were published on topics that are also read, and have not come back."""
         for index in range(len(layout.registers)):
             self._add(index)
+        for watch in self._watches:
+            if not any(watch in group.watches for group in self._groups.values()):
+                raise ConfigError(f"will: no register matches the patterns of {watch.place.topic}")
+        _check_templates(options, self.addresses)
 
     def _add(self, index: int) -> None:
         register = self.layout.registers[index]
@@ -338,3 +342,15 @@ def _time_path(options: MqttOptions) -> Steps | None:
         return json_path.parse(options.time)
     except ValueError as error:
         raise ConfigError(f"time: {error}") from None
+
+
+def _check_templates(options: MqttOptions, addresses: Sequence[Address]) -> None:
+    """Raise ConfigError if a template is no JSON, or is never used."""
+    written = {one.target.topic for one in addresses if one.target is not None and one.target.steps}
+    for topic, template in options.templates.items():
+        if topic not in written:
+            raise ConfigError(f"templates: no register is written to {topic!r} as JSON with a path")
+        try:
+            decode_json(template.encode())
+        except ValueFaultError as error:
+            raise ConfigError(f"templates: {topic}: {error}") from None

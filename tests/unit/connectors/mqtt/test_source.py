@@ -187,7 +187,7 @@ def test_scaled_values(plant: Plant) -> None:
 
 # -- writing -----------------------------------------------------------------------------------------------------------
 
-WRITABLE = {
+WRITABLE: dict[str, Any] = {
     "lamp": {"type": "BOOL", "address": "w/lamp -> w/lamp/set", "writable": True},
     "speed": {"type": "LREAL", "address": "w/speed", "writable": True},
     "x": {"type": "LREAL", "address": "w/state $.x -> w/set $.target.x", "writable": True},

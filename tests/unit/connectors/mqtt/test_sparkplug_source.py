@@ -7,6 +7,10 @@ from typing import Any
 
 import pytest
 
+from shmio.backoff import Backoff
+from shmio.connectors.mqtt import sparkplug
+from shmio.endpoints.mqtt.sparkplug.node import EdgeNode, Sample
+from shmio.layout.tags import place_tags
 from shmio.model import statuses
 from shmio.model.statuses import describe
 from tests.unit.connectors.mqtt.conftest import Plant
@@ -128,7 +132,10 @@ def test_null_and_quality_and_history(plant: Plant, edge: Edge) -> None:
 
 
 @pytest.mark.parametrize("fault", ["gap", "alias", "no birth", "garbage"])
-def test_what_cannot_be_trusted_is_bad_until_a_new_birth(plant: Plant, edge: Edge, fault: str) -> None:
+def test_what_cannot_be_trusted_is_bad_until_a_new_birth(
+    plant: Plant, edge: Edge, fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sparkplug, "ASK", Backoff(0.05, 0.1))
     with connected(plant.address, TAGS) as source:
         born(source, edge)
         metric = {"alias": 10, "type": "Double", "value": 2.5}
@@ -179,13 +186,11 @@ def test_no_question_is_asked_if_that_is_not_wanted(plant: Plant, edge: Edge) ->
 
 def test_a_node_of_shmio_itself_is_read(plant: Plant) -> None:
     """What shmio's own bridge publishes comes back with the same values."""
-    from shmio.endpoints.mqtt.sparkplug.node import EdgeNode, Sample  # noqa: PLC0415
-    from shmio.layout.tags import place_tags  # noqa: PLC0415
-
-    kinds = {
+    kinds: dict[str, tuple[str, Any]] = {
         "a": ("SINT", -7), "b": ("INT", -300), "c": ("DINT", -70_000), "d": ("LINT", -(1 << 40)), "e": ("USINT", 200),
         "f": ("UINT", 60_000), "g": ("UDINT", 4_000_000_000), "h": ("ULINT", (1 << 64) - 1), "i": ("REAL", 0.5),
-        "j": ("LREAL", 1e-300), "k": ("BOOL", True), "l": ("STRING[9]", "text"), "m": ("ARRAY[1..3] OF INT", [1, -2, 3]),
+        "j": ("LREAL", 1e-300), "k": ("BOOL", True), "l": ("STRING[9]", "text"),
+        "m": ("ARRAY[1..3] OF INT", [1, -2, 3]),
         "n": ("ARRAY[1..9] OF BOOL", [True, False, True] * 3), "o": ("ARRAY[1..2] OF LREAL", [0.25, -1.0]),
     }  # fmt: skip
     layout = place_tags("dev", {path: kind for path, (kind, _) in kinds.items()})
