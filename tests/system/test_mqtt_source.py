@@ -25,7 +25,7 @@ period_ms = 20
 url = "mqtt://BROKER"
 timeout = 1000
 will = "plant/lamp/there"
-max_age_ms = { "**" = 0 }
+max_age_ms.lamp = 0
 [[source]]
 name = "other"
 connector = "memory"

@@ -26,7 +26,7 @@ _REALS: Final = frozenset({"REAL", "LREAL"})
 _TEXTS: Final = frozenset({"STRING", "WSTRING"})
 _NUMBER: Final = re.compile(r"[+-]?(?:[0-9]{1,400}(?:\.[0-9]{0,400})?|\.[0-9]{1,400})(?:[eE][+-]?[0-9]{1,4})?")
 _WHOLE: Final = re.compile(r"[+-]?[0-9]{1,20}")
-_NO_NUMBER: Final = {"nan": math.nan, "inf": math.inf, "+inf": math.inf, "-inf": -math.inf}
+_NO_NUMBER: Final = {"nan": math.nan, "inf": math.inf, "infinity": math.inf, "-inf": -math.inf, "-infinity": -math.inf}
 _BOOLS: Final = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
 _EXACT: Final = 1 << 53
 """Up to here, every whole number is a float of its own."""
@@ -126,7 +126,9 @@ class Fitting:
         plain = self._plain(value)
         if isinstance(plain, bool):
             return self._texts[plain].encode()
-        return plain.encode() if isinstance(plain, str) else repr(plain).encode()
+        if isinstance(plain, float) and not math.isfinite(plain):
+            return b"NaN" if math.isnan(plain) else b"Infinity" if plain > 0 else b"-Infinity"
+        return str(plain).encode()
 
     def to_json(self, value: Value) -> Any:
         """Return what JSON has for a value of the register; ValueError if it has nothing."""
