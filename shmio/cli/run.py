@@ -131,6 +131,17 @@ def seconds(text: str) -> float:
     return seconds
 
 
+def milliseconds(text: str) -> float:
+    """Convert an argument that is a time in ms."""
+    try:
+        found = float(text)
+    except ValueError:
+        found = math.nan
+    if not 0 < found <= 1000 * MAX_SECONDS:
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a number of milliseconds above 0")
+    return found
+
+
 def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:
     """Add ``--json``, which :func:`run` also applies to errors."""
     parser.add_argument("--json", action="store_true", help=f"{text}; an error, too")

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.run import add_json, at_least, complete, load, run
+from shmio.cli.run import add_json, at_least, complete, load, milliseconds, run
 from shmio.version import __version__
 
 PROGRAM = "shmio-supervisor"
@@ -59,7 +59,10 @@ def _parser() -> argparse.ArgumentParser:
     add_json(verb("reload", text, target, command="control:reload"))
     text = "restart one process, as it was configured at the start or the last reload"
     verb("restart", text, target, command="control:restart").add_argument("name", metavar="NAME")
-    add_json(verb("check", "validate the configuration and its layouts; start nothing", file))
+    check = verb("check", "validate the configuration and its layouts; start nothing", file)
+    text = "say of each source whether its period can be met if a request takes this long to be answered"
+    check.add_argument("--round-trip-ms", type=milliseconds, metavar="MS", help=text)
+    add_json(check)
     logs = verb("logs", "print the end of the log files", target)
     logs.add_argument("name", metavar="NAME", nargs="?", help="a process, or supervisor (default: all)")
     logs.add_argument("-f", "--follow", action="store_true", help="continue with new lines")

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from shmio.connectors.browsing import Browsed, Wanted
+from shmio.connectors.load import Load
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
@@ -154,6 +155,13 @@ class Connector(ABC):
         Empty if it is good.
         """
         return ""
+
+    def load(self) -> Load | None:
+        """Return what a cycle asks of the device, for ``shmio-supervisor check``; None if that is not known.
+
+        It is called without a connection, and makes none.
+        """
+        return None
 
     # -- more than one cycle at a time ---------------------------------------------------------------------------------
 

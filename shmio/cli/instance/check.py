@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from shmio.cli.run import dumps
 from shmio.cli.target import config_file
-from shmio.config import Address
+from shmio.config import Address, Source
+from shmio.connectors.load import Requests, counted
 from shmio.errors import ConfigError, ShmioError
+from shmio.layout.topic import shorten
 from shmio.logs import printable
+from shmio.plan.load import source_load, writable_registers
 from shmio.plan.ports import served, taken
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import Plan
 from shmio.segment import PREFIX, BlockSpec, Segment
+
+MAX_PATTERNS: Final = 200
+"""Most characters of a source's patterns in a line."""
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -24,19 +31,22 @@ def check(arguments: argparse.Namespace) -> int:
     prepared = prepare(file)
     plan = prepared.plan
     would_fail = _taken(file, plan)
+    sources = list(zip(prepared.config.source, plan.blocks, strict=True))
+    figures = [_Figures(source, block, arguments.round_trip_ms) for source, block in sources]
+    slow = [text for index, one in enumerate(figures) for text in one.slow(f"source[{index}]")]
     found: dict[str, Any] = {
         "config": str(file),
         "instance": plan.instance,
         "processes": [job.name for job in plan.jobs],
         "sources": [
-            _described(block, peer(source)) for source, block in zip(prepared.config.source, plan.blocks, strict=True)
+            _described(block, peer(source)) | one.found for (source, block), one in zip(sources, figures, strict=True)
         ],
         "injections": list(prepared.injections),
         "replay": [],
         "segment": f"{PREFIX}{plan.instance}",
         "segment_bytes": plan.segment_bytes,
         "notes": [*prepared.notes, *_unserved(prepared), *would_fail],
-        "warnings": list(plan.warnings),
+        "warnings": [*plan.warnings, *(f"{file}: warning: {text}" for text in slow)],
     }
     if prepared.config.replay and prepared.config.replay.file:
         replay = prepare(file, "replay").plan
@@ -85,7 +95,7 @@ def _lines(found: dict[str, Any], *, would_fail: bool) -> list[str]:
         end = f"no faults{f', {warnings}' if count else ''} in the configuration; up would fail at present"
     return [
         f"{found['config']}: instance {found['instance']}, {processes} process{'es' * (processes != 1)}",
-        *(f"  {_line(source)}" for source in found["sources"]),
+        *(f"  {line}" for source in found["sources"] for line in (_line(source), *_load_lines(source))),
         *(f"  {text}" for text in found["injections"]),
         *(f"  with --mode replay: {_line(source)}" for source in found["replay"]),
         f"  segment {found['segment']}: {found['segment_bytes'] / 1e6:.2f} MB of shared memory",
@@ -114,3 +124,83 @@ def _line(source: dict[str, Any]) -> str:
         f"source {source['source']}{at}: {source['block']}, {source['registers']} registers, {source['bytes']} bytes; "
         f"ring of {source['ring_frames']} frames, {source['ring_s']:.1f} s, {source['ring_bytes'] / 1e6:.2f} MB"
     )
+
+
+class _Figures:
+    """What a source reads and writes, and whether its period can be met."""
+
+    def __init__(self, source: Source, block: BlockSpec, round_trip_ms: float | None) -> None:
+        self._load = source_load(source, block.layout)
+        self._round_trip_ms = round_trip_ms
+        self._period_ms = block.period_ns / 1e6
+        self.found: dict[str, Any] = {
+            "period_ms": self._period_ms,
+            "reads": self._load.reads if self._load else None,
+            "requests": [self._case(one) for one in self._load.requests] if self._load else [],
+            "load_note": self._load.note if self._load else "",
+            "writable": list(source.writable),
+            "writable_registers": writable_registers(source, block.layout),
+        }
+        """The keys of the source for ``--json``."""
+
+    def _case(self, requests: Requests) -> dict[str, Any]:
+        round_trips, round_trip_ms = requests.round_trips, self._round_trip_ms
+        cycle_ms = None if round_trip_ms is None else round_trips * round_trip_ms
+        return {
+            "assumption": requests.assumption,
+            "requests": requests.count,
+            "in_flight": requests.in_flight,
+            "round_trip_limit_ms": self._period_ms / round_trips if round_trips else None,
+            "cycle_ms": cycle_ms,
+            "met": None if cycle_ms is None else cycle_ms < self._period_ms,
+        }
+
+    def slow(self, key: str) -> Iterator[str]:
+        """Yield a warning if the period cannot be met, whatever is assumed."""
+        cases = self.found["requests"]
+        if cases and not any(case["met"] in (True, None) for case in cases):
+            best = min(cases, key=lambda case: case["cycle_ms"])
+            how = ", with one request at a time" if best["in_flight"] == 1 else ""
+            yield (
+                f"{key}.period_ms: {self._period_ms:g} ms cannot be met with a round trip of {self._round_trip_ms:g} "
+                f"ms{how}: a cycle takes at least {best['cycle_ms']:g} ms; raise period_ms above it, or read less"
+            )
+
+
+def _load_lines(source: dict[str, Any]) -> Iterator[str]:
+    """Yield lines about what a source reads and writes."""
+    if source["reads"] is not None:
+        cases, note = source["requests"], source["load_note"]
+        if not cases:
+            yield f"  reads {source['reads']}, without requests in each cycle{f': {note}' if note else ''}"
+        elif len(cases) == 1 and not cases[0]["assumption"]:
+            yield f"  reads {source['reads']} in {_case_text(cases[0], source['period_ms'])}"
+        else:
+            yield f"  reads {source['reads']}:"
+            for case in cases:
+                yield f"    with a {case['assumption']} in {_case_text(case, source['period_ms'])}"
+        if cases and note:
+            yield f"    {note}"
+    if count := source["writable_registers"]:
+        patterns = shorten(", ".join(source["writable"]), MAX_PATTERNS)
+        yield f"  writable: {counted(count, 'register')}: {patterns}"
+    elif source["writable"]:
+        yield "  writable: none: its connector cannot write, or the patterns name nothing"
+
+
+def _case_text(case: dict[str, Any], period_ms: float) -> str:
+    count, together = case["requests"], case["in_flight"]
+    text = f"{counted(count, 'request')} a cycle"
+    if count > 1:
+        text += (
+            ", all at once"
+            if together >= count
+            else ", one after the other"
+            if together == 1
+            else (f", {together} at once")
+        )
+    if case["met"] is None:
+        limit_ms = case["round_trip_limit_ms"]
+        return text if limit_ms is None else f"{text}; {period_ms:g} ms need a round trip below {limit_ms:.3g} ms"
+    can = "can be met" if case["met"] else "cannot be met"
+    return f"{text}: at least {case['cycle_ms']:g} ms; the period of {period_ms:g} ms {can}"

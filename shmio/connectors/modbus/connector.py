@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final
 import msgspec
 
 from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.load import Load, Requests, counted
 from shmio.connectors.modbus import client
 from shmio.connectors.modbus.address import Address, Order, Table, WordCodec, parse
 from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError
@@ -45,6 +46,11 @@ _STATUS: Final = {
 }
 _OF_ADDRESSES: Final = frozenset({client.ILLEGAL_FUNCTION, client.ILLEGAL_ADDRESS, client.ILLEGAL_VALUE})
 _OF_UNITS: Final = frozenset({client.NO_PATH, client.NO_ANSWER})
+_TABLE_NAMES: Final = {
+    Table.HOLDING: "holding register", Table.INPUT: "input register", Table.COIL: "coil",
+    Table.DISCRETE: "discrete input",
+}  # fmt: skip
+NOTE: Final = "addresses that the device refuses take more requests"
 
 log = logging.getLogger("shmio.source")
 
@@ -135,6 +141,16 @@ class ModbusConnector(Connector):
     def describe(self) -> str:
         """Return the peer and the number of requests of a cycle as a text for logs."""
         return f"to {self._client.peer} in {len(self._requests)} requests a cycle"
+
+    def load(self) -> Load:
+        """Return the requests that read all registers."""
+        counts: dict[Table, int] = {}
+        for request in self._requests:
+            counts[request.table] = counts.get(request.table, 0) + request.count
+        what = ", ".join(counted(counts[table], name) for table, name in _TABLE_NAMES.items() if table in counts)
+        units = sorted({request.unit for request in self._requests})
+        some = f"unit {units[0]}" if len(units) == 1 else f"{len(units)} units"
+        return Load(f"{what} of {some}", (Requests(len(self._requests)),), NOTE)
 
     def connect(self) -> None:
         """Connect to the device; ConnectorError if it cannot be reached."""

@@ -14,6 +14,7 @@ from shmio.config.credentials import read_password
 from shmio.config.model import MqttTls
 from shmio.config.tls import client_context
 from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.load import Load, counted
 from shmio.connectors.mqtt.commands import Command, plan
 from shmio.connectors.mqtt.link import Link, Publication, UnsupportedVersionError, version_of
 from shmio.connectors.mqtt.options import MqttOptions
@@ -58,6 +59,10 @@ class MqttConnector(Connector):
         version = "5" if self._version == MQTTv5 else "3.1.1"
         secured = "TLS" if self._options.tls else "plain text"
         return f"to {self._options.address} as {self._client_id}, MQTT {version}, {secured}, {self._store.describe()}"
+
+    def load(self) -> Load:
+        """Return what is read; no requests, because topics are subscribed to."""
+        return Load(counted(len(self._store.filters), "subscription"), note="the broker sends their messages")
 
     def connect(self) -> None:
         """Connect to the broker and subscribe; wait shortly for the messages that it has kept.

@@ -19,6 +19,7 @@ import msgspec
 from shmio.config.credentials import read_password
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.browsing import Browsed, Wanted
+from shmio.connectors.load import Load, Requests, counted
 from shmio.connectors.opcua import siemens
 from shmio.connectors.opcua.address import Address, parse
 from shmio.connectors.opcua.decode import Sample
@@ -117,6 +118,19 @@ class OpcUaConnector(Connector):
         subscribed = sum(session.subscriptions for session in sessions)
         mode = f"{subscribed} subscriptions" if options.mode == "subscribe" else "polling"
         return f"to {options.peer}, {len(self._addresses)} nodes, {mode}, sessions={len(sessions)}, {how}"
+
+    def load(self) -> Load:
+        """Return the requests of a cycle: none with subscriptions."""
+        options, nodes = self._options, len(self._addresses)
+        reads = counted(nodes, "node")
+        if options.mode == "subscribe":
+            return Load(reads, note=f"the server sends what has changed, at most every {options.publishing_ms} ms")
+        from shmio.connectors.opcua.session import MAX_PER_CALL  # noqa: PLC0415  a library that only sources need
+
+        most = options.session_items
+        count = sum(-(-min(most, nodes - at) // MAX_PER_CALL) for at in range(0, nodes, most))
+        note = f"a server that takes fewer than {MAX_PER_CALL} nodes in a request gets more requests"
+        return Load(reads, (Requests(count, count),), note)
 
     def connect(self) -> None:
         """Open the sessions, and wait for the first value of each node as long as the time-out allows.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import msgspec
 
 from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.load import Load, counted
 from shmio.connectors.ros.commands import Publication, mark_lost, plan, stamped
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.topics import Topics
@@ -76,6 +77,10 @@ class Ros2Connector(Connector):
     def describe(self) -> str:
         """Return the domain and what is read, for the log."""
         return f"to DDS {self._where}, {len(self._topics.by_name)} topics"
+
+    def load(self) -> Load:
+        """Return what is read; no requests, because topics are subscribed to."""
+        return Load(counted(len(self._topics.by_name), "topic"), note="their publishers send messages")
 
     def connect(self) -> None:
         """Join the domain, and wait for a publisher of a topic, or for a subscriber of a command topic.

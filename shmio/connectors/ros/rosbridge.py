@@ -13,6 +13,7 @@ import msgspec
 
 from shmio.config import Address
 from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.load import Load, counted
 from shmio.connectors.ros.commands import Publication, mark_lost, plan, stamped
 from shmio.connectors.ros.messages import finite
 from shmio.connectors.ros.options import TopicOptions
@@ -81,6 +82,10 @@ class RosbridgeConnector(Connector):
     def describe(self) -> str:
         """Return the peer and what is read, for the log."""
         return f"to {self._options.address}, {len(self._topics.by_name)} topics by rosbridge"
+
+    def load(self) -> Load:
+        """Return what is read; no requests, because topics are subscribed to."""
+        return Load(counted(len(self._topics.by_name), "topic"), note="the server sends their messages")
 
     def connect(self) -> None:
         """Open the connection, and subscribe to all topics.

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from shmio.connectors.base import Connector
+from shmio.connectors.load import Load
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blocks import BlockRead, BlockWrite, SizeProbe, waves
 from shmio.connectors.s7.drift import BlockWatch, Described
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
+from shmio.connectors.s7.load import NOTE, by_pdu_size
 from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
 from shmio.connectors.s7.table import S7TableConnector
 from shmio.errors import ConfigError, ConnectorError
@@ -37,10 +39,14 @@ class S7Client(S7Session):
         self.size = size
 
     def _reads(self) -> list[Read]:
-        chunk = min(self.pdu_size - pdu.READ_OVERHEAD, self.options.packetSize or self.size, self.size)
+        chunk = self._chunk(self.pdu_size)
         first = BlockRead(self.db_number, self.size, chunk)
         depth = min(max(1, self.jobs // first.count), MAX_DEPTH)
         return [first, *(BlockRead(self.db_number, self.size, chunk) for _ in range(depth - 1))]
+
+    def _chunk(self, pdu_size: int) -> int:
+        """Return the most bytes of a request."""
+        return min(pdu_size - pdu.READ_OVERHEAD, self.options.packetSize or self.size, self.size)
 
     def _waves(self, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
         return waves(self.db_number, self.pdu_size, writes, outcomes)
@@ -108,3 +114,8 @@ class S7Connector(S7Client, Connector):
     def describe(self) -> str:
         """Return the peer and the parameters of the session as a text for logs."""
         return f"to {self.options.peer} DB{self.db_number} pdu={self.pdu_size} jobs={self.jobs} depth={self.depth}"
+
+    def load(self) -> Load:
+        """Return the requests that read the block, by the PDU size that the controller may grant."""
+        requests = by_pdu_size(lambda pdu_size: -(-self.size // self._chunk(pdu_size)))
+        return Load(f"bytes 0 to {self.size - 1} of DB{self.db_number}", requests, NOTE)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from shmio.connectors.base import Connector
+from shmio.connectors.load import Load, counted
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.s7 import cpu, pdu
 from shmio.connectors.s7.address import Area, parse
@@ -30,12 +31,14 @@ from shmio.connectors.s7.explain import (
     explain_item,
     explain_place,
 )
+from shmio.connectors.s7.load import NOTE, by_pdu_size
 from shmio.connectors.s7.plan import Field, Job, Piece, Range, merge, most_bytes, pack
 from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
 from shmio.connectors.s7.tag import Tag
 from shmio.errors import ConfigError, ConnectorError, PathError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Layout, Register, bit_positions
+from shmio.layout.topic import shorten
 from shmio.layout.values.write import Write, apply
 from shmio.model.statuses import (
     BAD_COMMUNICATION_ERROR,
@@ -59,6 +62,12 @@ _STATUS: Final = {
     OTHER_SIZE: BAD_TYPE_MISMATCH,
     NO_SUCH_OBJECT: BAD_NODE_ID_UNKNOWN,
 }
+_AREA_NAMES: Final = {
+    Area.PERIPHERAL: "peripheral inputs", Area.INPUT: "inputs", Area.OUTPUT: "outputs", Area.MARKER: "markers",
+    Area.COUNTER: "counters", Area.TIMER: "timers",
+}  # fmt: skip
+MAX_PLACES: Final = 200
+"""Most characters about which blocks and areas are read."""
 _MOST_LOGGED: Final = 20  # refused registers that the log names one by one
 
 log = logging.getLogger("shmio.source")
@@ -386,14 +395,41 @@ class S7TableConnector(S7Session, Connector):
             f"depth={self.depth} in {requests} {'request' if requests == 1 else 'requests'} a cycle"
         )
 
+    def load(self) -> Load:
+        """Return the requests of a cycle that reads all registers, by the PDU size that the controller may grant."""
+
+        def count(pdu_size: int) -> int:
+            planner = Planner(self._tags)
+            planner.use(self._used(pdu_size))
+            return planner.count
+
+        fields = [tag.field for tag in self._tags.values()]
+        places = dict.fromkeys(
+            f"DB{one.db}" if one.area is Area.BLOCK else _AREA_NAMES[one.area]
+            for one in sorted(fields, key=lambda one: (one.area is not Area.BLOCK, one.area, one.db))
+        )
+        slow = sum(one.every > 1 for one in fields)
+        reads = f"{counted(len(fields), 'register')} in {shorten(', '.join(places), MAX_PLACES)}"
+        reads += f", {slow} of them not in each cycle" if slow else ""
+        beside = (
+            f"; values of the CPU ({counted(len(self._of_cpu), 'register')}) are asked for beside"
+            if self._of_cpu
+            else ""
+        )
+        return Load(reads, by_pdu_size(count), NOTE + beside)
+
     # -- reading -------------------------------------------------------------------------------------------------------
+
+    def _used(self, pdu_size: int) -> int:
+        """Return the PDU size that requests use, of the size that the controller granted."""
+        limit = self.options.packetSize or pdu_size
+        return min(pdu_size, max(pdu.MIN_PDU_SIZE, limit + pdu.READ_OVERHEAD))
 
     def _reads(self) -> list[Read]:
         if self._image is None:
             raise ConnectorError("the layout has no status area")
         self._cpu.begin()
-        limit = self.options.packetSize or self.pdu_size
-        self._planner.use(min(self.pdu_size, max(pdu.MIN_PDU_SIZE, limit + pdu.READ_OVERHEAD)))
+        self._planner.use(self._used(self.pdu_size))
         requests = max(1, self._planner.count)
         depth = min(max(1, self.jobs // requests), MAX_DEPTH)
         return [TableRead(self._planner, self._queue_again, self._store) for _ in range(depth)]

@@ -388,6 +388,54 @@ def test_check_prints_processes_sources_and_sizes(
     assert instance not in instances()
 
 
+def test_check_says_what_is_read_and_written(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check"]) == 0
+    output = capsys.readouterr().out
+    assert "\n    reads bytes 0 to 2179 of DB201:\n" in output
+    first = "with a PDU of 240 bytes in 10 requests a cycle, one after the other; 20 ms need a round trip below 2 ms\n"
+    assert first in output
+    assert "\n    writable: 19 registers: Outputs, Robot_*/*\n" in output
+
+
+def test_check_says_whether_a_period_can_be_met(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "--round-trip-ms", "4"]) == 0
+    output = capsys.readouterr().out
+    assert "5 requests a cycle, one after the other: at least 20 ms; the period of 20 ms cannot be met\n" in output
+    assert "3 requests a cycle, one after the other: at least 12 ms; the period of 20 ms can be met\n" in output
+    assert "warning" not in output, "it depends on the controller"
+    assert main(["check", "--json", "--round-trip-ms", "7"]) == 0, "a warning is no fault"
+    found = json.loads(capsys.readouterr().out)
+    cases = found["sources"][0]["requests"]
+    assert [(one["cycle_ms"], one["met"]) for one in cases] == [(70, False), (35, False), (21, False)]
+    [warning] = found["warnings"]
+    assert warning == (
+        "supervisor.toml: warning: source[0].period_ms: 20 ms cannot be met with a round trip of 7 ms, with one "
+        "request at a time: a cycle takes at least 21 ms; raise period_ms above it, or read less"
+    )
+    example("period_ms = 20", "period_ms = 25")
+    assert main(["check", "--round-trip-ms", "7"]) == 0
+    assert capsys.readouterr().out.endswith("no faults found\n")
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "fast", "1e9"])
+def test_check_refuses_what_is_no_round_trip(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["check", f"--round-trip-ms={text}"])
+    assert ended.value.code == 2
+    assert f"{text!r} is not a number of milliseconds above 0" in capsys.readouterr().err
+
+
+def test_check_says_that_a_server_sends_values(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("tags.toml").write_text('[registers]\n"v" = { type = "REAL", address = "ns=2;i=1", writable = true }\n')
+    source = '[[source]]\nname = "cell"\nconnector = "opcua"\nurl = "opc.tcp://server"\nlayout = "tags.toml"\n'
+    Path("supervisor.toml").write_text(f'[instance]\nname = "x"\n{source}')
+    assert main(["check", "--round-trip-ms", "1000"]) == 0
+    output = capsys.readouterr().out
+    assert "    reads 1 node, without requests in each cycle: the server sends what has changed, at most" in output
+    assert "    writable: 1 register: v\n" in output
+    assert output.endswith("no faults found\n")
+
+
 def test_check_points_out_a_source_that_misses_its_emulator(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     example("port = 1102", "port = 1103")
     assert main(["check"]) == 0
@@ -409,9 +457,17 @@ def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixtu
     [source] = found.pop("sources")
     assert source.pop("ring_bytes") > 1_000_000
     assert source.pop("ring_s") == pytest.approx(10.24)
+    by_pdu_size = source.pop("requests")
+    assert "one request at a time" in source.pop("load_note")
     assert source == {
         "source": "cell", "peer": "127.0.0.1:1102", "block": "DB201", "registers": 22, "bytes": 2180,
-        "ring_frames": 512,
+        "ring_frames": 512, "period_ms": 20.0, "reads": "bytes 0 to 2179 of DB201",
+        "writable": ["Outpts", "Outputs", "Robot_*/*"], "writable_registers": 19,
+    }  # fmt: skip
+    assert [one["requests"] for one in by_pdu_size] == [10, 5, 3]
+    assert by_pdu_size[0] == {
+        "assumption": "PDU of 240 bytes", "requests": 10, "in_flight": 1, "round_trip_limit_ms": 2.0, "cycle_ms": None,
+        "met": None,
     }  # fmt: skip
     [warning] = found.pop("warnings")
     assert "'Outpts' names nothing" in warning

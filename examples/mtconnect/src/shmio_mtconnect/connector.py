@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from shmio.connectors.base import Connector
+from shmio.connectors.load import Load, counted
 from shmio.connectors.register_image import RegisterImage
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
@@ -88,6 +89,11 @@ class MTConnectConnector(Connector):
         """Return the peer and how it is read, for the log."""
         known = len(self._follower.targets) if self._follower is not None else 0
         return f"to {self._options.url}, {known} data items"
+
+    def load(self) -> Load:
+        """Return what is read; no requests, because the agent sends a stream."""
+        note = f"the agent sends what has changed, at most every {self._options.interval} ms"
+        return Load(counted(len(self._addresses), "data item"), note=note)
 
     def connect(self) -> None:
         """Ask for the device model and the present state, and open the stream from there.

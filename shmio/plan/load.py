@@ -1,0 +1,40 @@
+"""What the sources of a checked configuration ask of their devices, and which registers may be written."""
+
+from __future__ import annotations
+
+from shmio.config import Source
+from shmio.connectors import registry
+from shmio.connectors.base import Connector
+from shmio.connectors.load import Load
+from shmio.layout.model import Layout
+from shmio.layout.values.write import bits_of, cover
+
+
+def source_load(source: Source, layout: Layout) -> Load | None:
+    """Return what a source asks of its device in a cycle; None if it has no device, or its connector does not say.
+
+    Args:
+        source: A source that was checked.
+        layout: The layout of its block.
+
+    """
+    connector = registry.load(source.connector)
+    if not issubclass(connector, Connector):
+        return None
+    made = connector.for_layout(layout)(registry.convert_options(source.connector, source.options), layout)
+    try:
+        return made.load()
+    finally:
+        made.close()
+
+
+def writable_registers(source: Source, layout: Layout) -> int:
+    """Return how many registers of a checked source commands may write, at least in part."""
+    connector = registry.load(source.connector)
+    if not source.writable or (issubclass(connector, Connector) and not connector.for_layout(layout).can_write):
+        return 0
+    mask = cover(layout, source.writable)
+    return sum(
+        any(mask[at] & bits for at, bits in enumerate(bits_of(register), register.offset))
+        for register in layout.registers
+    )
