@@ -30,6 +30,15 @@ from shmio.segment import instances
 EXAMPLE = ("supervisor.toml", "db201.db")
 EXAMPLE_NAME = "a50"
 SOURCES = (".db", ".udt", ".scl", ".awl")
+TABLES = (".toml", ".csv", ".xlsx")
+"""What tag tables are called."""
+LISTS = (".csv", ".xlsx", ".sdf", ".asc", ".seq")
+"""What tag lists of other tools are called."""
+_URL = re.compile(r"([a-z][a-z.+-]*):/+", re.IGNORECASE)
+TAG_LISTS: Final = (
+    "a device without such files has a tag table: shmio-layout import converts the tag list of another tool, "
+    "shmio-supervisor browse asks an OPC UA server, and docs/how-to/use-a-tag-list.md says how to write one"
+)
 GRPC_PORTS = range(8089, 8189)
 S7_PORTS = range(1102, 1202)
 MAX_SOURCES = 50
@@ -67,6 +76,8 @@ def init(arguments: argparse.Namespace) -> int:
     first = f"fill in {', and '.join(left)}, then " if left else ""
     check, up = (f"shmio-supervisor {verb} {option_for(file)}".rstrip() for verb in ("check", "up"))
     print(printable(f"next: {first}{check}, then {up}"))
+    if text is None:
+        print(f"for a PLC of your own: shmio-supervisor init -c FILE plc.ini FILE.db; {TAG_LISTS}")
     return 0
 
 
@@ -120,6 +131,7 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
     sources = [path for path in files if path.suffix.lower() in SOURCES]
     others = [path for path in files if path not in sources]
     for path in others:
+        _refuse_table(path, file)
         _refuse_foreign(path)
     if not sources or len(others) > 1:
         raise ConfigError(
@@ -208,6 +220,27 @@ def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layo
     if not found:
         raise refused[0]
     return found, warnings + [f"left out: {why.diagnostics[0]}" for why in refused]
+
+
+def _refuse_table(path: Path, file: Path) -> None:
+    """Raise ConfigError if this is a tag list or a server's URL, with what to do with it."""
+    text = str(path)
+    if match := _URL.match(text):  # a path has lost one of the slashes
+        url = f"{match[1]}://{text[match.end() :]}"
+        raise ConfigError(
+            f"{url}: init takes files: shmio-supervisor browse {url} -o tags.toml writes a tag table of what an OPC UA "
+            f"server offers; {_in_source(file, 'tags.toml')}"
+        )
+    suffix = path.suffix.lower()
+    table, others = f"if this is a tag table, {_in_source(file, path.name)}", f"shmio-layout import {path} -o tags.toml"
+    others = f"if it is an export of another tool, {others} makes a tag table of it"
+    remedies = [text for text, kinds in ((table, TABLES), (others, LISTS)) if suffix in kinds]
+    if remedies:
+        raise ConfigError(f"{path}: init takes sources of data blocks; {'; '.join(remedies)}")
+
+
+def _in_source(file: Path, table: str) -> str:
+    return f'write layout = "{table}" and the connector of your device into a [[source]] of {file}'
 
 
 def _refuse_foreign(path: Path) -> None:

@@ -68,6 +68,39 @@ def test_init_writes_the_example_of_the_repository(capsys: pytest.CaptureFixture
         assert Path(name).read_bytes() == (ROOT / name).read_bytes()
 
 
+def test_init_names_tag_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init"]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    with pytest.raises(SystemExit):
+        main(["init", "-h"])
+    usage = " ".join(capsys.readouterr().out.split())
+    for command in ("shmio-layout import", "shmio-supervisor browse", "use-a-tag-list.md"):
+        assert command in last
+        assert command in usage
+
+
+@pytest.mark.parametrize(
+    ("given", "remedies"),
+    [
+        ("tags.toml", ['write layout = "tags.toml" and the connector of your device into a [[source]] of supervisor']),
+        ("tags.csv", ['write layout = "tags.csv" and', "shmio-layout import tags.csv -o tags.toml makes"]),
+        ("PLCTags.xlsx", ["shmio-layout import PLCTags.xlsx -o tags.toml makes"]),
+        ("symbols.sdf", ["shmio-layout import symbols.sdf -o tags.toml makes"]),
+        ("opc.tcp://plc:4840", ["shmio-supervisor browse opc.tcp://plc:4840 -o tags.toml writes"]),
+    ],
+)
+@pytest.mark.parametrize("more", [[], ["cell.db"]])
+def test_init_says_what_to_do_with_a_tag_list(
+    given: str, remedies: list[str], more: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("cell.db").write_text(block("DB7", "Int"))
+    assert main(["init", given, *more]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert [remedy for remedy in remedies if remedy not in error] == []
+    assert not Path("supervisor.toml").exists()
+
+
 @pytest.mark.parametrize("name", ["supervisor.toml", "db201.db"])
 def test_init_never_overwrites(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path(name).write_text("mine")
