@@ -84,8 +84,8 @@ class Emulator(Section):
 
     name: Name
     kind: Text
-    layout: Text | Texts
     listen: Text
+    layout: Text | Texts | None = None
     program: Text = "idle"
     block: Text | None = None
     type_bytes: TypeBytes = {}

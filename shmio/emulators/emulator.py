@@ -1,4 +1,4 @@
-"""An emulated controller: a cyclic program, and a server that gives clients access to its block."""
+"""An emulated controller: a cyclic program, and a server that gives clients access to its memory."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from typing import Self
 from snap7.server import CPUState
 
 from shmio.config.address import Address
-from shmio.emulators.programs import program
+from shmio.emulators.areas import AREAS, Place, TableMemory, is_table, place_name
+from shmio.emulators.programs import Idle, program
 from shmio.emulators.s7 import S7Server, Traits
 from shmio.errors import ConfigError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
+from shmio.layout.s7.address import Area
 
 
 class Emulator:
-    """Runs a program on a data block, and serves that block and others over S7. Start it once.
+    """Runs a program on a data block or tag table, and serves it and others over S7. Start it once.
 
     The program's cycles follow an absolute schedule, so they do not drift; late cycles are skipped
     and counted. Clients read and write between cycles, never within one. A client that stops the
@@ -40,25 +42,30 @@ class Emulator:
         """Prepare the emulator.
 
         Args:
-            layout: The layout of the program's block.
+            layout: The layout of the program's block, or a tag table with addresses.
             program_name: The program to run.
             listen: The address to listen on.
             db_number: The block's number; default: the layout's own.
-            others: Blocks without a program, served under their own numbers.
+            others: Blocks without a program, served under their own numbers, and tag tables.
             max_clients: Maximum number of clients at a time.
             traits: Limits and faults of the server.
 
         Raises:
-            ConfigError: There is no such program, the layout does not suit it, or a number is
-                missing or used twice.
+            ConfigError: There is no such program, the layout does not suit it, a number is missing
+                or used twice, or a block is too short for a tag table.
 
         """
         self._program = program(program_name, layout)
         self._period_s = self._program.period_ms / 1000
         self._server = S7Server(listen, max_clients=max_clients, traits=traits)
-        self._frame = self._serve(layout, db_number)
+        self._memory: dict[Place, bytearray] = {}
+        self._table = TableMemory(layout) if is_table(layout) else None
+        self._frame = bytearray(layout.size) if self._table else self._serve(layout, db_number)
         for other in others:
-            self._serve(other)
+            if not is_table(other):
+                self._serve(other)
+        tables = [TableMemory(one) for one in others if is_table(one)]
+        self._serve_tables([self._table, *tables] if self._table else tables)
         self._thread = threading.Thread(target=self._run, name=f"program-{program_name}", daemon=True)
         self._stopping = threading.Event()
         self._failure: Exception | None = None
@@ -119,11 +126,41 @@ class Emulator:
             raise ConfigError(f"dbNumber: the layout {layout.name!r} names no number; give one")
         frame, _ = initial_frame(layout)
         self._server.add_block(number, frame)
+        self._memory[Area.BLOCK, number] = frame
         return frame
+
+    def _serve_tables(self, tables: Sequence[TableMemory]) -> None:
+        """Serve the areas that tables need, besides the blocks, with their initial values."""
+        present = frozenset(self._memory)
+        sizes: dict[Place, int] = {}
+        for table in tables:
+            for place, size in table.needs.items():
+                sizes[place] = max(sizes.get(place, 0), size)
+        for place, size in sizes.items():
+            if place in present:
+                if len(self._memory[place]) < size - 1:
+                    raise ConfigError(
+                        f"layout: a tag table needs {size} bytes of {place_name(place)}, whose layout has "
+                        f"{len(self._memory[place])}: correct one of them"
+                    )
+                continue
+            area = self._memory[place] = bytearray(size)
+            if place[0] is Area.BLOCK:
+                self._server.add_block(place[1], area)
+            else:
+                self._server.add_area(AREAS[place[0]], area)
+        for table in tables:
+            table.fill(self._memory, present)
 
     def _step(self, cycle: int) -> None:
         with self._server.lock:
-            self._program.step(cycle * self._period_s, self._frame)
+            if self._table is None:
+                self._program.step(cycle * self._period_s, self._frame)
+            elif not isinstance(self._program, Idle):
+                self._table.load(self._frame, self._memory)
+                before = bytes(self._frame)
+                self._program.step(cycle * self._period_s, self._frame)
+                self._table.store(before, self._frame, self._memory)
         self._cycles += 1
 
     def _run(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Protocol
@@ -11,7 +12,8 @@ import numpy as np
 
 from shmio.config.faults import meant
 from shmio.errors import ConfigError
-from shmio.layout.model import Layout
+from shmio.layout.model import NUMBERS, Layout
+from shmio.layout.values.codec import Value, codec
 from shmio.simulation import ModelRunner
 from shmio.simulation.a50 import A50Cell
 
@@ -85,6 +87,33 @@ def _word(generation: int, place: int) -> bytes:
     return ((generation + place * _STRIDE) & 0xFFFF_FFFF_FFFF_FFFF).to_bytes(8, "big")
 
 
+class Wave:
+    """Moves all registers that commands cannot write: numbers swing from 0 to 100, and bits blink.
+
+    Each register has a phase of its own. Texts and times keep their values, and so do the registers
+    that a tag table makes writable.
+    """
+
+    period_ms = 50
+    swing_s = 10.0
+
+    def __init__(self, layout: Layout) -> None:
+        """Find the registers; raise ConfigError if there is none."""
+        moved = [one for one in layout.registers if not one.writable and (one.type in NUMBERS or one.type == "BOOL")]
+        if not moved:
+            raise ConfigError("program wave: the layout has no number or BOOL that commands cannot write")
+        self._moved = [(codec(one, layout.byte_order), one.shape, one.type) for one in moved]
+
+    def step(self, time_s: float, frame: bytearray) -> None:
+        """Write the values at this time into the frame."""
+        for place, (own, shape, kind) in enumerate(self._moved):
+            level = 50 - 50 * math.cos(2 * math.pi * (time_s / self.swing_s + place / 16))
+            value: Value = level > 50 if kind == "BOOL" else level if kind in ("REAL", "LREAL") else round(level)
+            for length in reversed(shape):
+                value = [value] * length
+            own.encode_into(value, frame)
+
+
 class Idle:
     """Changes no register: a controller in RUN without a user program."""
 
@@ -114,7 +143,7 @@ class Program(Protocol):
 
 
 IDLE = "idle"
-PROGRAMS: Mapping[str, Callable[[Layout], Program]] = {"a50": A50, "counter": Counter, IDLE: Idle}
+PROGRAMS: Mapping[str, Callable[[Layout], Program]] = {"a50": A50, "counter": Counter, IDLE: Idle, "wave": Wave}
 
 
 def program(name: str, layout: Layout) -> Program:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,9 @@ from shmio.config import Address, Config, Emulator, Mqtt, Source
 from shmio.config.credentials import read_accounts
 from shmio.config.faults import Faults, meant
 from shmio.config.read import examine
-from shmio.emulators.programs import IDLE, program
+from shmio.emulators.areas import TableMemory, is_table, place_name
+from shmio.emulators.emulator import Emulator as Emulated
+from shmio.emulators.programs import IDLE
 from shmio.errors import ConfigError, PathError
 from shmio.injection.program import compile_condition
 from shmio.layout.glob import Glob
@@ -93,7 +96,8 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     emulated: dict[str, tuple[Layout, ...]] = {}
     for index, emulator in enumerate(config.emulator):
         with faults.catching():
-            emulated[emulator.name] = _check_emulator(index, emulator, files)
+            if emulator.layout is not None or not faults:  # else it is not known which sources read it
+                emulated[emulator.name] = _check_emulator(index, emulator, config, files)
     layouts = sources.layouts
     if faults:
         _warn_besides(config, layouts, faults)
@@ -196,26 +200,59 @@ def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
         raise ConfigError(f"recorder.trigger.{error}") from None
 
 
-def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:
-    """Return the blocks that an emulator serves: its program's block, or all if it has none."""
+def _check_emulator(index: int, emulator: Emulator, config: Config, files: LayoutFiles) -> tuple[Layout, ...]:
+    """Return the blocks and tag tables that an emulator serves, that of its program first."""
     key = f"emulator[{index}]"
     if emulator.kind not in EMULATOR_KINDS:
         raise ConfigError(
             f"{key}.kind: {emulator.kind!r} is unknown; valid: {', '.join(EMULATOR_KINDS)}"
             + meant(emulator.kind, EMULATOR_KINDS)
         )
-    if emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
+    if emulator.layout is None:
+        layouts = _read_from(key, emulator, config, files)
+    elif emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
         layouts = files.all(key, emulator)
-        _check_numbers(key, layouts)
-        return layouts
-    layout = files.get(key, emulator, emulator.dbNumber)
+    else:
+        layouts = (files.get(key, emulator, emulator.dbNumber),)
+    blocks = [layout for layout in layouts if not is_table(layout)]
     if emulator.dbNumber is None:
-        _check_numbers(key, (layout,))
+        _check_numbers(key, blocks)
+    elif not blocks:
+        raise ConfigError(f"{key}.dbNumber: leave it out: each address of a tag table names its block")
     try:
-        program(emulator.program, layout)
+        Emulated(layouts[0], emulator.program, Address("", 0), db_number=emulator.dbNumber, others=layouts[1:])
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
-    return (layout,)
+    return layouts
+
+
+def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles) -> tuple[Layout, ...]:
+    """Return the blocks and tag tables of the sources that read an emulator without a layout of its own."""
+    for name in ("block", "dbNumber", "type_bytes"):
+        if getattr(emulator, name):
+            raise ConfigError(f"{key}.{name}: needs a layout beside it")
+    listen = str(Address.parse(emulator.listen))
+    blocks: dict[int | None, Layout] = {}
+    tables: dict[bytes, Layout] = {}
+    for index, source in enumerate(config.source):
+        if source.connector != "s7" or peer(source) != listen:
+            continue
+        number = source.options.get("dbNumber")
+        layout = files.get(f"source[{index}]", source, number)
+        if is_table(layout):
+            tables[layout.hash] = layout
+            continue
+        layout = dataclasses.replace(layout, number=number or layout.number)
+        known = blocks.get(layout.number)
+        if known is None or known.size < layout.size:
+            blocks[layout.number] = layout
+    layouts = *blocks.values(), *tables.values()
+    if not layouts:
+        raise ConfigError(f'{key}.layout: this key is needed, because no source with connector = "s7" reads {listen}')
+    if emulator.program != IDLE and len(layouts) > 1:
+        held = ", ".join(layout.name for layout in layouts)
+        raise ConfigError(f"{key}.layout: this key is needed: program {emulator.program} runs on one of {held}")
+    return layouts
 
 
 def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
@@ -329,16 +366,33 @@ def _near(pattern: str, layout: Layout) -> str:
 
 
 def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
-    """Yield warnings about sources whose emulator in this file does not serve their block."""
+    """Yield warnings about sources whose emulator in this file does not serve what they read."""
     for index, source in enumerate(config.source):
-        wanted = source.options.get("dbNumber") or layouts[source.name].number
+        layout = layouts[source.name]
+        number = source.options.get("dbNumber") or layout.number
+        wanted = [f"DB{number}"] if number else []
+        if source.connector == "s7" and is_table(layout):
+            wanted = [place_name(place) for place in TableMemory(layout).needs]
         for emulator in config.emulator:
-            if wanted is None or peer(source) != str(Address.parse(emulator.listen)):
+            if not wanted or peer(source) != str(Address.parse(emulator.listen)):
                 continue
-            served = [emulator.dbNumber or layout.number for layout in emulated[emulator.name]]
-            if wanted not in served:
-                held = ", ".join(f"DB{number}" for number in served)
-                yield f"source[{index}]: it reads DB{wanted} of emulator {emulator.name!r}, which serves only {held}"
+            served = _served(emulator, emulated[emulator.name])
+            if missing := [name for name in wanted if name not in served]:
+                yield (
+                    f"source[{index}]: it reads {', '.join(missing)} of emulator {emulator.name!r}, which serves only "
+                    f"{', '.join(served)}"
+                )
+
+
+def _served(emulator: Emulator, layouts: Sequence[Layout]) -> dict[str, None]:
+    """Return the names of the blocks and areas that an emulator serves, in order."""
+    names: dict[str, None] = {}
+    for layout in layouts:
+        if is_table(layout):
+            names |= {place_name(place): None for place in sorted(TableMemory(layout).needs)}
+        else:
+            names[f"DB{emulator.dbNumber or layout.number}"] = None
+    return names
 
 
 def _not_emulated(config: Config) -> Iterator[str]:

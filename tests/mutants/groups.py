@@ -29,8 +29,8 @@ GROUPS: Final = {
         ),
     ),
     "s7": Group(
-        ("shmio/connectors/s7/*.py",),
-        ("tests/unit/connectors/s7", "tests/conformance/test_s7.py"),
+        ("shmio/connectors/s7/*.py", "shmio/layout/s7/*.py"),
+        ("tests/unit/connectors/s7", "tests/unit/layout/s7", "tests/conformance/test_s7.py"),
     ),
     "commands": Group(
         (

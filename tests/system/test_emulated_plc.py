@@ -1,4 +1,4 @@
-"""The page on emulated controllers, followed step by step: files, commands and output."""
+"""The pages on emulated controllers, followed step by step: files, commands and output."""
 
 from __future__ import annotations
 
@@ -17,21 +17,20 @@ from shmio.testing.cell import PATIENCE_S, until
 from shmio.testing.ports import reserved_port
 from tests.system.page import printed, shell
 
-PAGE = Path(__file__).parents[2] / "docs/how-to/emulate-an-s7-plc.md"
+PAGES = Path(__file__).parents[2] / "docs/how-to"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
 class Reader:
-    """Follows the page, with another port and other instance names."""
+    """Follows a page, with another port and other instance names."""
 
-    def __init__(self, folder: Path, instance: str, port: int) -> None:
-        text = PAGE.read_text().replace("127.0.0.1:1102", f"127.0.0.1:{port}").replace(" 1102", f" {port}")
+    def __init__(self, page: str, folder: Path, instance: str, port: int) -> None:
+        text = (PAGES / page).read_text().replace("127.0.0.1:1102", f"127.0.0.1:{port}").replace(" 1102", f" {port}")
         text = re.sub('^name = "press(-plc)?"\n(?!connector)', rf'name = "{instance}\1"\n', text, flags=re.MULTILINE)
         self.blocks = [(match[1], match[2]) for match in BLOCK.finditer(text)]
         self.folder, self.instance = folder, instance
-        self.source, (self.configuration, self.apart) = self._all("scl")[0], self._all("toml")
 
-    def _all(self, kind: str) -> list[str]:
+    def all(self, kind: str) -> list[str]:
         return [text for found, text in self.blocks if found == kind]
 
     def write(self, name: str, text: str) -> None:
@@ -56,31 +55,52 @@ class Reader:
 
 
 @pytest.fixture
-def reader(tmp_path: Path, instance: str) -> Iterator[Reader]:
+def reader(request: pytest.FixtureRequest, tmp_path: Path, instance: str) -> Iterator[Reader]:
     with ExitStack() as stack:
         address = stack.enter_context(reserved_port())
-        reader = Reader(tmp_path, instance, address.port)
+        reader = Reader(request.param, tmp_path, instance, address.port)
         yield reader
         for file in tmp_path.glob("*.toml"):
             reader.run(f"shmio-supervisor down -c {file.name}")
 
 
+@pytest.mark.parametrize("reader", ["emulate-an-s7-plc.md"], indirect=True)
 def test_the_page_on_emulated_controllers_runs_as_shown(reader: Reader) -> None:
-    reader.write("my.db", reader.source)
-    reader.write("supervisor.toml", reader.configuration)
+    (source,), (configuration, apart) = reader.all("scl"), reader.all("toml")
+    reader.write("my.db", source)
+    reader.write("supervisor.toml", configuration)
     *steps, (unplug, nothing) = reader.steps()
     assert len(steps) > 10
     assert "kill -STOP" in unplug
     assert not nothing
     for commands, shown in steps:
         if commands.startswith("shmio-supervisor reload"):
-            before, _, emulator = reader.configuration.partition("[[emulator]]")
-            assert re.sub(" *#.*", "", emulator) == reader.apart.partition("[[emulator]]")[2]
+            before, _, emulator = configuration.partition("[[emulator]]")
+            assert re.sub(" *#.*", "", emulator) == apart.partition("[[emulator]]")[2]
             reader.write("supervisor.toml", before)
-            reader.write("plc.toml", reader.apart)
+            reader.write("plc.toml", apart)
         reader.follow(commands, shown)
     with shmio.attach(reader.instance) as press:
         reader.follow(unplug, "")
         until(lambda: press.read("press/Fault").reason.startswith("no answer within 1000 ms"), "the reason")
         assert json.loads(reader.run("shmio-supervisor status --json").stdout)["state"] == "degraded"
         until(lambda: press.read("press/Fault").quality is Quality.GOOD, "another process")
+
+
+@pytest.mark.parametrize("reader", ["emulate-a-tag-table.md"], indirect=True)
+def test_the_page_on_emulated_tag_tables_runs_as_shown(reader: Reader) -> None:
+    table, configuration, program = reader.all("toml")
+    reader.write("press.toml", table)
+    reader.write("supervisor.toml", configuration)
+    for commands, shown in reader.steps():
+        reader.follow(commands, shown)
+    reader.write("supervisor.toml", configuration + program)
+    reader.follow("shmio-supervisor reload", "")
+    with shmio.attach(reader.instance) as press:
+        until(lambda: press.read("press/Temperature").quality is Quality.GOOD, "the emulator with its program")
+        seen: set[object] = set()
+        for view in press.stream("press", timeout_s=PATIENCE_S):
+            seen.add(view["Temperature"])
+            assert view["Speed"] == 12.5
+            if len(seen) > 5:
+                break

@@ -21,6 +21,7 @@ from shmio.connectors.s7.mode import MODES, ModeQuery
 from shmio.connectors.s7.query import Query
 from shmio.connectors.s7.userdata import READ_CLOCK, READ_SZL, Service, parse_clock, szl_data, szl_records
 from shmio.layout.model import INTEGERS, Register
+from shmio.layout.s7.address import CPU
 from shmio.layout.values.codec import Value
 from shmio.model.statuses import (
     BAD_NO_DATA,
@@ -31,7 +32,6 @@ from shmio.model.statuses import (
 )
 
 CLOCK_INTERVAL_NS: Final = 1_000_000_000
-_PREFIX: Final = "cpu."
 _MODULES, _COMPONENTS = 0x0011, 0x001C
 _STATE, _CLOCK = "state", "clock"
 
@@ -62,11 +62,6 @@ _CLOCK_LENGTH: Final = 23
 log = logging.getLogger("shmio.source")
 
 
-def is_address(text: str) -> bool:
-    """Return whether an address of a tag table is one of the CPU itself."""
-    return text.strip().lower().startswith(_PREFIX)
-
-
 class CpuTag(NamedTuple):
     """A register with a value of the CPU."""
 
@@ -85,9 +80,9 @@ def parse(place: int, register: Register) -> CpuTag:
 
     """
     text = register.address.strip()
-    name = text.lower().removeprefix(_PREFIX)
+    name = text.lower().removeprefix(CPU)
     if name not in _NAMES:
-        known = [_PREFIX + one for one in _NAMES]
+        known = [CPU + one for one in _NAMES]
         raise ValueError(
             f"address: {text[:80]!r} is none; the CPU has {', '.join(known)}{meant(text.lower()[:80], known)}"
         )
@@ -177,7 +172,7 @@ class CpuValues:
             self._news[tag.place] = value, GOOD if value is not None else status, now_ns
             if (value is None) == (tag.place in self._bad):
                 continue
-            name = f"{tag.register.path} ({_PREFIX}{tag.name})"
+            name = f"{tag.register.path} ({CPU}{tag.name})"
             if value is None:
                 self._bad.add(tag.place)
                 bad.append(name)

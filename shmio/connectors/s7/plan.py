@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 from shmio.connectors.s7 import pdu
-from shmio.connectors.s7.address import Area
+from shmio.layout.s7.address import Area
 
 MAX_ITEMS: Final = 20
 """Items of a job that all known controllers accept."""

@@ -17,7 +17,6 @@ from shmio.connectors.base import Connector
 from shmio.connectors.load import Load, counted
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.s7 import cpu, pdu
-from shmio.connectors.s7.address import Area, parse
 from shmio.connectors.s7.blocks import ITEM_OVERHEAD, JOB_OVERHEAD, BlockWrite, WriteItem, bit_item, byte_item, touches
 from shmio.connectors.s7.drift import BlockWatch, Described
 from shmio.connectors.s7.explain import (
@@ -38,6 +37,7 @@ from shmio.connectors.s7.tag import Tag
 from shmio.errors import ConfigError, ConnectorError, PathError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Layout, Register, bit_positions
+from shmio.layout.s7.address import Area, is_of_cpu, parse
 from shmio.layout.topic import shorten
 from shmio.layout.values.write import Write, apply
 from shmio.model.statuses import (
@@ -364,7 +364,7 @@ class S7TableConnector(S7Session, Connector):
         rates = _rates(options.every, layout)
         for index, register in enumerate(layout.registers):
             try:
-                if cpu.is_address(register.address):
+                if is_of_cpu(register.address):
                     of_cpu.append(cpu.parse(index, register))
                     continue
                 address = parse(register)

@@ -1,151 +1,17 @@
-"""Converts a register of a tag table between the controller's bytes and those of the image."""
+"""A register of a tag table, with its place among the fields that are read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Final
-
-from msgspec.structs import replace
-
-from shmio.connectors.s7.address import Address, Area
 from shmio.connectors.s7.plan import Field
-from shmio.errors import ValueRangeError
 from shmio.layout.model import ByteOrder, Register
-from shmio.layout.values.codec import Value, codec, scalar_codec
+from shmio.layout.s7.address import Address
+from shmio.layout.s7.conversion import Conversion
 
-_S5_BASES_MS: Final = (10, 100, 1000, 10_000)
 
-
-class Tag:
-    """A register, its address, and the conversion of its values."""
+class Tag(Conversion):
+    """A register, its address, the conversion of its values, and how often it is read."""
 
     def __init__(self, index: int, register: Register, address: Address, byte_order: ByteOrder, every: int = 1) -> None:
-        self.index, self.register, self.address = index, register, address
-        self._order = byte_order
-        unit = 2 if address.area.numbered else 1
-        start = address.start * unit
-        self.field = Field(index, address.area, address.db, start, start + address.size, every)
-        element = register.element
-        self._converted = (
-            address.kind is not element or register.scale is not None or address.area.numbered
-        ) and element.base != "BOOL"
-        plain = element.base == "BOOL" or element.size == 1 or bool(scalar_codec(element, byte_order).plain)
-        self.swapped = 0 if self._converted or not plain else 1 if byte_order == "big" else element.size
-        """Bytes of an element that the image has in the reverse order; 0: only values can be converted."""
-        self._in = replace(
-            register, type=address.kind.name, offset=0, bit=address.bit if not register.dims else register.bit,
-            size=address.size, partial=False,
-        )  # fmt: skip
-        self._out = replace(register, offset=0)
-
-    def image_bytes(self, data: bytes) -> bytes | None:
-        """Return the register's bytes in the image for its bytes in the controller; None if these are no value."""
-        if self.address.bit is not None:
-            bit = data[0] >> self.address.bit & 1
-            return bytes((bit << (self.register.bit or 0),))
-        if self.swapped:
-            return _reversed(data, self.swapped)
-        image = bytearray(self.register.size)
-        try:
-            value = self._number(data)
-            codec(self._out, self._order).encode_into(value, image)
-        except ValueRangeError:
-            return None
-        return bytes(image)
-
-    def _number(self, data: bytes) -> Value:
-        """Return the value of bytes of the controller."""
-        if self.address.area.numbered and self.register.type != "WORD":
-            return _scaled(_bcd(data, self.address.area), self._from_device)
-        return _scaled(codec(self._in, "big").decode(data), self._from_device)
-
-    def _from_device(self, number: Any) -> Any:
-        factor, offset = self.register.scale or (1, 0)
-        value = number * factor + offset if self.register.scale else number
-        return value if self.register.type in ("REAL", "LREAL") or isinstance(value, int | str) else round(value)
-
-    def device_bytes(self, image: bytes, first: int, count: int) -> tuple[int, bytes]:
-        """Return the controller's bytes for elements of a register, and their offset from its start.
-
-        Args:
-            image: The register's bytes in the image.
-            first: The first element.
-            count: The number of elements.
-
-        Raises:
-            ValueError: The bytes are not a valid value, or the controller cannot hold it.
-
-        """
-        kind, element = self.address.kind, self.register.element
-        part = image[first * element.stride : (first + count - 1) * element.stride + element.size]
-        if self.swapped:
-            return first * element.stride, _reversed(part, self.swapped)
-        dims = ((0, count - 1),) if self.register.dims else ()
-        out = replace(self._out, dims=dims, size=len(part), count=count)
-        size = (count - 1) * kind.stride + kind.size
-        inner = replace(self._in, dims=dims, size=size, count=count)
-        data = bytearray(size)
-        value = _scaled(codec(out, self._order).decode(part), self._to_device)
-        try:
-            codec(inner, "big").encode_into(value, data)
-        except ValueRangeError as error:
-            raise ValueError(f"the controller cannot hold the value: {error}") from None
-        return first * kind.stride, bytes(data)
-
-    def _to_device(self, value: Any) -> Any:
-        factor, offset = self.register.scale or (1, 0)
-        number = (value - offset) / factor if self.register.scale else value
-        if self.address.kind.base in ("REAL", "LREAL") or isinstance(number, int | str):
-            return number
-        try:
-            return round(number)
-        except (OverflowError, ValueError):
-            raise ValueError(f"the controller cannot hold {value!r} as {self.address.kind.name}") from None
-
-    def device_bit(self, byte: int) -> int:
-        """Return the controller's byte, from the start of the value, of a byte of the register.
-
-        Raises:
-            ValueError: The controller has no such bits.
-
-        """
-        if not self.swapped:
-            raise ValueError("a bit of a converted value cannot be written: write the whole value")
-        element, inner = divmod(byte, self.swapped)
-        return element * self.swapped + self.swapped - 1 - inner
-
-
-def _reversed(data: bytes, size: int) -> bytes:
-    """Return the bytes with the order reversed in each group of ``size``."""
-    if size == 1:
-        return data
-    if len(data) == size:
-        return data[::-1]
-    swapped = bytearray(len(data))
-    for place in range(size):
-        swapped[place::size] = data[size - 1 - place :: size]
-    return bytes(swapped)
-
-
-def _scaled(value: Value, convert: Callable[[Any], Any]) -> Value:
-    if isinstance(value, list):
-        return [_scaled(item, convert) for item in value]
-    if value is None:
-        raise ValueRangeError("the bytes are not a value of the type")
-    try:
-        converted: Value = convert(value)
-    except (OverflowError, ValueError) as error:
-        raise ValueRangeError(str(error)) from None
-    return converted
-
-
-def _bcd(data: bytes, area: Area) -> Value:
-    """Return a counter's value, or a timer's in ms; both have three BCD digits."""
-    word = int.from_bytes(data, "big")
-    digits = [word >> shift & 0xF for shift in (8, 4, 0)]
-    if max(digits) > 9:
-        raise ValueRangeError(f"0x{word:04X} is not in BCD")
-    number = 100 * digits[0] + 10 * digits[1] + digits[2]
-    if area is Area.COUNTER:
-        return number
-    return number * _S5_BASES_MS[word >> 12 & 3]
+        super().__init__(register, address, byte_order)
+        self.index = index
+        self.field = Field(index, address.area, address.db, self.start, self.stop, every)

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.s7 import pdu
-from shmio.connectors.s7.address import Area
 from shmio.connectors.s7.plan import MAX_ITEMS, Field, merge, most_bytes, pack
+from shmio.layout.s7.address import Area
 
 SIZES = [240, 480, 960]
 

@@ -14,6 +14,8 @@ from typing import Final, NamedTuple
 from shmio.layout.model import NUMBERS, ElementType, Register, array_size, element_type
 
 MAX_NUMBER: Final = 65_535
+CPU: Final = "cpu."
+"""How the addresses of values of the CPU itself begin."""
 _AREA_BYTES: Final = 65_536
 
 
@@ -86,6 +88,11 @@ class Address(NamedTuple):
         name = {Area.INPUT: "I", Area.OUTPUT: "Q", Area.MARKER: "M", Area.PERIPHERAL: "I"}[self.area]
         tail = ":P" if self.area is Area.PERIPHERAL else ""
         return f"%{name}{'' if bit else letter}{self.start}{bit}{tail}"
+
+
+def is_of_cpu(text: str) -> bool:
+    """Return whether an address is that of a value of the CPU itself, not in its memory."""
+    return text.strip().lower().startswith(CPU)
 
 
 def parse(register: Register) -> Address:

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.s7.address import Address, Area, parse
 from shmio.layout.model import Register
+from shmio.layout.s7.address import Address, Area, parse
 from shmio.layout.tags import place_tags
 
 

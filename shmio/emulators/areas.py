@@ -1,0 +1,127 @@
+"""The memory of an emulated controller that the addresses of a tag table need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Final
+
+from snap7.type import SrvArea
+
+from shmio.errors import ConfigError, ValueRangeError
+from shmio.layout.image import initial_frame
+from shmio.layout.model import Layout
+from shmio.layout.s7.address import Area, is_of_cpu, parse
+from shmio.layout.s7.conversion import Conversion
+
+Place = tuple[Area, int]
+"""An area, with the number of a data block; 0 for the others."""
+
+AREAS: Final[Mapping[Area, SrvArea]] = {
+    Area.INPUT: SrvArea.PE,
+    Area.OUTPUT: SrvArea.PA,
+    Area.MARKER: SrvArea.MK,
+    Area.TIMER: SrvArea.TM,
+    Area.COUNTER: SrvArea.CT,
+}
+"""The areas that are not data blocks, with python-snap7's names."""
+_LETTERS: Final = {Area.INPUT: "%I", Area.OUTPUT: "%Q", Area.MARKER: "%M", Area.TIMER: "%T", Area.COUNTER: "%C"}
+_LEAST: Final = dict.fromkeys(AREAS, 1024) | {Area.TIMER: 512, Area.COUNTER: 512}
+"""Bytes that these areas have at least, about as many as those of an S7-300."""
+
+
+def is_table(layout: Layout) -> bool:
+    """Return whether a layout is a tag table with addresses, and not that of a data block."""
+    return any(register.address for register in layout.registers)
+
+
+def place_name(place: Place) -> str:
+    """Return the name of an area in TIA Portal's notation."""
+    return f"DB{place[1]}" if place[0] is Area.BLOCK else _LETTERS[place[0]]
+
+
+class TableMemory:
+    """The registers of a tag table in the controller's memory."""
+
+    def __init__(self, layout: Layout) -> None:
+        """Find the place of each register; those of the CPU itself have none.
+
+        Raises:
+            ConfigError: An address is wrong.
+
+        """
+        self.layout = layout
+        self._conversions: list[Conversion] = []
+        for register in layout.registers:
+            if is_of_cpu(register.address):
+                continue
+            try:
+                self._conversions.append(Conversion(register, parse(register), layout.byte_order))
+            except ValueError as error:
+                raise ConfigError(f"layout: {register.path}: {error}") from None
+
+    @property
+    def needs(self) -> dict[Place, int]:
+        """The areas that the registers need, with the bytes of each; even, as in a controller."""
+        sizes: dict[Place, int] = {}
+        for one in self._conversions:
+            place = _place(one)
+            sizes[place] = max(sizes.get(place, _LEAST.get(place[0], 0)), one.stop + (one.stop & 1))
+        return sizes
+
+    def fill(self, memory: Mapping[Place, bytearray], present: frozenset[Place] = frozenset()) -> None:
+        """Store the initial values, those that the table gives after those of the types.
+
+        Args:
+            memory: The areas.
+            present: Areas that have values already: there, only the values of the table are stored.
+
+        """
+        frame, _ = initial_frame(self.layout)
+        for given in (False, True):
+            for one in self._conversions:
+                if given is (one.register.initial is not None) and (given or _place(one) not in present):
+                    with suppress(ValueError, ValueRangeError):  # such as 0 with a scale that cannot give it
+                        _store(one, frame, memory)
+
+    def load(self, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
+        """Put the registers' values into an image; what is no value leaves the image as it is."""
+        for one in self._conversions:
+            found = one.image_bytes(bytes(memory[_place(one)][one.start : one.stop]))
+            if found is not None:
+                offset = one.register.offset
+                frame[offset : offset + len(found)] = found
+
+    def store(self, before: bytes, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
+        """Put the registers of an image that have changed into the memory, if it can hold their values."""
+        for one in self._changed(before, frame):
+            with suppress(ValueError, ValueRangeError):
+                _store(one, frame, memory)
+
+    def _changed(self, before: bytes, frame: bytearray) -> Iterator[Conversion]:
+        for one in self._conversions:
+            start, stop = one.register.offset, one.register.offset + one.register.size
+            if before[start:stop] != frame[start:stop]:
+                yield one
+
+
+def _place(one: Conversion) -> Place:
+    area = one.address.area
+    return (Area.INPUT if area is Area.PERIPHERAL else area), one.address.db
+
+
+def _store(one: Conversion, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
+    """Store a register of an image.
+
+    Raises:
+        ValueError: The controller cannot hold the value.
+
+    """
+    register, area = one.register, memory[_place(one)]
+    own = bytes(frame[register.offset : register.offset + register.size])
+    if one.address.bit is not None:
+        mask = 1 << one.address.bit
+        area[one.start] = area[one.start] & ~mask | (mask if own[0] >> (register.bit or 0) & 1 else 0)
+        return
+    at, data = (0, own) if register.type == "BOOL" else one.device_bytes(own, 0, register.count)
+    area[one.start + at : one.start + at + len(data)] = data
