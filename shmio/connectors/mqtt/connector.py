@@ -19,7 +19,7 @@ from shmio.connectors.mqtt.commands import Command, plan
 from shmio.connectors.mqtt.link import Link, Publication, UnsupportedVersionError, version_of
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
-from shmio.errors import ConnectorError
+from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
 
@@ -46,8 +46,15 @@ class MqttConnector(Connector):
         self._version = version_of(options.version)
         self._link: Link | None = None
         self._last_number = 0
-        self._password = read_password(options.password_file, "password_file") if options.password_file else None
-        self._context = _context(options)
+        self._secrets()  # a wrong file is an error of the configuration now, and of the connection later
+
+    def _secrets(self) -> tuple[str | None, ssl.SSLContext | None]:
+        """Read the files that the keys name, which may have been replaced; ConfigError."""
+        options = self._options
+        password = read_password(options.password_file, "password_file") if options.password_file else None
+        if not options.tls:
+            return password, None
+        return password, client_context(MqttTls(ca=options.ca, certificate=options.certificate, key=options.key), "")
 
     @property
     def timeout_s(self) -> float:
@@ -103,8 +110,12 @@ class MqttConnector(Connector):
 
     def _open(self, until_s: float) -> list[str]:
         store = self._store
+        try:
+            password, context = self._secrets()
+        except ConfigError as error:
+            raise ConnectorError(str(error)) from None
         link = self._link = Link(
-            self._options, self._client_id, self._password, self._context, store.take, store.wake, self._last_number
+            self._options, self._client_id, password, context, store.take, store.wake, self._last_number
         )
         try:
             return link.open(self._version, store.filters, until_s)
@@ -184,12 +195,6 @@ class MqttConnector(Connector):
             for one in sent:
                 if one.number is not None:
                     one.outcome = link.outcome(one.number, one.publication.topic, retain=one.publication.retain)
-
-
-def _context(options: MqttOptions) -> ssl.SSLContext | None:
-    if not options.tls:
-        return None
-    return client_context(MqttTls(ca=options.ca, certificate=options.certificate, key=options.key), "")
 
 
 def _mark(outcomes: list[str | Lost], commands: Sequence[Command], sent: Sequence[Command]) -> None:

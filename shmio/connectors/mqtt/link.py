@@ -7,6 +7,7 @@ lives, and that what it sends is not behind.
 
 from __future__ import annotations
 
+import logging
 import socket
 import ssl
 import threading
@@ -31,8 +32,8 @@ from shmio.logs import printable
 
 MAX_PACKET_BYTES: Final = (1 << 24) + (1 << 17)
 """A larger packet ends the connection. The largest payload that an option allows fits."""
-MAX_FILTERS: Final = 100
-"""Most filters of a SUBSCRIBE."""
+MAX_FILTERS: Final = 8
+"""Most filters of a SUBSCRIBE. Some brokers end the connection for more (AWS IoT Core)."""
 MAX_IN_FLIGHT: Final = 20
 HEAD_BYTES: Final = 128
 """Maximum size of the parts of a PUBLISH other than topic and payload."""
@@ -43,6 +44,8 @@ _UNSUPPORTED: Final = "Unsupported protocol version"
 _LOGIN: Final = frozenset({0x86, 0x87})
 _TAKEN_OVER: Final = 0x8E
 _NO_SUBSCRIBERS: Final = 0x10
+
+log = logging.getLogger("shmio.source.mqtt")
 
 
 class Deliver(Protocol):
@@ -438,8 +441,16 @@ class Link:
             self._condition.notify_all()
 
     def _on_message(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
-        with suppress(UnicodeDecodeError):  # a topic that is no text is none of ours
-            self._deliver(message.topic, bytes(message.payload), retained=message.retain)
+        try:
+            topic = message.topic
+        except UnicodeDecodeError:  # it is none of ours
+            return
+        try:
+            self._deliver(topic, bytes(message.payload), retained=message.retain)
+        except Exception:
+            log.exception("a message on %s could not be handled", printable(topic))
+            self._fail(f"a message on {printable(topic)[:200]} could not be handled: see the log")
+            raise
 
     def _on_pong(self) -> None:
         with self._condition:

@@ -31,6 +31,8 @@ from shmio.wire import sparkplug_b_pb2 as wire
 REBIRTH: Final = "Node Control/Rebirth"
 MAX_METRICS: Final = 100_000
 """Most metrics of a message."""
+MAX_ALIASES: Final = 1_000_000
+"""Most metrics of a node and all its devices."""
 ASK: Final = Backoff(1.0, 60.0)
 """Waits before a node is asked again for its birth."""
 CALM_NS: Final = 120_000_000_000
@@ -268,6 +270,9 @@ class Node:
             if wanted and device is not None:
                 device.metrics[one.name] = known
                 device.take(known, one, message, payload.timestamp)
+        if len(self._aliases) > MAX_ALIASES:
+            self._lose(f"has more than {MAX_ALIASES} metrics")
+            self._aliases.clear()
 
     def _data(self, device: Device | None, payload: wire.Payload, message: Message) -> None:
         for one in payload.metrics:

@@ -59,6 +59,16 @@ def test_logins(make_broker: Callable[..., Address], tmp_path: Path) -> None:
             connected(address, TAGS, version=version),
         ):
             pass
+    with connected(address, TAGS, **login) as source:  # the password is read again for each connection
+        secret(tmp_path, "wrong")
+        with pytest.raises(ConnectorError, match="check username"):
+            source.connector.connect()
+        secret(tmp_path, "")
+        with pytest.raises(ConnectorError, match=r"password_file: .* is empty"):
+            source.connector.connect()
+        secret(tmp_path, "right")
+        source.connector.connect()
+        source.read()
     wrong = login | {"password_file": secret(tmp_path, "wrong")}
     with pytest.raises(ConnectorError, match="check username, password_file"), connected(address, TAGS, **wrong):
         pass

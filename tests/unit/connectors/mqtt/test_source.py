@@ -288,9 +288,10 @@ def test_a_broker_that_knows_only_mqtt_3() -> None:
     with reserved_port() as address, Peer() as peer:
         peer.ask("broker", address.port)
         peer.ask("connect", address.port, {"protocolVersion": 4})
-        with connected(address, TAGS) as source:
+        with connected(address, TAGS | {"fixed": ("INT", "fixed/number")}) as source:
             peer.publish("plant/pos", "3")
             source.until(lambda: source.value("pos") == 3.0)
             assert "MQTT 3.1.1" in source.connector.describe()
+            assert source.code("fixed") == statuses.BAD_USER_ACCESS_DENIED  # alone
         with pytest.raises(ConnectorError, match="version"), connected(address, TAGS, version="5"):
             pass
