@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+import shmio
+from shmio.model.values import Quality, Reading
 from shmio.testing.cell import Cell, kill, until
 from shmio.testing.mosquitto import missing
 from shmio.testing.ports import reserved_port
@@ -55,37 +56,37 @@ def test_a_device_at_the_broker_of_the_instance(make_cell: Callable[..., Cell]) 
         def quality(name: str) -> Any:
             return cell.processes()[name]["quality"]
 
-        def lamp() -> dict[str, Any]:
-            found: dict[str, Any] = json.loads(cell.output("shmio", "get", "--json", "lamp"))
-            return found
-
         def publish(topic: str, payload: str) -> None:
             command = ["mosquitto_pub", "-h", broker.host, "-p", str(broker.port), "-q", "1", "-r", "-t", topic]
             subprocess.run([*command, "-m", payload], check=True, timeout=20)
 
         until(lambda: quality("lamp") == "good", "good quality")
-        assert "BadWaitingForInitialData" in lamp()["lamp/lamp/On"]["reason"]
-        publish("plant/lamp/state", '{"on": true, "power": 12.5}')
-        publish("plant/lamp/there", "online")
-        until(lambda: lamp()["lamp/lamp/On"]["quality"] == "good", "a good register")
-        found = lamp()
-        assert (found["lamp/lamp/On"]["value"], found["lamp/lamp/Power"]["value"]) == (True, 12.5)
-        assert "BadNotFound" in found["lamp/lamp/Gone"]["reason"]
-        device.ask("connect", broker.port)
-        device.ask("subscribe", "plant/lamp/set")
-        cell.output("shmio", "set", "lamp/lamp/On", "false")
-        assert device.ask("next", "plant/lamp/set")["payload"] == '{"on":false}'
-        assert "not writable" in cell.run("shmio", "set", "lamp/lamp/Power", "1").stderr
-        publish("plant/lamp/there", "offline")
-        until(lambda: "BadNoCommunication" in lamp()["lamp/lamp/On"]["reason"], "a device that is gone")
-        assert "is not there" in cell.run("shmio", "set", "lamp/lamp/On", "true").stderr
+        with shmio.attach(cell.instance) as programs:
 
-        kill(cell.processes()["broker"]["pid"])
-        until(lambda: quality("lamp") == "bad", "bad quality")
-        until(lambda: quality("lamp") == "good", "good quality with the next broker")
-        publish("plant/lamp/there", "online")
-        publish("plant/lamp/state", '{"on": false, "power": 0}')
-        until(lambda: lamp()["lamp/lamp/On"]["quality"] == "good", "a good register")
-        assert lamp()["lamp/lamp/On"]["value"] is False
+            def lamp(name: str) -> Reading:
+                return programs.read(f"lamp/lamp/{name}")
+
+            assert "BadWaitingForInitialData" in lamp("On").reason
+            publish("plant/lamp/state", '{"on": true, "power": 12.5}')
+            publish("plant/lamp/there", "online")
+            until(lambda: lamp("On").quality is Quality.GOOD, "a good register")
+            assert (lamp("On").value, lamp("Power").value) == (True, 12.5)
+            assert "BadNotFound" in lamp("Gone").reason
+            device.ask("connect", broker.port)
+            device.ask("subscribe", "plant/lamp/set")
+            cell.output("shmio", "set", "lamp/lamp/On", "false")
+            assert device.ask("next", "plant/lamp/set")["payload"] == '{"on":false}'
+            assert "not writable" in cell.run("shmio", "set", "lamp/lamp/Power", "1").stderr
+            publish("plant/lamp/there", "offline")
+            until(lambda: "BadNoCommunication" in lamp("On").reason, "a device that is gone")
+            assert "is not there" in cell.run("shmio", "set", "lamp/lamp/On", "true").stderr
+
+            kill(cell.processes()["broker"]["pid"])
+            until(lambda: quality("lamp") == "bad", "bad quality")
+            until(lambda: quality("lamp") == "good", "good quality with the next broker")
+            publish("plant/lamp/there", "online")
+            publish("plant/lamp/state", '{"on": false, "power": 0}')
+            until(lambda: lamp("On").quality is Quality.GOOD, "a good register")
+            assert lamp("On").value is False
         assert {name: cell.processes()[name]["restarts"] for name in ("lamp", "other")} == {"lamp": 0, "other": 0}
         assert quality("other") == "good"
