@@ -189,7 +189,7 @@ class Link:
 
         """
         self.version = version
-        opened = self._connected_socket()
+        opened = self._connected_socket(until_s)
         client = self._client = _Client(opened, self._client_id, version, self.last_number)
         client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
         client.on_subscribe, client.on_publish = self._on_subscribe, self._on_publish
@@ -218,10 +218,11 @@ class Link:
         self.ping()  # what the broker has kept comes before the answer
         return refused
 
-    def _connected_socket(self) -> socket.socket:
-        peer, timeout_s = self.peer, self._options.timeout / 1000
+    def _connected_socket(self, until_s: float) -> socket.socket:
+        peer = self.peer
         try:
-            opened = tcp.connect(tcp.look_up(peer.host, peer.port), timeout_s)
+            places = tcp.look_up(peer.host, peer.port)
+            opened = tcp.connect(places, max(0.001, self._soon(until_s) - time.monotonic()))
         except TimeoutError:
             raise ConnectorError(f"no answer within {self._options.timeout} ms from {peer}") from None
         except OSError as error:
@@ -229,7 +230,7 @@ class Link:
         if self._context is None:
             return opened
         try:
-            opened.settimeout(timeout_s)
+            opened.settimeout(max(0.001, self._soon(until_s) - time.monotonic()))
             return self._context.wrap_socket(opened, server_hostname=peer.host)
         except TimeoutError:
             opened.close()
@@ -402,7 +403,8 @@ class Link:
             return f"{self.peer}: {_tls(client.tls_error)}"
         if self._connack is None:
             missing = "TLS there (mqtts://)" if self._context is None else "a client certificate (certificate, key)"
-            return f"{self.peer} closed the connection before it accepted the login: it may expect {missing}"
+            older = ", or MQTT 3.1.1 (version)" if self.version == MQTTv5 else ""
+            return f"{self.peer} closed the connection before it accepted the login: it may expect {missing}{older}"
         twin = f"; does another client connect as {self._client_id} (client_id)?" if self._options.client_id else ""
         return f"the connection to {self.peer} was lost{twin}"
 

@@ -249,8 +249,7 @@ class Node:
             if device is not None:
                 device.end(died=True)
         elif device is not None and not device.born:
-            if not device.died:
-                self._lose(f"{device} sends data without a birth")
+            self._lose(f"{device} sends data without a birth")
         else:
             self._data(device, payload, message)
 

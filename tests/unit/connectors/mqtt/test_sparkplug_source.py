@@ -131,7 +131,7 @@ def test_null_and_quality_and_history(plant: Plant, edge: Edge) -> None:
         assert source.code("axis/name") == statuses.BAD_OUT_OF_RANGE
 
 
-@pytest.mark.parametrize("fault", ["gap", "alias", "no birth", "garbage"])
+@pytest.mark.parametrize("fault", ["gap", "alias", "no birth", "after death", "garbage"])
 def test_what_cannot_be_trusted_is_bad_until_a_new_birth(
     plant: Plant, edge: Edge, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,6 +146,9 @@ def test_what_cannot_be_trusted_is_bad_until_a_new_birth(
             edge.send("DDATA", "robot", metric | {"alias": 77})
         elif fault == "no birth":
             edge.send("DDATA", "other", {"name": "n", "type": "Int32", "value": 1})
+        elif fault == "after death":
+            edge.send("DDEATH", "robot")
+            edge.send("DDATA", "robot", metric)
         else:
             edge.peer.ask("publish", f"{GROUP}/NDATA/cell", {"hex": "ffffffff"})
         source.until(lambda: set(CODES(source)) == {WAITING})
