@@ -23,7 +23,9 @@ class Plant:
     The device accepts every write unless ``refusal`` gives a reason.
     """
 
-    def __init__(self, writer: BlockWriter, *, armed: bool = True) -> None:
+    def __init__(
+        self, writer: BlockWriter, *, armed: bool = True, allow_nonfinite: Sequence[str] = ("axis/position",)
+    ) -> None:
         self.writer = writer
         self.memory = bytearray(writer.block.layout.size)
         self.written: list[Write] = []
@@ -34,10 +36,11 @@ class Plant:
         self.output = Output(writer)
         self.commands = CommandProcessor(
             self.output, writer.block.attributes.writable, time.monotonic_ns,
-            allow_nonfinite=["axis/position"], armed=armed, owner_of=self.owners.get,
+            allow_nonfinite=allow_nonfinite, armed=armed, owner_of=self.owners.get,
         )  # fmt: skip
         self.commands.open()
-        self._cycles = 0
+        self.cycles = 0
+        """Number of cycles so far."""
         self._stop = threading.Event()
         self._threads = [threading.Thread(target=self.commands.run)]
         self._threads[0].start()
@@ -49,9 +52,9 @@ class Plant:
                 self.commands.carry_out(self._write)
         except ConnectorError as error:
             self.commands.close(str(error))
-        self._cycles += 1
+        self.cycles += 1
         image = bytes(self.memory)
-        self.output.publish(Image(image, self._cycles, time.time_ns(), self.quality, Provenance.LIVE, ""))
+        self.output.publish(Image(image, self.cycles, time.time_ns(), self.quality, Provenance.LIVE, ""))
 
     def run(self, period_s: float = 0.002) -> None:
         """Run cycles until stopped."""

@@ -17,7 +17,7 @@ from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1.declare import DeclareCall
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_PATTERNS, Selections, SourceDirection
-from shmio.endpoints.grpc.shmio_v1.tables import VALUES, Array, head, head_of, pack, pack_slots
+from shmio.endpoints.grpc.shmio_v1.tables import VALUES, Array, StatusChanges, head, head_of, pack, pack_slots
 from shmio.endpoints.grpc.shmio_v1.write import MAX_VALUES, assigned, outcome, packed
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import SendQueue
@@ -209,6 +209,7 @@ class InjectCall(InjectionFollower):
         self._room = asyncio.Semaphore(MAX_OPEN)
         self._shown: Frame | None = None
         self._shown_image = b""
+        self._sent: Frame | None = None  # that of the last originals
         self._timer: asyncio.TimerHandle | None = None
         self._in_order = asyncio.Lock()
 
@@ -383,14 +384,18 @@ class InjectCall(InjectionFollower):
             self._shown = frame
             return None
         before = self._shown_image if shown is not None and shown.source_ns else None
-        body = b""
+        body, statuses = b"", StatusChanges(b"", codes=False)
         if frame.source_ns:
             columns = self._view.columns
             values = pack(columns.decode(image), None if before is None else columns.decode(before))
             body = (field(VALUES, values) if values else b"") + self._ranges.differing(image, before)
+            statuses = self._view.statuses(frame, None if before is None else self._sent)
         quality = shown is None or frame.quality != shown.quality
         self._shown, self._shown_image = frame, image
-        return head(self._view.number, frame, whole=before is None) + body if body or quality else None
+        if not (body or quality or statuses.codes):
+            return None
+        self._sent = frame
+        return head(self._view.number, frame, whole=before is None) + body + statuses.field
 
     def divert(self, diverted: CommandWrites) -> None:
         """Handle diverted values: over ``/in`` writes, over ``/out`` values of inner layers."""

@@ -138,7 +138,7 @@ def _reading(view: View, *, originals: bool) -> bytes:
     frame = view.block.latest()
     if frame is None:
         return wire.Update(table=view.number, reason="no data yet", whole=True).SerializeToString()
-    update = b"".join(view.update(frame))
+    update = view.update(frame).whole
     quality, reason = view.block.assess(frame)
     if quality is not frame.quality:
         update += stale_fields(reason)

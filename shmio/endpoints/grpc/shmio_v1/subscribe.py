@@ -95,7 +95,7 @@ class EveryFrame:
         frame = follower.poll()
         if frame is None:
             return _stale_update(self.view, follower)
-        update = b"".join(self.view.update(frame, follower.frame))
+        update = self.view.update(frame, follower.frame).whole
         if missed := follower.take_missed():
             update += number(MISSED, missed)
         follower.take(frame, aged=not follower.behind)
@@ -112,7 +112,8 @@ class LatestFrame:
         self._interval_s = interval_s
         self._deadband = deadband
         self._last_s = -math.inf
-        self._sent: DecodedImage | None = None  # the receiver's values; only with a dead-band
+        self._values: DecodedImage | None = None  # the receiver's values; only with a dead-band
+        self._sent: Frame | None = None  # that of the last update; only if registers have statuses
 
     def next(self, now_s: float) -> bytes | None:
         """Return the changes of the newest frame, or an update that reports the last one as stale."""
@@ -134,18 +135,21 @@ class LatestFrame:
         was_stale = follower.stale
         follower.take(frame)
         stale = stale_fields(follower.reason) if follower.stale else b""
-        if shown is not None and not (update.body or stale or was_stale or _state(frame) != _state(shown)):
+        if shown is not None and not (update.changed or stale or was_stale or _state(frame) != _state(shown)):
             return None
         self._last_s = now_s
-        return b"".join(update) + stale
+        if self.view.block.statuses is not None:
+            self._sent = frame
+        return update.whole + stale
 
     def _update(self, frame: Frame, shown: Frame | None) -> UpdateMessage:
         if not (self._deadband and isinstance(self.view, Selection)):
-            return self.view.update(frame, shown)
-        if shown is None or self._sent is None or not shown.source_ns:
-            self._sent = self.view.decode(frame)
+            return self.view.update(frame, shown, self._sent)
+        if shown is None or self._values is None or not shown.source_ns:
+            self._values = self.view.decode(frame)
             return self.view.update(frame)
-        update, self._sent = self.view.update_beyond(frame, shown, self._sent, self._deadband)
+        sent = self._sent or shown
+        update, self._values = self.view.update_beyond(frame, shown, sent, self._values, self._deadband)
         return update
 
 

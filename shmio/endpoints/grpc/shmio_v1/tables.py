@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -348,13 +348,31 @@ def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:
 
 
 class UpdateMessage(NamedTuple):
-    """A serialised ``Update`` in two parts.
-
-    ``body`` has the changes; it is empty if there are none.
-    """
+    """A serialised ``Update`` in two parts."""
 
     head: bytes
     body: bytes
+    """The changes; empty if there are none."""
+    changed: bool
+    """True if there are other changes than those of source times.
+
+    A receiver of the newest values gets these with the next update: there would be one for each
+    frame otherwise.
+    """
+
+    @property
+    def whole(self) -> bytes:
+        """Both parts."""
+        return self.head + self.body
+
+
+class StatusChanges(NamedTuple):
+    """Statuses of registers that have changed."""
+
+    field: bytes
+    """The field of an ``Update``; empty if there are none."""
+    codes: bool
+    """True if a status code has changed, not only source times."""
 
 
 class WriteUpdates:
@@ -436,7 +454,7 @@ class Selection:
         self.elements = sum(register.count for register in registers)
         self.columns = Columns(registers, block.layout.byte_order)
         self._decoded: OrderedDict[int, DecodedImage] = OrderedDict()
-        self._updates: OrderedDict[tuple[int, int], UpdateMessage] = OrderedDict()
+        self._updates: OrderedDict[tuple[int, int, int], UpdateMessage] = OrderedDict()
         self._injected_places: OrderedDict[int, Array] = OrderedDict()
         self._status_indices: Array | None = None
 
@@ -469,30 +487,40 @@ class Selection:
             _trim(self._decoded)
         return found
 
-    def update(self, frame: Frame, before: Frame | None = None) -> UpdateMessage:
+    def update(self, frame: Frame, before: Frame | None = None, sent: Frame | None = None) -> UpdateMessage:
         """Return an ``Update`` with the changes since ``before``, or with everything. It is cached.
 
         Its quality is the one that the frame was published with.
+
+        Args:
+            frame: The new frame.
+            before: The last frame that was compared; None: the update has everything.
+            sent: The frame of the last update that was sent, whose source times the receiver has;
+                default: ``before``.
+
         """
         if before is not None and not before.source_ns:
             before = None
-        key = frame.number, before.number if before else 0
+        if sent is None or self.block.statuses is None:
+            sent = before
+        key = frame.number, before.number if before else 0, sent.number if sent else 0
         found = self._updates.get(key)
         if found is None:
             old = self.decode(before) if before else None
-            found = self._updates[key] = self._update(frame, before, self.decode(frame), old)
+            found = self._updates[key] = self._update(frame, before, self.decode(frame), old, sent)
             _trim(self._updates)
         return found
 
     def update_beyond(
-        self, frame: Frame, before: Frame, sent: DecodedImage, deadband: float
+        self, frame: Frame, before: Frame, sent: Frame, values: DecodedImage, deadband: float
     ) -> tuple[UpdateMessage, DecodedImage]:
         """Return an ``Update`` with the changes that exceed a dead-band.
 
         Args:
             frame: The new frame.
-            before: The frame of the last update.
-            sent: The values that the receiver has now.
+            before: The last frame that was compared.
+            sent: The frame of the last update that was sent.
+            values: The values that the receiver has now.
             deadband: The largest difference that is left out.
 
         Returns:
@@ -500,43 +528,51 @@ class Selection:
 
         """
         new = self.decode(frame)
-        return self._update(frame, before, new, sent, deadband), merge(new, sent, deadband)
+        return self._update(frame, before, new, values, sent, deadband), merge(new, values, deadband)
 
     def _update(
-        self, frame: Frame, before: Frame | None, new: DecodedImage, old: DecodedImage | None, deadband: float = 0.0
+        self,
+        frame: Frame,
+        before: Frame | None,
+        new: DecodedImage,
+        old: DecodedImage | None,
+        sent: Frame | None,
+        deadband: float = 0.0,
     ) -> UpdateMessage:
-        parts = []
+        parts, statuses = [], StatusChanges(b"", codes=False)
         if frame.source_ns:
             if values := pack(new, old, deadband):
                 parts.append(field(VALUES, values))
             if old is None or new.invalid != old.invalid:
                 parts.append(field(INVALID, field(1, np.array(new.invalid, "<u4").tobytes())))
-            parts += self._statuses(frame, before, whole=old is None, changed=bool(parts))
+            statuses = self.statuses(frame, None if old is None else sent)
         now = self.injected(frame)
         if before is None or (now is not (was := self.injected(before)) and not np.array_equal(now, was)):
             parts.append(field(INJECTED, field(1, now.tobytes())))
-        return UpdateMessage(head(self.number, frame, whole=before is None), b"".join(parts))
+        changed = bool(parts) or statuses.codes
+        parts.append(statuses.field)
+        return UpdateMessage(head(self.number, frame, whole=before is None), b"".join(parts), changed)
 
-    def _statuses(self, frame: Frame, before: Frame | None, *, whole: bool, changed: bool) -> Iterator[bytes]:
-        """Yield the field with the statuses, if there are any and some have changed.
+    def statuses(self, frame: Frame, sent: Frame | None) -> StatusChanges:
+        """Return the statuses of a frame that differ from those of the last frame that was sent.
 
-        A change of source times alone counts only if the update has other changes: there would
-        be an update for each frame.
+        Without such a frame, return all.
         """
         area = self.block.statuses
         if area is None:
-            return
+            return StatusChanges(b"", codes=False)
         codes, times = self._status_columns(area, frame)
+        differ = np.ones(len(codes), bool)
         places = np.arange(len(codes))
-        if before is not None and not whole:
-            old_codes, old_times = self._status_columns(area, before)
+        if sent is not None and sent.source_ns:
+            old_codes, old_times = self._status_columns(area, sent)
             differ = codes != old_codes
-            if not (changed or differ.any()):
-                return
             places = np.flatnonzero(differ | (times != old_times))
-        if len(places):
-            columns = places.astype("<u4"), codes[places].astype("<u4"), times[places].astype("<i8")
-            yield field(STATUSES, b"".join(field(at, column.tobytes()) for at, column in enumerate(columns, 1)))
+        if not len(places):
+            return StatusChanges(b"", codes=False)
+        columns = places.astype("<u4"), codes[places].astype("<u4"), times[places].astype("<i8")
+        parts = b"".join(field(at, column.tobytes()) for at, column in enumerate(columns, 1))
+        return StatusChanges(field(STATUSES, parts), codes=bool(differ.any()))
 
     def _status_columns(self, area: StatusArea, frame: Frame) -> tuple[Array, Array]:
         """Return the status codes and source times of the table's registers."""
@@ -607,14 +643,19 @@ class RawFrames:
             size=layout.size,
         ).SerializeToString()
 
-    def update(self, frame: Frame, before: Frame | None = None) -> UpdateMessage:  # noqa: ARG002  a frame is always whole
+    def update(
+        self,
+        frame: Frame,
+        before: Frame | None = None,  # noqa: ARG002  a frame is always whole
+        sent: Frame | None = None,  # noqa: ARG002
+    ) -> UpdateMessage:
         """Return an ``Update`` with the image, and with the original image if injections change it."""
         found = self._updates.get(frame.number)
         if found is None:
             body = field(IMAGE, frame.image) if frame.source_ns else b""
             if frame.source_ns and frame.effective is not None:
                 body += field(ORIGINAL, frame.raw)
-            found = self._updates[frame.number] = UpdateMessage(head(self.number, frame, whole=True), body)
+            found = self._updates[frame.number] = UpdateMessage(head(self.number, frame, whole=True), body, bool(body))
             _trim(self._updates)
         return found
 

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
-from shmio.client import connect_aio
+import pytest
+
+from shmio.client import connect, connect_aio
 from shmio.endpoints.grpc.encoding import Subject, unless_bad
+from shmio.endpoints.grpc.shmio_v1.subscribe import BlockUpdates, EveryFrame, LatestFrame
+from shmio.endpoints.grpc.shmio_v1.tables import Selection
 from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, UNCERTAIN_LAST_USABLE_VALUE
 from shmio.model.values import Quality
-from shmio.segment import BlockWriter, EventKind, Record
+from shmio.segment import BlockWriter, EventKind, Record, Segment
+from shmio.segment import Quality as FrameQuality
+from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire import simlog_v2_pb2 as v2
 from tests.unit.endpoints.grpc.test_grpc import Recorder
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, message, serve
-from tests.unit.statuses import COUNT, LAYOUT, SOURCE_NS, SPEED, first_image, plant
+from tests.unit.endpoints.plant import Plant
+from tests.unit.statuses import COUNT, LAMP, LAYOUT, ROW, SOURCE_NS, SPEED, first_image, plant
 
 
 def served(instance: str, test: Callable[[Endpoint, BlockWriter], Awaitable[None]]) -> None:
@@ -145,5 +152,135 @@ def test_a_value_that_waits_in_a_stream_is_dropped_when_its_register_turns_bad(i
         writer.publish(bytes(image), cycle=2)
         await endpoint.until(dropped)
         feed.leave(speed, stream)
+
+    served(instance, test)
+
+
+@pytest.fixture
+def source(instance: str) -> Iterator[tuple[Segment, BlockWriter]]:
+    with plant(instance) as found:
+        yield found
+
+
+def selection(segment: Segment) -> Selection:
+    return Selection(1, segment.blocks["plant"], LAYOUT.registers)
+
+
+def times(update: bytes | None) -> dict[int, int]:
+    """Return the source times that an update has, without their common part, by the register's index."""
+    assert update is not None
+    found = wire.Update.FromString(update).statuses
+    return {place: time - SOURCE_NS for place, time in zip(found.registers, found.source_ns, strict=True)}
+
+
+@pytest.mark.parametrize("deadband", [0.0, 0.1])
+def test_a_time_that_changed_alone_comes_with_the_next_update(
+    source: tuple[Segment, BlockWriter], deadband: float
+) -> None:
+    segment, writer = source
+    updates, image = LatestFrame(selection(segment), 0.0, deadband), first_image()
+    writer.publish(bytes(image), cycle=1)
+    assert times(updates.next(0.0)) == {COUNT: 0, SPEED: 1, ROW: 2, LAMP: 3}
+    image.put(COUNT, 1, SOURCE_NS + 50)
+    writer.publish(bytes(image), cycle=2)
+    assert updates.next(0.0) is None
+    image.put(LAMP, False, SOURCE_NS + 60)
+    writer.publish(bytes(image), cycle=3)
+    assert times(updates.next(0.0)) == {COUNT: 50, LAMP: 60}
+    image.put(ROW, [1, 2, 3, 4], SOURCE_NS + 70)
+    writer.publish(bytes(image), cycle=4)
+    assert updates.next(0.0) is None
+    image.put(SPEED, 1.5, SOURCE_NS + 80, UNCERTAIN_LAST_USABLE_VALUE)
+    writer.publish(bytes(image), cycle=5)
+    assert times(updates.next(0.0)) == {ROW: 70, SPEED: 80}
+
+
+def test_an_update_about_the_source_has_the_times_that_changed_alone(source: tuple[Segment, BlockWriter]) -> None:
+    segment, writer = source
+    updates, image = LatestFrame(selection(segment), 0.0, 0.0), first_image()
+    writer.publish(bytes(image), cycle=1)
+    updates.next(0.0)
+    image.put(COUNT, 1, SOURCE_NS + 50)
+    writer.publish(bytes(image), cycle=2, quality=FrameQuality.UNCERTAIN, reason="STOP")
+    assert times(updates.next(0.0)) == {COUNT: 50}
+
+
+def test_each_of_all_frames_has_the_times_that_changed(source: tuple[Segment, BlockWriter]) -> None:
+    segment, writer = source
+    updates, image = EveryFrame(selection(segment)), first_image()
+    for cycle in range(1, 4):
+        writer.publish(bytes(image), cycle=cycle)
+        image.put(COUNT, 1, SOURCE_NS + 10 * cycle)
+    assert [times(updates.next(0.0)) for _ in range(3)] == [
+        {COUNT: 0, SPEED: 1, ROW: 2, LAMP: 3},
+        {COUNT: 10},
+        {COUNT: 20},
+    ]
+
+
+def test_subscribers_with_different_rates_get_the_same_times(source: tuple[Segment, BlockWriter]) -> None:
+    segment, writer = source
+    view, image = selection(segment), first_image()
+    fast, slow = LatestFrame(view, 0.0, 0.0), LatestFrame(view, 10.0, 0.0)
+    subscribers: tuple[tuple[BlockUpdates, dict[int, int]], ...] = ((fast, {}), (slow, {}))
+
+    def deliver(now_s: float) -> None:
+        for updates, known in subscribers:
+            if update := updates.next(now_s):
+                known.update(times(update))
+
+    for cycle in range(1, 30):
+        image.put(COUNT, 1, SOURCE_NS + cycle)
+        if cycle % 5 == 0:
+            image.put(SPEED, float(cycle), SOURCE_NS + cycle)
+        writer.publish(bytes(image), cycle=cycle)
+        deliver(cycle / 2)
+    image.put(LAMP, False, SOURCE_NS + 99)
+    writer.publish(bytes(image), cycle=30)
+    deliver(100.0)
+    assert [known for _, known in subscribers] == [{COUNT: 29, SPEED: 25, ROW: 2, LAMP: 99}] * 2
+
+
+def test_originals_of_an_injection_have_their_statuses(instance: str) -> None:
+    async def test(endpoint: Endpoint, writer: BlockWriter) -> None:
+        image = first_image()
+        image.put(SPEED, 1.5, SOURCE_NS + 7, UNCERTAIN_LAST_USABLE_VALUE)
+        device = Plant(writer, allow_nonfinite=())
+        device.memory[:] = bytes(image)
+        device.cycle()
+        device.run()
+
+        def call() -> None:
+            with (
+                connect(f"127.0.0.1:{endpoint.port}", timeout_s=TIMEOUT_S) as client,
+                client.inject("plant/speed", "plant/count", originals=True) as shadow,
+            ):
+                update = next(shadow)
+                first = {reading.register.path: reading for reading in update.readings}
+                speed, count = first["speed"], first["count"]
+                assert (speed.value, speed.quality) == (1.5, Quality.UNCERTAIN)
+                assert speed.source_time == (SOURCE_NS + 7) / 1e9
+                assert (count.value, count.quality, count.source_time) == (1, Quality.GOOD, SOURCE_NS / 1e9)
+                shadow.set({"plant/speed": 100.0})
+                image.fail(SPEED, BAD_NODE_ID_UNKNOWN, SOURCE_NS + 8)  # the value stays as it was
+                device.memory[:] = bytes(image)
+                (speed,) = next(shadow).readings
+                assert (speed.quality, speed.source_time) == (Quality.BAD, (SOURCE_NS + 8) / 1e9)
+                assert "BadNodeIdUnknown" in speed.reason
+                image.put(COUNT, 1, SOURCE_NS + 9)  # only its time
+                device.memory[:] = bytes(image)
+                cycles = device.cycles
+                while device.cycles < cycles + 3:
+                    client.read("plant")
+                image.put(SPEED, 2.5, SOURCE_NS + 10)
+                device.memory[:] = bytes(image)
+                readings = {reading.register.path: reading for reading in next(shadow).readings}
+                assert (readings["speed"].value, readings["speed"].quality) == (2.5, Quality.GOOD)
+                assert readings["count"].source_time == (SOURCE_NS + 9) / 1e9
+
+        try:
+            await asyncio.to_thread(call)
+        finally:
+            device.stop()
 
     served(instance, test)
