@@ -95,7 +95,7 @@ class MqttConnector(Connector):
         link = self._link
         assert link is not None  # noqa: S101 - for the type checker
         self._ask(link)
-        number = link.ping()
+        number = link.ping()  # what the broker has kept comes before the answer
         self._store.wait(
             lambda: self._store.complete or (not self._store.host and link.answered(number)),
             min(time.monotonic() + FIRST_S, until_s),
@@ -162,6 +162,7 @@ class MqttConnector(Connector):
         commands, refusals = plan(self._store, self._options, writes)
         outcomes: list[str | Lost] = list(refusals)
         sent: list[Command] = []
+        link.forget()
         try:
             link.check()
             for command in commands:
@@ -170,8 +171,8 @@ class MqttConnector(Connector):
                     continue
                 link.await_room(until_s)
                 self._store.expect(command.publication.topic, command.publication.payload)
-                sent.append(command)  # from here on, the broker may get it
                 command.number = link.publish(command.publication)
+                sent.append(command)  # from here on, the broker may have it
             self._confirm(link, sent, until_s)
         except ConnectorError as error:
             _mark(outcomes, commands, sent)
@@ -179,8 +180,8 @@ class MqttConnector(Connector):
         finally:
             link.forget()
         _mark(outcomes, commands, sent)
-        if all(command.outcome == "" for command in sent):  # else the message does not come back
-            self._store.await_expected(time.monotonic() + min(ECHO_S, self._options.timeout / 1000))
+        accepted = all(command.outcome == "" for command in sent)  # else a message does not come back
+        self._store.await_expected(time.monotonic() + min(ECHO_S, self._options.timeout / 1000) * accepted)
         return [str(outcome) for outcome in outcomes]
 
     def _confirm(self, link: Link, sent: Sequence[Command], until_s: float) -> None:
@@ -200,9 +201,12 @@ class MqttConnector(Connector):
 def _mark(outcomes: list[str | Lost], commands: Sequence[Command], sent: Sequence[Command]) -> None:
     """Note what is known of each write, which may need several messages."""
     begun = {id(command) for command in sent}
-    for number, outcome in enumerate(outcomes):
-        own = [command for command in commands if number in command.writes]
-        if outcome or not own:
+    needed: dict[int, list[Command]] = {}
+    for command in commands:
+        for number in command.writes:
+            needed.setdefault(number, []).append(command)
+    for number, own in needed.items():
+        if outcomes[number]:
             continue
         if refusal := next((command.outcome for command in own if command.outcome), ""):
             outcomes[number] = refusal

@@ -75,6 +75,11 @@ class _Client(Client):
         self.violation = ""
         """What the broker did that ends the connection."""
         self.on_pong: Callable[[], None] = lambda: None
+        self.pings = self.pongs = 0
+        """How many PINGREQs were sent and answered. Paho sends some, too."""
+        self.pinged_ns = 0
+        """When the oldest PINGREQ without an answer was sent, or else the last one, ns of CLOCK_MONOTONIC."""
+        self._pinging = threading.Lock()
         self._last_mid = after
 
     @property
@@ -82,9 +87,17 @@ class _Client(Client):
         """The last packet identifier that was used."""
         return self._last_mid
 
-    def ping(self) -> None:
-        """Send a PINGREQ, which paho sends only after its keep-alive time."""
+    def ping(self) -> int:
+        """Send a PINGREQ, which paho sends only after its keep-alive time; return its number."""
         self._send_pingreq()
+        return self.pings
+
+    def _send_pingreq(self) -> MQTTErrorCode:
+        with self._pinging:
+            if self.pings == self.pongs:
+                self.pinged_ns = time.monotonic_ns()
+            self.pings += 1
+            return super()._send_pingreq()
 
     def _create_socket(self) -> Any:
         return self._opened
@@ -107,6 +120,10 @@ class _Client(Client):
 
     def _handle_pingresp(self) -> MQTTErrorCode:
         code = super()._handle_pingresp()
+        with self._pinging:
+            self.pongs = min(self.pongs + 1, self.pings)
+            if self.pongs < self.pings:
+                self.pinged_ns = time.monotonic_ns()
         self.on_pong()
         return code
 
@@ -161,8 +178,6 @@ class Link:
         """The messages of the present writes, acknowledged or not."""
         self._limits: dict[str, Any] = {}
         self.last_number = last_number
-        self._pinged_ns = 0
-        self._pings = self._pongs = 0
         self.version: MQTTProtocolVersion = MQTTv5
 
     @property
@@ -214,9 +229,7 @@ class Link:
             raise ConnectorError(f"{self.peer} refuses the connection: {self._refusal(self._connack)}")
         if self._options.retain and not self._limits.get("RetainAvailable", 1):
             raise ConnectorError(f"{self.peer} keeps no messages: remove retain = true")
-        refused = self._subscribe(client, list(filters), until_s)
-        self.ping()  # what the broker has kept comes before the answer
-        return refused
+        return self._subscribe(client, list(filters), until_s)
 
     def _connected_socket(self, until_s: float) -> socket.socket:
         peer = self.peer
@@ -288,26 +301,23 @@ class Link:
 
     def check(self) -> None:
         """Raise ConnectorError if the connection is lost, or the broker does not answer in time."""
-        if self._failure:
-            raise ConnectorError(self._failure)
-        now_ns, timeout_ns = time.monotonic_ns(), self._options.timeout * 1_000_000
-        if self._pongs < self._pings:
-            if now_ns - self._pinged_ns > timeout_ns:
+        client = self._client
+        if client is None or self._failure:
+            raise ConnectorError(self._failure or f"not connected to {self.peer}")
+        silent_ns, timeout_ns = time.monotonic_ns() - client.pinged_ns, self._options.timeout * 1_000_000
+        if client.pongs < client.pings:
+            if silent_ns > timeout_ns:
                 raise ConnectorError(f"no answer within {self._options.timeout} ms from {self.peer}")
-        elif now_ns - self._pinged_ns > timeout_ns // 2:
-            self.ping()
+        elif silent_ns > timeout_ns // 2:
+            client.ping()
 
     def ping(self) -> int:
         """Send a PINGREQ; return its number, for :meth:`answered`."""
-        if self._client is not None and self._pongs == self._pings:
-            self._pings += 1
-            self._pinged_ns = time.monotonic_ns()
-            self._client.ping()
-        return self._pings
+        return self._client.ping() if self._client is not None else 0
 
     def answered(self, number: int) -> bool:
         """Return whether a PINGREQ was answered, or the connection is lost."""
-        return self._pongs >= number or bool(self._failure)
+        return self._client is None or self._client.pongs >= number or bool(self._failure)
 
     # -- publishing ----------------------------------------------------------------------------------------------------
 
@@ -371,9 +381,8 @@ class Link:
 
     def wait_processed(self, until_s: float) -> None:
         """Wait until the broker has read all that was published; ConnectorError if it does not say so."""
-        self._wait(lambda: self._pongs == self._pings, until_s, "")
         number = self.ping()
-        self._wait(lambda: self._pongs >= number, until_s, "to PUBLISH")
+        self._wait(lambda: self._client is not None and self._client.pongs >= number, until_s, "to PUBLISH")
 
     def _wait(self, condition: Callable[[], bool], until_s: float, to_what: str) -> None:
         with self._condition:
@@ -447,6 +456,8 @@ class Link:
             topic = message.topic
         except UnicodeDecodeError:  # it is none of ours
             return
+        if self._closing:
+            return
         try:
             self._deliver(topic, bytes(message.payload), retained=message.retain)
         except Exception:
@@ -456,7 +467,6 @@ class Link:
 
     def _on_pong(self) -> None:
         with self._condition:
-            self._pongs = min(self._pongs + 1, self._pings)
             self._condition.notify_all()
         self._wake()
 
