@@ -72,8 +72,8 @@ def _parser() -> argparse.ArgumentParser:
     init.usage = f"{PROGRAM} init [-h] [-c FILE] [--emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"
     init.epilog = (
         "A device without source files of data blocks has a tag table, which a [[source]] names as its layout: "
-        "shmio-layout import converts the tag list of another tool, shmio-supervisor browse asks an OPC UA server, "
-        "and docs/how-to/use-a-tag-list.md says how to write one."
+        "shmio-layout import converts the tag list of another tool, shmio-supervisor browse asks an OPC UA server or "
+        "an MQTT broker, and docs/how-to/use-a-tag-list.md says how to write one."
     )
     init.add_argument("--emulated", action="store_true", help="with an emulated PLC in place of the real one")
     init.add_argument("--block", metavar="NAME", help="only this data block (default: a source for each)")

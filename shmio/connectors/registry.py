@@ -34,7 +34,7 @@ BUILT_IN = {
     "s7": "shmio.connectors.s7.connector:S7Connector",
 }
 
-BROWSED = {"opc.tcp": "opcua"}
+BROWSED = {"opc.tcp": "opcua", "mqtt": "mqtt", "mqtts": "mqtt"}
 """Which connector lists what a device offers, by the scheme of the device's URL."""
 
 

@@ -14,7 +14,9 @@ from shmio.config.credentials import read_password
 from shmio.config.model import MqttTls
 from shmio.config.tls import client_context
 from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.load import Load, counted
+from shmio.connectors.mqtt.browse import Listener
 from shmio.connectors.mqtt.commands import Command, plan
 from shmio.connectors.mqtt.link import Link, Publication, UnsupportedVersionError, version_of
 from shmio.connectors.mqtt.options import MqttOptions
@@ -46,15 +48,28 @@ class MqttConnector(Connector):
         self._version = version_of(options.version)
         self._link: Link | None = None
         self._last_number = 0
-        self._secrets()  # a wrong file is an error of the configuration now, and of the connection later
+        _secrets(options)  # a wrong file is an error of the configuration now, and of the connection later
 
-    def _secrets(self) -> tuple[str | None, ssl.SSLContext | None]:
-        """Read the files that the keys name, which may have been replaced; ConfigError."""
-        options = self._options
-        password = read_password(options.password_file, "password_file") if options.password_file else None
-        if not options.tls:
-            return password, None
-        return password, client_context(MqttTls(ca=options.ca, certificate=options.certificate, key=options.key), "")
+    @classmethod
+    def browse(cls, options: MqttOptions, wanted: Wanted) -> Browsed:
+        """List the topics on which messages come within the time-out, and what is in them."""
+        listener = Listener(options, wanted)
+        client_id = options.client_id or f"shmio-browse-{secrets.token_hex(6)}"
+        until_s = time.monotonic() + (TIMEOUTS - 1) * options.timeout / 1000
+        versions = ["5", "3.1.1"] if options.version == "auto" else [options.version]
+        for version in versions:
+            link = Link(options, client_id, *_secrets(options), listener.take, lambda: None)
+            try:
+                if link.open(version_of(version), ["#"], until_s):
+                    raise ConnectorError(f"{options.address} refuses a subscription to all topics")
+                listener.wait(time.monotonic() + options.timeout / 1000)
+                break
+            except UnsupportedVersionError:
+                if version == versions[-1]:
+                    raise
+            finally:
+                link.close()
+        return listener.found()
 
     @property
     def timeout_s(self) -> float:
@@ -111,7 +126,7 @@ class MqttConnector(Connector):
     def _open(self, until_s: float) -> list[str]:
         store = self._store
         try:
-            password, context = self._secrets()
+            password, context = _secrets(self._options)
         except ConfigError as error:
             raise ConnectorError(str(error)) from None
         link = self._link = Link(
@@ -196,6 +211,14 @@ class MqttConnector(Connector):
             for one in sent:
                 if one.number is not None:
                     one.outcome = link.outcome(one.number, one.publication.topic, retain=one.publication.retain)
+
+
+def _secrets(options: MqttOptions) -> tuple[str | None, ssl.SSLContext | None]:
+    """Read the files that the keys name, which may have been replaced; ConfigError."""
+    password = read_password(options.password_file, "password_file") if options.password_file else None
+    if not options.tls:
+        return password, None
+    return password, client_context(MqttTls(ca=options.ca, certificate=options.certificate, key=options.key), "")
 
 
 def _mark(outcomes: list[str | Lost], commands: Sequence[Command], sent: Sequence[Command]) -> None:

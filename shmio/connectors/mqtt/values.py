@@ -168,6 +168,11 @@ def decode_json(payload: bytes) -> Any:
         raise ValueFaultError(BAD_DECODING_ERROR, f"the payload is no JSON: {printable(str(error))[:100]}") from None
 
 
+def is_number(text: bytes) -> bool:
+    """Return whether a payload is a number as text."""
+    return _NUMBER.fullmatch(text.decode("latin1")) is not None
+
+
 def _parse_number(text: str) -> int | float:
     if _WHOLE.fullmatch(text):
         return int(text)

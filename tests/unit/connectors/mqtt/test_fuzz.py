@@ -10,7 +10,10 @@ import msgspec
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from shmio.connectors.browsing import Wanted
 from shmio.connectors.mqtt import json_path
+from shmio.connectors.mqtt.address import parse
+from shmio.connectors.mqtt.browse import Listener
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
 from shmio.connectors.mqtt.topic import time_ns
@@ -134,6 +137,32 @@ def _metric(
     return made
 
 
+@given(
+    st.lists(st.tuples(st.sampled_from(["a", "a/b", "//", " $", "a $.b", "spBv1.0/G/DBIRTH/N/D"]), TEXTS), max_size=5)
+)
+def test_browsing_texts(messages: list[tuple[str, bytes]]) -> None:
+    _browse(messages)
+
+
+@given(VALUES)
+@example({"'\"": 1, "": 2, "a": {".": [{"[": "x"}]}})
+@example([[[1]]])
+def test_browsing_json(document: Any) -> None:
+    with contextlib.suppress(UnicodeEncodeError):
+        _browse([("a/b", json.dumps(document).encode())])
+
+
+def _browse(messages: list[tuple[str, bytes]]) -> None:
+    """What is offered has an address that can be read."""
+    listener = Listener(MqttOptions(url="mqtt://127.0.0.1"), Wanted())
+    for topic, payload in messages:
+        listener.take(topic, payload, retained=True)
+    for one in listener.found().offers:
+        assert bool(one.type) != bool(one.refused)
+        if one.type:
+            parse(str(one.columns["address"]))
+
+
 PAYLOADS = st.builds(
     lambda seq, metrics: wire.Payload(seq=seq, metrics=metrics, timestamp=seq).SerializeToString(),
     st.integers(0, 3),
@@ -145,6 +174,7 @@ PAYLOADS = st.builds(
 def test_sparkplug(messages: list[tuple[int, bytes]]) -> None:
     store = store_of(dict(SPARKPLUG))
     kinds = ("NBIRTH/N", "DBIRTH/N/D", "NDATA/N", "DDATA/N/D", "NDEATH/N", "DDEATH/N/D", "DBIRTH/N/E", "STATE")
+    _browse([(f"spBv1.0/G/{kinds[kind]}", payload) for kind, payload in messages])
     for kind, payload in messages:
         store.take(f"spBv1.0/G/{kinds[kind]}", payload, retained=False)
         check(store)

@@ -58,6 +58,11 @@ const commands = {
     setInterval(() => tell().catch(() => {}), ms)
     return tell()
   },
+  repeat_sparkplug: (messages, ms) => {
+    const tell = () => Promise.all(messages.map(one =>
+      publish(one.topic, Buffer.from(sparkplug.encodePayload(one.payload)))))
+    setInterval(() => tell().catch(() => {}), ms)
+  },
   flood: async (topic, count) => {
     for (let number = 1; number < count; number++) client.publish(topic, String(number))
     await publish(topic, String(count), { qos: 1 })
