@@ -64,6 +64,11 @@ class Wanted:
         self._globs = [Glob(pattern) for pattern in patterns]
         self.depth, self.nodes = depth, nodes
 
+    @property
+    def everything(self) -> bool:
+        """True if there is no pattern."""
+        return not self._globs
+
     def takes(self, names: Iterable[str]) -> bool:
         """Return whether to list a value or group."""
         path = _path(names)

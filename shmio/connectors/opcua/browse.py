@@ -29,6 +29,11 @@ _HAS_PROPERTY: Final = ua.NodeId(46)
 _NODES_AT_ONCE: Final = 20
 """Nodes in a request to browse; more would keep the event loop from noticing that the server is alive."""
 _VALUES_AT_ONCE: Final = 100
+REFERENCES_PER_NODE: Final = 30
+"""Most references for each node of the limit. Some lead to properties, and to nodes that are known."""
+MAX_CHARACTERS: Final = 1 << 26
+"""Most characters of all names, identifiers and comments together."""
+_MAX_COMMENT: Final = 1000
 _WRITE: Final = 2
 """The bit of CurrentWrite in an access level."""
 _TYPES: Final = {
@@ -85,6 +90,7 @@ class _Search:
         self._seen = {_OBJECTS}
         self._found = Browsed()
         self._uris: list[str] = []
+        self._references = self._characters = 0
 
     async def run(self) -> Browsed:
         """Search level by level."""
@@ -103,18 +109,32 @@ class _Search:
                 self._stop(f"{shorten(names, 200)} is deeper than {depth} levels: set --depth")
         return self._found
 
+    @property
+    def _room(self) -> int:
+        """How many more references the search may look at; 0 or less if it must find no more nodes."""
+        if len(self._seen) >= self._wanted.nodes or self._characters > MAX_CHARACTERS:
+            return 0
+        left = self._wanted.nodes * REFERENCES_PER_NODE - self._references
+        return min(left, self._wanted.nodes - len(self._seen)) if self._wanted.everything else left
+
     def _stop(self, why: str) -> None:
         self._found.incomplete = self._found.incomplete or why
 
     async def _look_into(self, nodes: Sequence[_Node]) -> None:
         """Find the children of nodes."""
-        room = self._wanted.nodes - len(self._seen)
+        room = self._room
         if room <= 0:
             return
-        references = await self._session.browse([node.id for node in nodes], room)
+        references, left_out = await self._session.browse([node.id for node in nodes], room)
+        self._references += sum(map(len, references))
         for node, found in zip(nodes, references, strict=True):
             for one in found:
                 self._add(node, one)
+        if left_out or self._references >= self._wanted.nodes * REFERENCES_PER_NODE:
+            self._stop(
+                f"the server sends more references than {self._wanted.nodes} nodes need: name a part of it by a "
+                "PATTERN, or set --limit"
+            )
 
     def _add(self, parent: _Node, reference: Any) -> None:
         target, name = reference.NodeId, reference.BrowseName.Name or ""
@@ -133,8 +153,16 @@ class _Search:
                 f"the server has more than {self._wanted.nodes} nodes: name a part of it by a PATTERN, or set --limit"
             )
             return
+        self._count(name, key.Identifier)
+        if self._characters > MAX_CHARACTERS:
+            self._stop("the names of the server's nodes are too long: name a part of it by a PATTERN")
+            return
         self._seen.add(key)
         parent.children.append(_Node(key, names, reference.NodeClass == ua.NodeClass.Variable))
+
+    def _count(self, *texts: object) -> None:
+        """Count the characters of texts that are kept."""
+        self._characters += sum(len(one) for one in texts if isinstance(one, str | bytes))
 
     async def _list(self, nodes: Sequence[_Node]) -> None:
         """Add nodes to what was found, with the types of variables."""
@@ -158,7 +186,8 @@ class _Search:
             value, data_type, description, access = (one[node] for one in details)
             kind, refused = _type(value, data_type)
             node.is_whole = bool(kind)
-            comment = description.value if description.kind == decode.LOCALIZED_TEXT else ""
+            comment = shorten(description.value, _MAX_COMMENT) if isinstance(description.value, str) else ""
+            self._count(comment)
             columns = {
                 "address": self._address(node.id),
                 "unit": units.get(node, ""),

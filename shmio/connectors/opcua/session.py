@@ -410,12 +410,15 @@ class Session:
         """Read an attribute of nodes."""
         return await self._samples(nodes, attribute)
 
-    async def browse(self, nodes: Sequence[Any], most: int) -> list[list[Any]]:
+    async def browse(self, nodes: Sequence[Any], most: int) -> tuple[list[list[Any]], bool]:
         """Return the hierarchical references from nodes to objects and variables; none of an unknown node.
 
         Args:
             nodes: The node ids.
             most: Once there are more references than this, the rest is left out.
+
+        Returns:
+            The references of each node, and whether some were left out.
 
         """
         request = ua.BrowseRequest()
@@ -429,9 +432,11 @@ class Session:
             raise MalformedError
         found: list[list[Any]] = [list(one.References or []) for one in results]
         open_points = [(place, one.ContinuationPoint) for place, one in enumerate(results) if one.ContinuationPoint]
+        left_out = False
         for place, one in enumerate(results):
             if one.StatusCode.value & 0xFFFF0000 == _BAD_NO_CONTINUATION_POINTS and len(nodes) > 1:
-                found[place] = (await self.browse([nodes[place]], most))[0]
+                (found[place],), less = await self.browse([nodes[place]], most)
+                left_out = left_out or less
         while open_points:
             following = ua.BrowseNextRequest()
             full = sum(map(len, found)) > most
@@ -439,6 +444,7 @@ class Session:
             following.Parameters.ContinuationPoints = [point for _, point in open_points]
             answer = await self._response(ua.BrowseNextResponse, following)
             if full:
+                left_out = True
                 break
             results = answer.Parameters.Results
             if len(results) != len(open_points):
@@ -453,7 +459,7 @@ class Session:
             ]
             if open_points and sum(map(len, found)) == before:
                 raise MalformedError  # it would never end
-        return found
+        return found, left_out
 
     # -- reading -------------------------------------------------------------------------------------------------------
 

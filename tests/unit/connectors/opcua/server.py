@@ -16,10 +16,13 @@ from asyncua.common.utils import ServiceError
 from asyncua.crypto.permission_rules import User, UserRole
 from asyncua.server.internal_session import InternalSession
 from asyncua.server.monitored_item_service import MonitoredItemService
+from asyncua.server.uaprocessor import UaProcessor
+from asyncua.ua.ua_binary import struct_from_binary
 
 PASSWORD = "secret password"
 CREATE, CREATE_ALL = MonitoredItemService._create_data_change_monitored_item, InternalSession.create_monitored_items
-READ, SUBSCRIBE = InternalSession.read, InternalSession.create_subscription
+PROCESS = UaProcessor._process_message
+BROWSE, READ, SUBSCRIBE = InternalSession.browse, InternalSession.read, InternalSession.create_subscription
 
 
 class Accounts:
@@ -123,6 +126,63 @@ class Device:
     async def refer(self, name: str, other: str) -> None:
         """Let a node organize another one, which may contain it."""
         await self.node(name).add_reference(self.node(other), ua.ObjectIds.Organizes, bidirectional=False)
+
+    async def endless(self, kind: str) -> None:
+        """Make up what is below Device when it is browsed.
+
+        ``tree``: a million nodes; ``circle``: some nodes that refer to each other without
+        end; ``names``: long names.
+        """
+        self.sent, self.points = 0, dict[bytes, tuple[Any, int]]()
+        device = ua.NodeId("Device", 2)
+
+        def made_up(node: ua.NodeId) -> bool:
+            return node == device or (node.NamespaceIndex == 2 and isinstance(node.Identifier, int))
+
+        def page(node: ua.NodeId, at: int, most: int) -> ua.BrowseResult:
+            parent = 0 if node == device else node.Identifier
+            if parent > 1_000_000 and kind == "tree":
+                return ua.BrowseResult()
+            self.sent += most
+            found = []
+            for place in range(at, at + most):
+                number = place % 200 + 1 if kind == "circle" else 1000 * parent + place + 1
+                name = f"{number}" if kind != "names" else f"{number} " + "x" * 5000
+                found.append(
+                    ua.ReferenceDescription(
+                        ua.NodeId(47), True, ua.NodeId(number, 2), ua.QualifiedName(name, 2), ua.LocalizedText(name),
+                        ua.NodeClass.Variable if number > 1_000_000 else ua.NodeClass.Object, ua.NodeId(58),
+                    )
+                )  # fmt: skip
+            result = ua.BrowseResult(References=found)
+            if at + most < 1000 or kind == "circle":
+                result.ContinuationPoint = f"{parent} {at + most}".encode()
+                self.points[result.ContinuationPoint] = node, at + most
+            return result
+
+        async def browse(session: Any, asked: Any) -> Any:
+            found = await BROWSE(session, asked)
+            for place, one in enumerate(asked.NodesToBrowse):
+                if made_up(one.NodeId):
+                    found[place] = page(one.NodeId, 0, min(500, asked.RequestedMaxReferencesPerNode or 500))
+            return found
+
+        async def process(processor: Any, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> Any:
+            if typeid != ua.NodeId(ua.ObjectIds.BrowseNextRequest_Encoding_DefaultBinary):
+                return await PROCESS(processor, typeid, requesthdr, seqhdr, body)
+            asked = struct_from_binary(ua.BrowseNextParameters, body)
+            points = [self.points.pop(point) for point in asked.ContinuationPoints]
+            response = ua.BrowseNextResponse()
+            if not asked.ReleaseContinuationPoints:
+                response.Parameters.Results = [page(*point, 500) for point in points]
+            processor.send_response(requesthdr.RequestHandle, seqhdr, response)
+            return True
+
+        InternalSession.browse, UaProcessor._process_message = browse, process
+
+    async def effort(self) -> list[int]:
+        """Return how many made up references were sent, and how many continuation points are open."""
+        return [self.sent, len(self.points)]
 
     async def clients(self) -> int:
         """Return the number of sessions of clients."""

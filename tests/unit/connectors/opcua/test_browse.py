@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from shmio.cli import supervisor
+from shmio.connectors.opcua import browse as browsing
 from shmio.connectors.opcua.connector import OpcUaConnector
 from shmio.connectors.opcua.options import OpcUaOptions
 from shmio.layout.compiler import Source, compile_sources
@@ -97,6 +98,53 @@ def test_the_search_is_bounded(server: Device, capsys: pytest.CaptureFixture[str
     assert "Axis" in said.out
     assert "speed" not in said.out
     assert "Device/Axis/speed/now is deeper than 2 levels: set --depth" in said.err
+
+
+@pytest.fixture(scope="module")
+def hostile() -> Iterator[Device]:
+    with Device() as device:
+        yield device
+
+
+def test_a_server_with_a_million_nodes(hostile: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    hostile.ask("endless", "tree")
+    assert browse(hostile.url, "--limit", 3000) == 1
+    said = capsys.readouterr()
+    assert len(said.out.splitlines()) == 2999
+    assert "this is not all: the server has more than 3000 nodes" in said.err
+    sent, open_points = hostile.ask("effort")
+    assert sent <= 3000 + 20 * 500, "the rest is not asked for"
+    assert open_points == 0, "the server need not remember where the search has ended"
+
+
+def test_a_pattern_finds_a_node_behind_more_than_the_limit(hostile: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    hostile.ask("endless", "tree")
+    assert browse(hostile.url, "Device/1000/1001000", "--limit", 100) == 0
+    assert capsys.readouterr().out.splitlines()[-1].split()[0] == "1001000"
+    assert browse(hostile.url, "Device/*/1001000", "--limit", 100) == 1
+    assert "more than 100 nodes" in capsys.readouterr().err, "the search may enter each of 1000 objects"
+
+
+def test_nodes_that_refer_to_each_other_without_end(hostile: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    hostile.ask("endless", "circle")
+    assert browse(hostile.url, "--limit", 1000) == 1
+    said = capsys.readouterr()
+    assert len(said.out.splitlines()) == 201
+    assert "this is not all: the server sends more references than 1000 nodes need" in said.err
+    sent, open_points = hostile.ask("effort")
+    assert sent <= 1000 * browsing.REFERENCES_PER_NODE + 20 * 500
+    assert open_points == 0
+
+
+def test_long_names_take_no_more_memory_than_allowed(
+    hostile: Device, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(browsing, "MAX_CHARACTERS", 1 << 20)
+    hostile.ask("endless", "names")
+    assert browse(hostile.url, "--limit", 3000) == 1
+    said = capsys.readouterr()
+    assert len(said.out.splitlines()) < (1 << 20) / 5000 + 2
+    assert "this is not all: the names of the server's nodes are too long" in said.err
 
 
 @pytest.mark.parametrize(
