@@ -11,7 +11,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 CLOSE_S: Final = 0.2
 MAX_REPORTED: Final = 20
+MAX_FRAGMENTS: Final = 10_000
+"""Most fragments of a message."""
 _SEND_TIMEOUT: Final = struct.Struct("@ll")
 
 log = logging.getLogger("shmio.source")
@@ -191,10 +193,8 @@ class Link:
         """Receive until the connection ends; runs in the thread."""
         failure = f"{self._peer} closed the connection"
         try:
-            for data in self._socket:
-                if isinstance(data, bytes):
-                    raise ConnectorError(f"{self._peer} sent a binary message, which was not asked for")
-                self._take(data)
+            for text in self._texts():
+                self._take(text)
         except ConnectorError as error:
             failure = str(error)
         except self._closed_errors as error:
@@ -206,6 +206,26 @@ class Link:
             self._failure = failure
             self._condition.notify_all()
         self._socket.close_socket()
+
+    def _texts(self) -> Iterator[str]:
+        """Yield the messages until the server closes the connection; ConnectorError if one is not acceptable.
+
+        The library limits the bytes of a message, but not into how many fragments it is divided.
+        """
+        from websockets.exceptions import ConnectionClosedOK  # noqa: PLC0415  the library is optional
+
+        while True:
+            fragments: list[str] = []
+            try:
+                for one in self._socket.recv_streaming():
+                    if not isinstance(one, str):
+                        raise ConnectorError(f"{self._peer} sent a binary message, which was not asked for")
+                    fragments.append(one)
+                    if len(fragments) > MAX_FRAGMENTS:
+                        raise ConnectorError(f"{self._peer} sent a message of more than {MAX_FRAGMENTS} fragments")
+            except ConnectionClosedOK:
+                return
+            yield "".join(fragments)
 
     def _take(self, text: str) -> None:
         try:
