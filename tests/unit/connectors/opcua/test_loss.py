@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import socket
 import struct
 import threading
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 
 import pytest
 
@@ -16,6 +14,7 @@ from shmio.connectors.base import Lost, WriteLostError
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 from shmio.testing.proxy import FaultProxy
+from tests.unit.connectors import hostile
 from tests.unit.connectors.opcua.device import Device, framing
 from tests.unit.connectors.opcua.harness import PATIENCE_S, Source, connected, until
 
@@ -125,83 +124,29 @@ def test_threads_end(device: Device) -> None:
 # -- hostile peers -----------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def peer(behave: Callable[[socket.socket], None]) -> Iterator[str]:
-    """Listen, and treat each client like this."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-
-        def serve() -> None:
-            while True:
-                try:
-                    client, _ = listener.accept()
-                except OSError:
-                    return
-                with client, suppress(OSError):
-                    client.settimeout(PATIENCE_S)
-                    behave(client)
-
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield f"opc.tcp://127.0.0.1:{listener.getsockname()[1]}"
-        listener.shutdown(socket.SHUT_RDWR)
-    thread.join(PATIENCE_S)
-    assert not thread.is_alive()
-
-
-def silence(client: socket.socket) -> None:
-    while client.recv(65536):
-        pass
-
-
-def sends(data: bytes) -> Callable[[socket.socket], None]:
-    def behave(client: socket.socket) -> None:
-        client.recv(65536)
-        client.sendall(data)
-        silence(client)
-
-    return behave
-
-
-def endless(data: bytes) -> Callable[[socket.socket], None]:
-    def behave(client: socket.socket) -> None:
-        client.recv(65536)
-        while True:
-            client.sendall(data)
-
-    return behave
-
-
-def trickle(client: socket.socket) -> None:
-    never = threading.Event()
-    client.recv(65536)
-    for byte in b"ACKF\x1c\0\0\0" * 1000:
-        client.sendall(bytes([byte]))
-        never.wait(0.05)
-
-
 ACK = b"ACKF" + struct.pack("<IIIIII", 28, 0, 65535, 65535, 0, 0)
 HOSTILE = {
-    "silence": silence,
-    "closes at once": lambda client: None,
-    "HTTP": sends(b"HTTP/1.1 400 Bad Request\r\n\r\n"),
-    "zeros": sends(bytes(4096)),
-    "ones": sends(b"\xff" * 4096),
-    "a huge chunk": endless(b"ACKF" + struct.pack("<I", 0xFFFFFFF0) + bytes(1 << 16)),
-    "a tiny chunk": sends(b"ACKF" + struct.pack("<I", 0)),
-    "an error": sends(b"ERRF" + struct.pack("<IIi", 16, 0x80830000, -1)),
-    "acknowledges without end": endless(ACK),
-    "no bytes allowed": sends(b"ACKF" + struct.pack("<IIIIII", 28, 0, 1, 1, 1, 1)),
-    "a trickle": trickle,
-    "acknowledge, then chunks without end": endless(
+    "silence": hostile.silence,
+    "closes at once": hostile.closes,
+    "HTTP": hostile.sends(b"HTTP/1.1 400 Bad Request\r\n\r\n"),
+    "zeros": hostile.sends(bytes(4096)),
+    "ones": hostile.sends(b"\xff" * 4096),
+    "a huge chunk": hostile.endless(b"ACKF" + struct.pack("<I", 0xFFFFFFF0) + bytes(1 << 16)),
+    "a tiny chunk": hostile.sends(b"ACKF" + struct.pack("<I", 0)),
+    "an error": hostile.sends(b"ERRF" + struct.pack("<IIi", 16, 0x80830000, -1)),
+    "acknowledges without end": hostile.endless(ACK),
+    "no bytes allowed": hostile.sends(b"ACKF" + struct.pack("<IIIIII", 28, 0, 1, 1, 1, 1)),
+    "a trickle": hostile.trickle(b"ACKF\x1c\0\0\0"),
+    "acknowledge, then chunks without end": hostile.endless(
         ACK + b"MSGC" + struct.pack("<IIIII", 65000, 0, 0, 1, 1) + bytes(65000 - 24)
     ),
 }
 
 
 @pytest.mark.parametrize("behave", HOSTILE.values(), ids=HOSTILE)
-def test_a_hostile_peer_is_refused_in_time_and_costs_little(behave: Callable[[socket.socket], None]) -> None:
-    with peer(behave) as url:
-        source = Source(url, TAGS, timeout=TIMEOUT_MS)
+def test_a_hostile_peer_is_refused_in_time_and_costs_little(behave: hostile.Behaviour) -> None:
+    with hostile.peer(behave) as address:
+        source = Source(f"opc.tcp://{address}", TAGS, timeout=TIMEOUT_MS)
         tracemalloc.start()
         try:
             begun = time.monotonic()
