@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from shmio.connectors.load import counted
 from shmio.connectors.mqtt import json_path
 from shmio.connectors.mqtt.address import NAMESPACE, Address, Metric, Place, parse
 from shmio.connectors.mqtt.faults import ValueFaultError
@@ -137,8 +138,8 @@ class Store:
 
     def describe(self) -> str:
         """Return what is read, for the log."""
-        nodes = f", {len(self.host)} Sparkplug nodes" if self.host else ""
-        return f"{len(self._topics)} topics{nodes}"
+        found = [counted(len(self._topics), "topic")] if self._topics else []
+        return ", ".join([*found, *([counted(len(self.host), "Sparkplug node")] if self.host else [])])
 
     @property
     def filters(self) -> list[str]:
