@@ -21,6 +21,8 @@ _MOST_NAMES: Final = 3
 ITEM_OK = 0xFF
 ACCESS_DENIED, OUT_OF_RANGE, NO_SUCH_TYPE, OTHER_SIZE, NO_SUCH_OBJECT = 0x03, 0x05, 0x06, 0x07, 0x0A
 
+KNOWN_CODES: Final = frozenset(S7_RETURN_CODES)
+
 _NO_OPTIMIZED = "clear 'Optimized block access' of the block, compile and load, or read it by OPC UA"
 _ACCESS_DENIED = (
     "access denied {where}: enable 'Permit access with PUT/GET communication' and 'Full access' in the CPU's "

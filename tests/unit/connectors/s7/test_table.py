@@ -294,6 +294,17 @@ def test_any_answer_is_parsed_or_a_fault(noise: bytes, sizes: list[int], headed:
         ]
 
 
+def test_data_behind_an_item_that_is_too_short_are_no_refusal() -> None:
+    """The first item lacks its data; the head and data of the second one would fit in their place."""
+    data = b"\xff\x04\0\x20" + b"\xff\x04\0\x20" + b"0123"
+    head = struct.pack(">BxH3sBB2xHHHH", 3, 0, b"\x02\xf0\x80", 0x32, 3, 1, 2, len(data), 0) + b"\x04\x02"
+    with pytest.raises(ConnectorError, match="return code 0x30 and length 12851"):
+        pdu.parse_items(memoryview(head + data), [4, 4])
+    refused = b"\x77\0\0\0"  # a code that no table has
+    head = struct.pack(">BxH3sBB2xHHHH", 3, 0, b"\x02\xf0\x80", 0x32, 3, 1, 2, len(refused), 0) + b"\x04\x01"
+    assert [one.code for one in pdu.parse_items(memoryview(head + refused), [4])] == [0x77]
+
+
 def test_an_answer_to_other_sizes_is_refused() -> None:
     data = b"\xff\x04\0\x10ab\xff\x04\0\x08c"
     head = struct.pack(">BxH3sBB2xHHHH", 3, 0, b"\x02\xf0\x80", 0x32, 3, 1, 2, len(data), 0) + b"\x04\x02"
