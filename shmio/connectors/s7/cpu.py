@@ -148,7 +148,7 @@ class CpuValues:
 
     def _look_at_mode(self) -> None:
         mode = self._mode
-        if not mode.supported:
+        if mode.unknown:
             if self._mode_seen:
                 self._mode_seen = 0
                 why = "the controller does not tell its operating mode"

@@ -85,11 +85,11 @@ class BlockWatch(Query):
         """Log why."""
         log.debug("the controller %s of its blocks: a change of a block will not be noticed", why)
 
-    def lost(self) -> None:
+    def lost(self, *, alive: bool = True) -> None:
         """Begin with the first block in the next session."""
         self._round.clear()
         self._refused.clear()
-        super().lost()
+        super().lost(alive=alive)
 
     def _go_on(self) -> None:
         self._round.pop()

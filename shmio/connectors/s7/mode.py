@@ -2,7 +2,7 @@
 
 The mode is the low half of the fourth byte of a record of SZL W#16#0424; the high half is the
 previous mode. The numbers are from Siemens, System Software for S7-300/400, A5E00739858, 33.21. If
-a controller does not support this list, it is not queried again, and STOP is not noticed.
+a controller refuses this list, it is not queried again in the session, and STOP is not noticed.
 """
 
 from __future__ import annotations
@@ -58,6 +58,9 @@ class ModeQuery(Query):
         """The number of the mode, one of ``MODES`` or another one; None if it is unknown."""
         self.answered_ns = 0
         """UTC time of the last answer, ns since 1970."""
+        self.unknown = False
+        """Whether the controller does not tell its mode in this session."""
+        self._logged = False
 
     @property
     def runs(self) -> bool:
@@ -69,10 +72,10 @@ class ModeQuery(Query):
         return szl_data(_SZL)
 
     def answered(self, data: bytes) -> None:
-        """Store the mode; stop asking if the list has none."""
+        """Store the mode; stop asking in this session if the list has none."""
         records = szl_records(data, _SZL)
         if not records or len(records[0]) < 4:
-            self._give_up("does not support the query")
+            self._stop()
             return
         self.mode = records[0][3] & 0x0F
         self.answered_ns = time.time_ns()
@@ -80,18 +83,26 @@ class ModeQuery(Query):
         self.doubt = f"the PLC is {words}" if words else ""
 
     def refused(self, refusal: RefusedError) -> None:  # noqa: ARG002 - all refusals mean the same
-        """Stop asking."""
-        self._give_up("does not support the query")
+        """Stop asking in this session; the next one may be with another controller."""
+        self._stop()
 
-    def lost(self) -> None:
+    def _stop(self) -> None:
+        self.rest()
+        self.given_up("does not support the query")
+
+    def lost(self, *, alive: bool = True) -> None:
         """Forget the mode, because the connection was lost."""
         self._forget()
-        super().lost()
+        self.unknown = not self.supported
+        super().lost(alive=alive)
 
     def given_up(self, why: str) -> None:
-        """Log why."""
+        """Log why, once."""
         self._forget()
-        log.debug("the controller %s of its operating mode: STOP will not be noticed", why)
+        self.unknown = True
+        if not self._logged:
+            self._logged = True
+            log.debug("the controller %s of its operating mode: STOP will not be noticed", why)
 
     def _forget(self) -> None:
         self.doubt, self.mode = "", None

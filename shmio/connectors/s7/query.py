@@ -43,6 +43,8 @@ class Query(ABC):
         self.count = 1
         self.sent = 0
         self.complete = True
+        self.begun_after = 0
+        """Number of answers of the session that came before the question."""
         self._answer = bytearray()
         self._sequence = 0
         self.again: Callable[[Query], None] = lambda _: None
@@ -103,16 +105,17 @@ class Query(ABC):
                 self._give_up("does not answer as expected")
             raise
 
-    def lost(self) -> None:
+    def lost(self, *, alive: bool = True) -> None:
         """Forget an open question, because the connection was lost.
 
-        Stop asking if connections were repeatedly lost while the question was open.
+        Stop asking if connections were repeatedly lost while the question was open, though the
+        controller was ``alive``: it answered other requests meanwhile.
         """
         self._due_ns = 0
         if self.complete:
             return
         self.complete = True
-        self._failures += 1
+        self._failures += alive
         if not self._known and self._failures == PATIENCE:
             self.silent = True
             self._give_up("does not answer the query")

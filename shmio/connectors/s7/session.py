@@ -154,6 +154,7 @@ class S7Session(ABC):
         self._idle: list[Read] = []
         self._mode = ModeQuery()
         self._queries: list[Query] = []
+        self._answers = 0  # in this session, without those that set it up
         self._add_query(self._mode)
         self._close_on_error = _CloseOnError(self.close, options)
 
@@ -327,8 +328,9 @@ class S7Session(ABC):
         self._window = Window(0, self._window.reference)
         self._under_way.clear()
         self._idle.clear()
-        for query in self._queries:
-            query.lost()
+        for query in self._queries:  # a controller that has just set a session up is alive too
+            query.lost(alive=not self._answers or self._answers > query.begun_after)
+        self._answers = 0
 
     # -- session -------------------------------------------------------------------------------------------------------
 
@@ -374,6 +376,7 @@ class S7Session(ABC):
         for query in self._queries:
             if query.due(now_ns) and not (query.optional and self._mode.silent):
                 query.begin(now_ns, now_ns + self._timeout_ns)
+                query.begun_after = self._answers
                 self._window.add(query)
                 return
 
@@ -415,6 +418,7 @@ class S7Session(ABC):
         while (frame := transport.frame()) is not None:
             window.accept(frame)
             answers += 1
+        self._answers += answers
         if window.idle and transport.left:
             raise ConnectorError("unexpected bytes after the last answer")
         self._flush()

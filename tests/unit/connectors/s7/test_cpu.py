@@ -6,6 +6,7 @@ import contextlib
 import datetime as dt
 import logging
 import struct
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -22,6 +23,7 @@ from shmio.emulators.s7 import S7Server, Traits
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.values.codec import Value
 from shmio.model.statuses import BAD_NO_DATA, BAD_NOT_SUPPORTED, BAD_WAITING_FOR_INITIAL_DATA, GOOD, StatusArea
+from shmio.testing.proxy import FaultProxy
 from tests.unit.connectors.s7 import noise as frames
 from tests.unit.connectors.s7.test_table import (
     Plc,
@@ -204,6 +206,26 @@ def test_a_cpu_that_never_answers_is_not_asked_for_ever(caplog: pytest.LogCaptur
     assert failures == 8
     assert codes(layout, raw) == [GOOD] + [BAD_NOT_SUPPORTED] * (len(CPU) - 1)
     assert "is not asked any more" in caplog.text
+
+
+def test_a_cable_that_is_pulled_while_a_question_is_open_is_no_refusal() -> None:
+    layout = table(CPU)
+    with serving(Plc()) as server, FaultProxy(server.address) as proxy:
+        options = S7Options(host="127.0.0.1", port=proxy.address.port, timeout=2000)
+        connector = S7Connector.for_layout(layout)(options, layout)
+        with contextlib.closing(connector):
+            for _ in range(4):
+                connector.connect()
+                proxy.edit(lambda _: None)  # from now on no answer comes
+                connector.submit()
+                proxy.cut()
+                with pytest.raises(ConnectorError):
+                    connector.collect(time.monotonic_ns() + 10**10)
+                proxy.pass_all()
+            connector.connect()
+            for _ in range(100):
+                raw = connector.read()
+    assert set(codes(layout, raw)) == {GOOD}
 
 
 def test_stop_and_the_clock_are_seen_a_second_later(monkeypatch: pytest.MonkeyPatch) -> None:

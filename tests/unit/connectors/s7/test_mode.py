@@ -77,15 +77,23 @@ def test_mode_is_asked_once_an_interval() -> None:
         memoryview(bytes.fromhex("03000013 02f080 32 02 0000 0001 0000 0000 81 04")),
     ],
 )
-def test_controller_without_a_mode_is_not_asked_again(unknown: memoryview, caplog: pytest.LogCaptureFixture) -> None:
-    """The missing mode is logged once, at level DEBUG, and the query is not repeated."""
+def test_controller_without_a_mode_is_asked_in_each_session(
+    unknown: memoryview, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The missing mode is logged once, at level DEBUG."""
     caplog.set_level(logging.DEBUG, "shmio.source")
     question = ModeQuery()
-    question.begin(0, 10)
-    question.accept(0, unknown)
-    assert question.doubt == ""
-    question.lost()
-    assert not question.due(10 * INTERVAL_NS)
+    told = [question.unknown]
+    for _ in range(2):
+        assert question.due(0)
+        question.begin(0, 10)
+        question.accept(0, unknown)
+        told.append(question.unknown)
+        assert question.doubt == ""
+        assert not question.due(10 * INTERVAL_NS)
+        question.lost()
+        told.append(question.unknown)
+    assert told == [False, True, False, True, False]
     assert [record.levelname for record in caplog.records] == ["DEBUG"]
 
 
@@ -108,6 +116,15 @@ def test_controller_that_has_answered_is_asked_again_after_lost_connections() ->
         assert question.doubt == ""  # the mode is unknown now
         assert question.due(0)
         question.begin(0, 10)
+
+
+def test_connections_lost_without_any_answer_say_nothing_of_the_question() -> None:
+    question = ModeQuery()
+    for _ in range(5):
+        assert question.due(0)
+        question.begin(0, 10)
+        question.lost(alive=False)
+    assert question.supported
 
 
 GOOD = bytes(answer())
