@@ -100,12 +100,12 @@ def library_reader(file: Path) -> Iterator[mcap.reader.McapReader]:
 
 
 def seek_by_library(reader: mcap.reader.McapReader, time_ns: int) -> int:
-    """Log time of the first frame from a time on."""
+    """Let the mcap library find the first frame at or after a time; return its log time in ns."""
     return int(next(iter(reader.iter_messages(topics=["cell/frames"], starting_at=time_ns)))[2].log_time)
 
 
 def timed(function: Callable[[], object]) -> float:
-    """How long one call takes, in s."""
+    """Return the duration of one call in s."""
     begun_s = time.perf_counter()
     function()
     return time.perf_counter() - begun_s

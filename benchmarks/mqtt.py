@@ -130,7 +130,7 @@ def bare(address: Address, moving: Moving, qos: int, duration_s: float) -> Calla
 
 
 def latencies(address: Address, qos: int, count: int) -> list[float]:
-    """ms from a frame to its value at a subscriber."""
+    """Return the times in ms from the publication of a frame to the arrival of its value at a subscriber."""
     with segment(STAMPED) as made, bridge(made, address, qos) as running:
         subscriber = subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("mqtt_subscriber.py")), str(address), str(count)],

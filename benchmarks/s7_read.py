@@ -1,4 +1,4 @@
-"""Whole reads of DB201 a second: shmio's S7 client beside two others' ``db_read``, over ever longer links.
+"""Reads of all of DB201 per second: shmio's S7 client beside ``db_read`` of two others, over links with growing delay.
 
 The others are python-snap7 and the C library snap7. Controller, link and clients are processes of their own. Each
 client keeps its session over all rounds.

@@ -1,10 +1,10 @@
 """How the cost of an instance grows: with sources, with the size of a block, with readers.
 
-Each row is an instance of its own at 50 Hz; each source has an emulated controller of its own, in a process whose CPU
-is counted apart, since a plant has real ones. *All* is what the machine did, of as many times 100 % as it has cores,
-and *elsewhere* the part of it that is none of the benchmark's: with no core left, or much of that, the figures tell of
-the machine, no longer of shmio. *Due to frame* is from the time at which a cycle was due to the publishing of its
-frame: lateness, the read, and waiting for a core.
+Each row is an instance at 50 Hz. Each source has an emulated controller in its own process. The CPU use of these
+processes is reported separately, because a plant has real controllers. *All* is the CPU use of the whole machine; its
+maximum is 100 % times the number of cores. *Elsewhere* is the part used by programs other than the benchmark. If no
+core is idle, or *elsewhere* is large, the figures measure the machine and not shmio. *Due to frame* is the time from
+the moment at which a cycle was due to the publication of its frame: lateness, the read, and waiting for a core.
 """
 
 from __future__ import annotations

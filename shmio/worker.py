@@ -3,6 +3,9 @@
 A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))``, where ``run(worker)``
 does its work. Exit status: 0 stopped as requested; 1 failed, a restart may help; 2 failed, and the
 configuration must be changed first.
+
+A worker outlives its supervisor: the next supervisor takes it over, see
+:mod:`shmio.supervisor.takeover`.
 """
 
 from __future__ import annotations

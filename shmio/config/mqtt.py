@@ -155,14 +155,16 @@ def _check_accounts(mqtt: Mqtt, instance: str) -> None:
         key = f"mqtt.account[{index}]"
         if account.name in names:
             whose = (
-                "the account without a name, for clients that do not log in,"
+                "an account without a name, for clients that do not log in,"
                 if account.name is None
-                else repr(account.name)
+                else f"an account with the name {account.name!r}"
             )
-            raise ConfigError(f"{key}.name: {whose} is already {names[account.name]}")
+            raise ConfigError(f"{key}.name: {whose} exists already: {names[account.name]}")
         names[account.name] = key
         if account.name is not None and mqtt.password_file is None:
-            raise ConfigError(f"{key}.name: {account.name!r} needs a password, in a line of mqtt.password_file")
+            raise ConfigError(
+                f"{key}.name: {account.name!r} needs a password: set mqtt.password_file, and add a line for it there"
+            )
         for place, role in enumerate(account.roles):
             if role not in ROLES:
                 raise ConfigError(f"{key}.roles[{place}]: no role {role!r}; there are: {', '.join(ROLES)}")

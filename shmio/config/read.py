@@ -209,8 +209,8 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
         tables = {**tables, "source": sources[:MAX_SOURCES]}
         if len(sources) > MAX_SOURCES:
             faults.add(
-                f"source: {len(sources)} of them; an instance has at most {MAX_SOURCES} processes, "
-                "and the others are not checked"
+                f"source: there are {len(sources)} sources, but an instance has at most {MAX_SOURCES} processes; "
+                f"only the first {MAX_SOURCES} sources are checked"
             )
     sound, places = _Structure(faults, folder, broken).sections(tables)
     faults.places = places
@@ -338,7 +338,7 @@ class _Structure:
     def _first(self, value: list[Any], key: str) -> list[Any]:
         """Return the sections to check, at most ``MAX_SECTIONS``."""
         if len(value) > MAX_SECTIONS:
-            self._faults.add(f"{key}: {len(value)} of them; only {MAX_SECTIONS} are checked")
+            self._faults.add(f"{key}: there are {len(value)} sections; only the first {MAX_SECTIONS} are checked")
         return value[:MAX_SECTIONS]
 
     def _field(self, value: Any, key: str, kind: Any) -> bool:

@@ -1,4 +1,8 @@
-"""Carries out commands about injections, and evaluates declared injections in each cycle."""
+"""Carries out commands about injections, and evaluates declared injections in each cycle.
+
+The layers that they form, and the order in which these change the image, are in
+:mod:`shmio.connectors.injection_layers`; :mod:`shmio.connectors.output` applies them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Publishes a source's images with its injections applied, and the list and events of these injections."""
+"""Publishes a source's images with its injections applied, and the list and events of these injections.
+
+The injections and their order are in :mod:`shmio.connectors.injection_layers`.
+"""
 
 from __future__ import annotations
 
@@ -91,7 +94,10 @@ class Output:
 
     @property
     def base(self) -> bytes:
-        """Image beneath injections: :attr:`raw`, or the recorded image in a replay."""
+        """The image to which injections are applied: :attr:`raw`.
+
+        A replay that shows recorded injections applies them to the recorded image that includes these.
+        """
         return self.raw if self._last is None else self._last.base
 
     @property

@@ -47,7 +47,8 @@ def touched(layout: Layout, write: Write, present: Callable[[int], Value]) -> It
                 codec(register, layout.byte_order).encode_into(present(index), image)
             except ValueRangeError:
                 raise ValueError(
-                    f"{register.path}: the last message does not have the other elements: write the whole array"
+                    f"{register.path}: the other elements are unknown, because the last message does not contain them: "
+                    "write the whole array"
                 ) from None
         apply(write, image)
         yield index, codec(register, layout.byte_order).decode(image)

@@ -236,7 +236,7 @@ class _Parser:
             function = self._word
             self._advance()
             if not self._is("("):
-                raise self._expected(f"'(' after {function}")
+                raise self._expected(f"'(' after {function!r}")
             self._parentheses()
             self._emit(_one(abs) if function == "abs" else _edge(_EDGES[function], len(self._steps)))
         elif self._kind == "number":

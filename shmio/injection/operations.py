@@ -364,8 +364,8 @@ class Flip(Operation):
         """Create the operation.
 
         Args:
-            mask: The bits to invert, (size,); None to invert a random bit in each cycle.
-            cover: The covered bits, (size,), from which the random bit is chosen.
+            mask: The bits to invert, (size,). None: invert one random covered bit in each cycle.
+            cover: The bits that the injection covers, (size,).
             draw: The source of randomness.
 
         """

@@ -400,8 +400,8 @@ def bit_positions(register: Register) -> list[tuple[int, int]]:
 def element_position(element: ElementType, shape: tuple[int, ...], flat: int) -> tuple[int, int | None]:
     """Return (byte, bit) of an array element relative to the array's start.
 
-    ``flat`` counts elements row by row. Each row of bits begins at a whole byte; all other elements
-    follow each other at their stride.
+    ``flat`` counts elements row by row. In an array of BOOL, each row begins at a whole byte.
+    Elements of other types are spaced by their stride.
     """
     if element.base != "BOOL":
         return flat * element.stride, None

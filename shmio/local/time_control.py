@@ -171,8 +171,8 @@ class Coordinator:
         self._check_writable()
         if self._segment.clock.stepped:
             raise TimeError(
-                f'the time of instance {self._segment.instance!r} is virtual from its start (clock = "stepped" in its '
-                'configuration): there is no real time to go back to; to have real time, start it with clock = "wall"'
+                f"instance {self._segment.instance!r} always runs in virtual time, because its configuration says "
+                'clock = "stepped"; for real time, change this to clock = "wall" and restart the instance'
             )
 
     def set_step_size(self, dt_ns: int) -> None:

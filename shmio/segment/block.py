@@ -39,11 +39,11 @@ class Frame(NamedTuple):
     Attributes:
         number: Number of the frame in its ring, from 1.
         cycle: Number of the period in the source's schedule; in virtual time, number of the step.
-        publish_ns: CLOCK_MONOTONIC at publication, or a comparable time in virtual time.
+        publish_ns: CLOCK_MONOTONIC at publication; in virtual time, the virtual clock's equivalent.
         clock_ns: The instance's clock at publication.
         source_ns: The source's time stamp, UTC. A bad frame repeats the last image with its time
             stamp. 0: there never was an image, and the bytes are zeros.
-        incarnation: Number of the source's process.
+        incarnation: Number of starts of the source's process, including the present one.
         quality: Quality of the image at publication.
         provenance: Where the raw image comes from.
         event: Number of the last event before the frame.

@@ -48,6 +48,7 @@ def _align(size: int, to: int) -> int:
     return -(-size // to) * to
 
 
+_DAMAGED = "; the segment is damaged: restart the instance"
 _RING_SECONDS = 8
 _SECTIONS_PER_BLOCK = 8  # of a block with every kind of section
 _SPARE_SECTIONS = 40 * _SECTIONS_PER_BLOCK
@@ -191,7 +192,7 @@ def read_block(
         raise FormatError(f"{name}: block {described.name}: {error}") from None
     linked_size = frames.frame_size if channel is None else channel.frame_size
     if frames.frame_size != linked_size or events.frame_size != EVENT_SIZE:
-        raise FormatError(f"{name}: block {described.name}: its rings differ in size")
+        raise FormatError(f"{name}: block {described.name}: its rings have wrong frame sizes{_DAMAGED}")
 
     def layout() -> Layout:
         try:
@@ -199,7 +200,10 @@ def read_block(
         except LayoutError as error:
             raise FormatError(f"{name}: block {described.name}: {error}") from None
         if found.size != frames.frame_size:
-            raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
+            raise FormatError(
+                f"{name}: block {described.name}: its layout describes {found.size} bytes, but its frames have "
+                f"{frames.frame_size}{_DAMAGED}"
+            )
         return found
 
     return Block(

@@ -334,7 +334,7 @@ def test_hostile_bytes_never_crash_it(reader: Path, instance: str) -> None:
 
 
 def test_hostile_rings_never_crash_it(reader: Path, instance: str) -> None:
-    """Write heads, sequences, sizes and texts that no writer produces, while a reader follows."""
+    """Corrupt slots of the ring (sequence, sizes, texts) at random while the C reader follows: it does not crash."""
     chance = random.Random(2)
     with segment(instance, ring_bytes=1 << 12) as made:
         writer = made.writer("device")

@@ -1,4 +1,4 @@
-"""The A50 cell, armed for injections toward its controller."""
+"""The A50 cell, configured so that injections may change what is written to its controller."""
 
 from __future__ import annotations
 

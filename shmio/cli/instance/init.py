@@ -292,7 +292,7 @@ def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) ->
     if not together and len(ports) < len(blocks):
         raise ConfigError(
             f"{len(blocks)} data blocks need {len(blocks)} ports, but only {len(ports)} are free: "
-            "choose one block with --block NAME"
+            "choose one of them with --block NAME"
         )
     lines: list[str] = []
     for index, block in enumerate(blocks[: len(ports)]):

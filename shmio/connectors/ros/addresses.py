@@ -155,7 +155,9 @@ def extract(message: Any, address: Address) -> Any:
             raise FieldError(BAD_TYPE_MISMATCH, f"{address.text}: {step.name!r} is not a sequence")
         index = step.place if step.place is not None else place_of(scopes, step, address)
         if index >= len(found):
-            raise FieldError(BAD_INDEX_RANGE_NO_DATA, f"{address.text}: {step.name!r} is shorter")
+            raise FieldError(
+                BAD_INDEX_RANGE_NO_DATA, f"{address.text}: the array {step.name!r} has only {len(found)} elements"
+            )
         found = found[index]
     return found
 

@@ -186,7 +186,9 @@ def _assign(message: Any, kind: str, address: Address, value: Any, *, grow: bool
         index = step.place if step.place is not None else place_of(scopes, step, address)
         if index >= len(sequence):
             if not grow:
-                raise FieldError(BAD_NO_DATA, f"{address.text}: {step.name!r} is shorter")
+                raise FieldError(
+                    BAD_NO_DATA, f"{address.text}: the array {step.name!r} has only {len(sequence)} elements"
+                )
             sequence.extend([_MISSING] * (index + 1 - len(sequence)))
         if last:
             sequence[index] = value

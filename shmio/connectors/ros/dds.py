@@ -127,7 +127,7 @@ class Ros2Connector(Connector):
         """
         joined = self._participant
         if joined is None:
-            raise ConnectorError(f"not in DDS {self._where}")
+            raise ConnectorError(f"this process has not joined DDS {self._where}")
         self._pull(joined)
         if not self._met(joined):
             raise ConnectorError(f"all publishers of its topics have left DDS {self._where}")
@@ -161,7 +161,7 @@ class Ros2Connector(Connector):
         """
         joined = self._participant
         if joined is None:
-            raise WriteLostError(f"not in DDS {self._where}", [Lost.UNSENT] * len(writes))
+            raise WriteLostError(f"this process has not joined DDS {self._where}", [Lost.UNSENT] * len(writes))
         self._pull(joined)
         publications, refusals = plan(self._topics, writes)
         outcomes: list[str | Lost] = list(refusals)

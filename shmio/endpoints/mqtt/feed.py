@@ -18,6 +18,7 @@ from shmio.endpoints.mqtt.topics import (
     StructureChannel,
     TopicRules,
     ValueChannel,
+    output_topic,
 )
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
@@ -64,7 +65,7 @@ class Feed:
         base = f"{prefix}/{block.source}"
         self.status = StatusChannel(self.follower, f"{base}/status")
         chosen = list(_chosen(block.layout, rules, block.source))
-        self._channel_of = [*self._channels_of(chosen, rules, base)]
+        self._channel_of = [*self._channels_of(chosen, rules, prefix)]
         """The channel of each published register, in the layout's order."""
         self.channels = list(dict.fromkeys(self._channel_of))
         frames = rules.frames(block.source)
@@ -80,7 +81,7 @@ class Feed:
         self._limited: dict[ValueChannel | FramesChannel, None] = {}
 
     def _channels_of(
-        self, chosen: Sequence[tuple[Register, MqttTopic]], rules: TopicRules, base: str
+        self, chosen: Sequence[tuple[Register, MqttTopic]], rules: TopicRules, prefix: str
     ) -> Iterator[ValueChannel]:
         source = self.block.source
         paths = [rules.structure(source, part.path) if rule.payload == "structure" else None for part, rule in chosen]
@@ -91,10 +92,10 @@ class Feed:
         structures: dict[str, StructureChannel] = {}
         for (register, rule), path in zip(chosen, paths, strict=True):
             if path is None:
-                yield RegisterChannel(self.follower, register, f"{base}/{register.path}/out", rule)
+                yield RegisterChannel(self.follower, register, output_topic(prefix, source, register.path), rule)
                 continue
             if path not in structures:
-                topic = f"{base}/{path}/out" if path else f"{base}/out"
+                topic = output_topic(prefix, source, path)
                 structures[path] = StructureChannel(self.follower, path, parts[path], topic, rule)
             yield structures[path]
 

@@ -1,4 +1,4 @@
-"""The topics that the bridge publishes: the configuration's rules, and channels.
+"""The topics that the bridge publishes: their names, the configuration's rules, and channels.
 
 A channel makes the payload of one topic when the outbox sends it.
 """
@@ -27,6 +27,11 @@ NUMBERS: Final = (int, float)
 
 _ToJson = Callable[[bytes], Any]
 """Converts an image to a value for JSON."""
+
+
+def output_topic(prefix: str, source: str, path: str = "") -> str:
+    """Return the topic of a register or structure of a source; of the whole source without path."""
+    return f"{prefix}/{source}/{path}/out" if path else f"{prefix}/{source}/out"
 
 
 class TopicRules:

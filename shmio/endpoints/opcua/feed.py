@@ -169,7 +169,7 @@ class Feed:
 
     def watch(self, path: str, get: Callable[[], ua.DataValue]) -> Watch:
         """Return the watch of a register, an element or a part."""
-        index = self._owner(path)
+        index = self._register_of(path)
         found = self._by_register.setdefault(index, {})
         if path not in found:
             found[path] = Watch(self, f"{self.block.source}/{path}", get)
@@ -197,13 +197,13 @@ class Feed:
             if path is None:
                 self._details[watch.key] = watch
             else:
-                self._by_register.setdefault(self._owner(path), {})[path] = watch
+                self._by_register.setdefault(self._register_of(path), {})[path] = watch
         watch.renew(get)
         if get is not None and path is None:
             self._shown[watch.key] = watch.encoded
 
-    def _owner(self, path: str) -> int:
-        """Return the index of the register that has this path, or of which it is an element or a part."""
+    def _register_of(self, path: str) -> int:
+        """Return the index of the register of a path, which may name an element or a part of the register."""
         while path not in self._index:
             path = path.rpartition("/")[0] if ".%" not in path else path.rpartition(".%")[0]
         return self._index[path]
@@ -214,7 +214,7 @@ class Feed:
         if self._details.get(watch.key) is watch:
             del self._details[watch.key], self._shown[watch.key]
         elif "#" not in path and not watch.gone:
-            index = self._owner(path)
+            index = self._register_of(path)
             found = self._by_register.get(index, {})
             if found.get(path) is watch:
                 del found[path]

@@ -49,7 +49,10 @@ class Conversion:
         self._out = replace(register, offset=0)
 
     def image_bytes(self, data: bytes) -> bytes | None:
-        """Return the register's bytes in the image for its bytes in the controller; None if these are no value."""
+        """Convert the register's bytes from the controller's form to the image's.
+
+        Return None if they do not represent a value.
+        """
         if self.address.bit is not None:
             bit = data[0] >> self.address.bit & 1
             return bytes((bit << (self.register.bit or 0),))

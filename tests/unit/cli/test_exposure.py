@@ -1,4 +1,4 @@
-"""The line that says what other users of the host may do to an instance."""
+"""Tests of the line in which ``up`` says what other users of this host may do to the instance."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def test_address_of_an_external_broker(tmp_path: Path, text: str, expected: list
         (f'{OWN}[mqtt.account]\nroles = ["read"]\n', "mqtt.account: write [[mqtt.account]]"),
         (f"{OWN}[[mqtt.account]]\n", "mqtt.account[0].roles: this key is needed"),
         (f'{OWN}{ACCOUNT}["see"]\n', "mqtt.account[0].roles[0]: no role 'see'; there are: read, write"),
-        (f'{OWN}{ACCOUNT}["read"]\n{ACCOUNT}["write"]\n', "mqtt.account[1].name: the account without a name"),
+        (f'{OWN}{ACCOUNT}["read"]\n{ACCOUNT}["write"]\n', "mqtt.account[1].name: an account without a name"),
         (f'{OWN}{ACCOUNT}["read"]\nname = "a"\n', "mqtt.account[0].name: 'a' needs a password"),
         (f'{OWN}{ACCOUNT}["read"]\npublish = ["a"]\n', "mqtt.account[0].publish: needs the role write"),
         (

@@ -79,7 +79,7 @@ def test_comparison_with_nan_is_false() -> None:
         ("a b", "at character 3: expected and, or, or the end, found 'b'"),
         ("a < 1 < 2", "at character 7: expected and, or, or the end, found '<'"),
         ("(a", "at character 3: expected ')', found the end"),
-        ("abs a", "expected '(' after abs, found 'a'"),
+        ("abs a", "expected '(' after 'abs', found 'a'"),
         ("a $ 1", "at character 3: expected a register, a number or an operator, found '$'"),
         ("12abc", "expected a register, a number or an operator, found '1'"),
         ("__import__('os')", "expected and, or, or the end, found '('"),

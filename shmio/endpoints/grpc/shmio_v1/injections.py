@@ -160,7 +160,10 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
 
     """
     if len(pieces) > MAX_VALUES:
-        raise ValueRangeError(f"{len(pieces)} pieces, at most {MAX_VALUES} are allowed: join neighbours, or send fewer")
+        raise ValueRangeError(
+            f"pieces: the message has {len(pieces)}, but at most {MAX_VALUES} are allowed: join adjacent pieces, or "
+            "send them in several messages"
+        )
     cover = np.frombuffer(bits, np.uint8)
     image, given = np.zeros(len(bits), np.uint8), np.zeros(len(bits), np.uint8)
     spans = []
@@ -169,7 +172,7 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
         wanted = cover[span] & (piece.mask or 0xFF if piece.mask <= 0xFF else 0)
         if not piece.data or span.stop > len(bits) or not wanted.all():
             raise ValueRangeError(
-                f"pieces: the injection does not cover all of the {len(piece.data)} bytes from byte {piece.offset} on"
+                f"pieces: the injection does not cover all bits of bytes {piece.offset} to {span.stop - 1}"
             )
         image[span] ^= (image[span] ^ np.frombuffer(piece.data, np.uint8)) & wanted
         given[span] |= wanted

@@ -165,7 +165,7 @@ class Selections:
 
 
 class _Budget:
-    """The registers, elements and comparisons that a call may still use."""
+    """How many more registers, elements and comparisons of paths a call may still request."""
 
     def __init__(self) -> None:
         self.registers, self.elements, self.matches = MAX_REGISTERS, MAX_ELEMENTS, MAX_MATCHES

@@ -342,7 +342,7 @@ class SubscribeCall:
                 self.updates += 1
                 size += len(written)
                 parts.append(field(UPDATES, written))
-        waiting = deque(one for one in self._blocks.values() if self._open(one))
+        waiting = deque(one for one in self._blocks.values() if self._may_send(one))
         waiting.rotate(self._turn)
         self._turn += 1  # otherwise a block with long updates would starve the others
         most = len(parts) + BATCH_UPDATES
@@ -357,17 +357,18 @@ class SubscribeCall:
             parts.append(field(UPDATES, update))
         return b"".join(parts), not (waiting or any(inward.waits for inward in self._inward.values()))
 
-    def _open(self, updates: BlockUpdates) -> bool:
+    def _may_send(self, updates: BlockUpdates) -> bool:
         """Return whether the updates of a block may be sent now.
 
-        In virtual time, the updates of a block on the instance's clock wait for the end of a step.
+        In virtual time, updates of a source that steps with the instance wait until the step has
+        ended.
         """
         held = self._virtual_time.on and updates.view.block.attributes.stepped
         return not held or bool(self._step_marks) or updates.follower.frame is None
 
     def _ring(self, updates: BlockUpdates) -> None:
         """Wake the stream, because a block has a new frame or event."""
-        if self._open(updates):
+        if self._may_send(updates):
             self._wake.set()
 
     async def _wait(self) -> None:

@@ -1,4 +1,8 @@
-"""The queues of clients' streams: states may be conflated, events may not."""
+"""The queues of clients' streams: states may be conflated, events may not.
+
+simlog.v1, simlog.v2 and simserver use :class:`Outbox`. shmio.v1 uses :class:`SendQueue`, and
+conflates in :class:`shmio.endpoints.grpc.shmio_v1.subscribe.LatestFrame`.
+"""
 
 from __future__ import annotations
 

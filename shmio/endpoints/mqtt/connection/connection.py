@@ -502,8 +502,8 @@ class CommandConnection:
             client_id: The client id of this connection.
             selector: Selects the sockets that are ready.
             wake: Called by a thread that needs :meth:`turn` to run.
-            filters: Returns the filters for commands.
-            answers: Returns the filters for results.
+            filters: Returns the topic filters to subscribe to for commands.
+            answers: Returns the topic filters to subscribe to for the results of commands.
 
         """
         self._policy = ReconnectPolicy(settings, client_id, ())

@@ -1,4 +1,4 @@
-"""The limits equal those documented on the page about them."""
+"""The limits of the gRPC endpoint equal those in docs/reference/grpc-access.md."""
 
 from __future__ import annotations
 

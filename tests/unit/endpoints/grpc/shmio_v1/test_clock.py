@@ -141,7 +141,7 @@ def test_after_a_release_frames_are_sent_without_a_step(instance: str) -> None:
 def test_time_that_started_virtual_cannot_be_released(instance: str) -> None:
     async def test(served: Endpoint, _: Models) -> None:
         code, text = await refusal(stub(served).Release(wire.ReleaseRequest(), timeout=TIMEOUT_S))
-        assert (code, "virtual from its start" in text) == (grpc.StatusCode.FAILED_PRECONDITION, True)
+        assert (code, "always runs in virtual time" in text) == (grpc.StatusCode.FAILED_PRECONDITION, True)
 
     simulate(instance, test)
 

@@ -371,7 +371,7 @@ def test_too_many_pieces_are_refused_before_any_is_checked(segment: Segment) -> 
         await call.write(wire.InjectRequest(shadow=shadow))
         while not (answers := (await asyncio.wait_for(call.read(), TIMEOUT_S)).answers):
             pass
-        assert answers[0].outcome.reason.startswith("4097 pieces, at most 4096")
+        assert answers[0].outcome.reason.startswith("pieces: the message has 4097, but at most 4096")
         call.cancel()
 
     with_plant(segment, test)
