@@ -3,9 +3,9 @@
 ::
 
     ShmioError
-    ├── ConfigError        the configuration is wrong; names the key
-    │   └── DeclarationError     a declared injection is wrong; also a ValueRangeError
-    ├── LayoutError        a data-block source is wrong; carries diagnostics with file, line, column
+    ├── ConfigError        the configuration is wrong; the message names the key
+    │   └── DeclarationError     a declared injection is wrong; also a subclass of ValueRangeError
+    ├── LayoutError        a data-block source is wrong; ``diagnostics`` has file, line and column
     ├── ValueRangeError    a value does not fit its register's type
     ├── PathError          no such source or register
     ├── ConflictError      a name is in use for something else
@@ -18,16 +18,16 @@
     ├── CommandError       a command cannot be sent to its source, or was not carried out
     │   └── TimeError            the instance's clock cannot be moved, or a step failed
     ├── QualityError       the quality of the value is bad
-    ├── ConnectorError     the device did not answer as it should; carries a reason code
+    ├── ConnectorError     the device did not answer as it should
     ├── ModelError         a simulation model is declared wrongly, or its code failed
     ├── RecordingError     a recording cannot be written, or this version cannot read it
-    ├── MissingLibraryError  an optional library is not installed; names the command for it
+    ├── MissingLibraryError  an optional library is not installed; the message has the command for it
     ├── EndpointError      an endpoint cannot use its address, or is at a limit
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
-    │   ├── LostError            nothing serves this address at present; also a NotRunningError
+    │   ├── LostError            nothing serves this address at present; also a subclass of NotRunningError
     │   └── UnknownClientError   the endpoint requires a known client
     └── ControlError       the supervisor refused or did not answer
-        └── UnreachableError     its socket cannot be connected to
+        └── UnreachableError     shmio cannot connect to the supervisor's socket
 
 The command-line tools print the message of any of these errors and exit with status 1.
 """
@@ -116,7 +116,7 @@ class AlreadyRunningError(SegmentError):
 
 
 class FormatError(SegmentError):
-    """The segment has a magic, ABI version or structure that this version of shmio cannot read."""
+    """The segment has a magic number, ABI version or structure that this version cannot read."""
 
 
 class CommandError(ShmioError):
@@ -140,8 +140,8 @@ class QualityError(ShmioError):
 class ConnectorError(ShmioError):
     """The device is absent or did not answer as the protocol demands.
 
-    On this error, the poll loop closes the connection, and ``str()`` becomes the reason in the
-    next frame.
+    On this error, the poll loop closes the connection. The next frame has the text of the error as
+    its reason.
     """
 
 
@@ -181,4 +181,4 @@ class ControlError(ShmioError):
 
 
 class UnreachableError(ControlError):
-    """The supervisor's control socket cannot be connected to."""
+    """shmio cannot connect to the supervisor's control socket."""

@@ -26,9 +26,9 @@ KEPT_FILES = 3
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as one line; a traceback follows, indented.
+    """Formats a record as one line, followed by its traceback, indented.
 
-    Control characters of the line are escaped.
+    Control characters in the line are escaped.
     """
 
     def __init__(self, process: str, source: str | None) -> None:
@@ -50,13 +50,13 @@ class LineFormatter(logging.Formatter):
 class RotatingLog(logging.handlers.RotatingFileHandler):
     """A rotating log file.
 
-    With ``streams``, standard output and error always go to its newest file.
+    With ``streams``, standard output and standard error always go to the newest file.
     """
 
     def __init__(self, file: Path, *, streams: bool, patient: bool) -> None:
         """Open the file.
 
-        If that fails, raise OSError; with ``patient``, try again at each record.
+        If that fails, raise OSError, or with ``patient`` try again at each record.
         """
         self._streams = False  # they already go to this file, if it can be opened
         super().__init__(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1, delay=True)
@@ -84,9 +84,9 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
         return self.stream is not None and not os.path.samestat(there, os.fstat(self.stream.fileno()))
 
     def _open(self) -> TextIOWrapper:
-        """Open a new file and redirect the streams to it.
+        """Open a new file and redirect standard output and error to it.
 
-        Otherwise the traceback of a crash would go to a removed file.
+        Without that, the traceback of a crash would go to a removed file.
         """
         stream = super()._open()
         if self._streams:
@@ -111,8 +111,8 @@ def setup(
         process: The process name in each line.
         source: The source name in each line.
         console: True to write records to standard error as well.
-        streams: True if standard output and error go to the file, and are to follow each new one.
-        patient: True to retry a file that cannot be written, instead of raising ConfigError.
+        streams: True if standard output and error go to this file. They are redirected to each new file.
+        patient: True to try again later if the file cannot be written, instead of raising ConfigError.
 
     Returns:
         The logger named ``shmio``.

@@ -22,9 +22,9 @@ _OPERATIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "drop": {},
     "flip": {"bits": "bits"},
 }
-"""The keys of each operation, with their message fields.
+"""For each operation, its keys and the corresponding fields of its message.
 
-If ``value`` is an operation's only key, the value itself is the message.
+An operation whose only key is ``value`` has no message of its own: its field is the value.
 """
 _COMMON: Final = ("probability", "start_s", "end_s", "when", "for_s", "times", "seed", "priority")
 _DISTRIBUTIONS: Final = {"uniform": wire.Noise.DISTRIBUTION_UNIFORM, "gaussian": wire.Noise.DISTRIBUTION_GAUSSIAN}
@@ -57,7 +57,7 @@ def value_to_wire(value: object, path: str) -> wire.Value:
         return wire.Value(text=value)
     if isinstance(value, (list, tuple)):
         return wire.Value(list=wire.List(values=[value_to_wire(item, path) for item in value]))
-    raise ValueRangeError(f"{path}: a {type(value).__name__} is not a value of a register")
+    raise ValueRangeError(f"{path}: a Python {type(value).__name__} cannot be the value of a register")
 
 
 def value_from_wire(value: wire.Value, path: str) -> object:
@@ -215,7 +215,7 @@ def event_from_wire(found: wire.Event) -> Event:
 
 
 def _found_to_wire(value: object, path: str) -> wire.Value:
-    """Convert a value. None (invalid bytes) becomes a message without a value."""
+    """Convert an event's value. None, which stands for invalid bytes, becomes a message without a value."""
     if value is None:
         return wire.Value()
     if isinstance(value, list):

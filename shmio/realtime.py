@@ -1,4 +1,4 @@
-"""Real-time priority: a process with one runs before processes without one, sched(7)."""
+"""Real-time priority: processes that have it run before all other processes. See sched(7)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def prioritise(priority: int) -> None:
     """Give the calling thread, and threads that it starts later, a priority of SCHED_FIFO.
 
     Raises:
-        ConfigError: The user has no permission for it. The message contains the remedy.
+        ConfigError: This user may not use the priority. The message contains the remedy.
 
     """
     try:
@@ -25,7 +25,7 @@ def prioritise(priority: int) -> None:
 
 
 def check(priority: int) -> None:
-    """Raise ConfigError unless a process of this user may have the priority."""
+    """Raise ConfigError unless processes of this user may have the priority."""
     refused: list[ConfigError] = []
 
     def attempt() -> None:

@@ -1,10 +1,10 @@
 """Base of all child processes: role, log, heartbeat, report, and stop on request.
 
 A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))``, where ``run(worker)``
-does its work. Exit status: 0 stopped as requested; 1 failed, a restart may help; 2 failed, and the
-configuration must be changed first.
+does the work of the process. Exit status: 0: the worker stopped as requested; 1: it failed, and a
+restart may help; 2: it failed, and the configuration must be changed first.
 
-A worker outlives its supervisor: the next supervisor takes it over, see
+A worker outlives its supervisor. The next supervisor takes it over: see
 :mod:`shmio.supervisor.takeover`.
 """
 
@@ -66,7 +66,9 @@ class Worker:
         deadline = time.monotonic() + ROLE_WAIT_S
         while not self.slot.take():
             if time.monotonic() > deadline:
-                raise SegmentError(f"role {self.name} is still held by pid {self.slot.report.pid}")
+                raise SegmentError(
+                    f"the role {self.name} is still taken by another process, pid {self.slot.report.pid}"
+                )
             time.sleep(0.02)
         # Meanwhile the supervisor may have died, and a new one may have removed the segment.
         if not self.segment.shared.current():
@@ -106,19 +108,19 @@ class Worker:
             call()
 
     def on_reread(self, call: Callable[[], object]) -> None:
-        """Call ``call`` in another thread after each reload of the worker's rules.
+        """Call ``call`` in another thread whenever SIGHUP requests to read files again.
 
-        If there has been a reload since the process started, also call it now.
+        If a request has come since the process started, also call it now.
         """
         self._on_reread = call
         if self._rereads:
             call()
 
     def _install_signal_handlers(self) -> None:
-        """Make SIGTERM set ``stopping`` and SIGHUP trigger a reread; ignore Ctrl-C.
+        """Make SIGTERM set ``stopping``, and SIGHUP call what :meth:`on_reread` was given.
 
-        A thread handles the signals. A handler would run in the main thread, and block for ever if
-        that thread has locked the event.
+        Ignore Ctrl-C. A thread handles the signals. A signal handler would run in the main thread,
+        and block for ever if that thread has locked the event.
         """
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
@@ -139,7 +141,7 @@ class Worker:
 
 
 def main(run: Callable[[Worker], None]) -> int:
-    """Run a worker to its end; return the exit status of the process."""
+    """Run a worker until it ends, and return the exit status of the process."""
     worker = None
     try:
         worker = Worker(_read_spec())
@@ -168,7 +170,7 @@ def _report_failure(worker: Worker | None, message: str) -> None:
 
 def _read_spec() -> dict[str, Any]:
     if sys.stdin.isatty():
-        raise ConfigError("this module is a worker: shmio-supervisor starts it")
+        raise ConfigError("this module is a worker process: only shmio-supervisor can start it")
     try:
         data = sys.stdin.buffer.read(MAX_SPEC_BYTES + 1)
         sys.stdin.close()
@@ -176,7 +178,9 @@ def _read_spec() -> dict[str, Any]:
             raise ConfigError(f"the process description is larger than {MAX_SPEC_BYTES} bytes: the layout is too large")
         spec = json.loads(data)
     except ValueError:
-        raise ConfigError("no process description on standard input; shmio-supervisor starts workers") from None
+        raise ConfigError(
+            "no process description on standard input: only shmio-supervisor can start a worker"
+        ) from None
     missing = {"instance", "epoch", "name", "kind", "log_file", "config"} - set(spec)
     if missing:
         raise ConfigError(f"the process description lacks {', '.join(sorted(missing))}")

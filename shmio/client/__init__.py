@@ -8,7 +8,7 @@ Five lines::
         for update in cell.subscribe("cell/Robot_*/Axs*_Pos"):
             print(update.cycle, update.quality, update["cell/Robot_800/Axs1_Pos"])
 
-For asyncio: ``async with connect_aio(…)``. Its methods are the same, but awaited.
+For asyncio, use ``async with connect_aio(…)``. The client has the same methods; await them.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def connect_aio(
 ) -> client.Client:
     """Return a client for asyncio, with the arguments of :func:`connect`.
 
-    Create and use it within an event loop; its methods are awaited.
+    Create and use the client within an event loop, and await its methods.
     """
     return client.Client(
         Target(address, _path(ca), _path(certificate), _path(key), token, token_in_plain_text), timeout_s

@@ -1,4 +1,4 @@
-"""The part that both clients share: target, requests, answers, and errors from gRPC. No I/O."""
+"""Targets, requests, answers, and errors from gRPC, for both clients. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 STEP_PATIENCE_S: Final = 60.0
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 WRITE_PATIENCE_S: Final = 30.0
-"""Time in s that is added to the time-out of a write: a source may have long cycles."""
+"""Time in s that is added to the time-out of a write, because a source may have long cycles."""
 _SEARCH_PATIENCE_S: Final = 600.0
 """Time-out of a search in a recording, in s."""
 OPTIONS: Final = [
@@ -60,20 +60,20 @@ _PLAIN: Final = {
     "Cancelling all calls": "the endpoint has stopped",
     "Socket closed": "the endpoint has stopped",
 }
-"""Short texts for long ones of gRPC."""
+"""Texts that replace long error messages of gRPC, by a part of the message."""
 _TLS: Final = {
-    "Hostname Verification": "its certificate does not name this host: use a name or address that it has",
-    "WRONG_VERSION_NUMBER": "it speaks plain text: leave the CA out (ca, --ca)",
-    "CERTIFICATE_VERIFY_FAILED": "its certificate is not from the CA that was named (ca, --ca), or has expired",
+    "Hostname Verification": "its certificate does not name this host: use a name or address from the certificate",
+    "WRONG_VERSION_NUMBER": "the endpoint does not use TLS: leave the CA out (ca, --ca)",
+    "CERTIFICATE_VERIFY_FAILED": "its certificate is not from the CA given (ca, --ca), or has expired",
 }
-"""Short texts for TLS errors of gRPC."""
+"""Texts that replace gRPC's messages about TLS errors, by a part of the message."""
 _UNIX: Final = "unix:"
 _MEANING: Final = {
     grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
-    grpc.StatusCode.DEADLINE_EXCEEDED: "it did not answer in time",
-    grpc.StatusCode.UNAUTHENTICATED: "it does not know this client",
-    grpc.StatusCode.PERMISSION_DENIED: "it does not permit this",
-    grpc.StatusCode.UNIMPLEMENTED: "it does not serve shmio.v1, it is older than this client",
+    grpc.StatusCode.DEADLINE_EXCEEDED: "the endpoint did not answer in time",
+    grpc.StatusCode.UNAUTHENTICATED: "the endpoint does not know this client",
+    grpc.StatusCode.PERMISSION_DENIED: "the endpoint does not permit this call",
+    grpc.StatusCode.UNIMPLEMENTED: "the endpoint does not serve shmio.v1, or it is older than this client",
 }
 
 
@@ -102,7 +102,7 @@ class Target:
 
     @property
     def credentials(self) -> grpc.ChannelCredentials | None:
-        """Return credentials for TLS; None for plain text. OSError: a file cannot be read."""
+        """Credentials for TLS; None for plain text. Raises OSError if a file cannot be read."""
         if self.ca is None:
             return None
         ca, key, certificate = (
@@ -112,14 +112,14 @@ class Target:
 
     @property
     def metadata(self) -> tuple[tuple[str, str], ...]:
-        """Return the metadata of every call."""
+        """The metadata of every call."""
         return () if self.token is None else (("authorization", f"Bearer {self.token}"),)
 
     def error(self, error: Any) -> ShmioError:
         """Convert the error of a gRPC call to an error of shmio."""
         code, details = error.code(), error.details() or ""
         if "message larger than max" in details:  # text of gRPC
-            details = f"too much for one message: give or ask for fewer values at once ({details})"
+            details = f"the values are too large for one message: send or request fewer at once ({details})"
         if kind := _ERRORS.get(code):
             return kind(details)
         error_type = _REMOTE.get(code, RemoteError)
@@ -152,10 +152,10 @@ def _is_here(address: str) -> bool:
 
 
 def ns(dt_s: float | None) -> int:
-    """Convert the size of a step to ns; 0 stands for the present step size.
+    """Convert the length of a step to ns. None, which means the step size, becomes 0.
 
     Raises:
-        ValueRangeError: The size is out of range.
+        ValueRangeError: The length is out of range.
     """
     if dt_s is None:
         return 0
@@ -183,7 +183,11 @@ def subscribe_request(
 
 
 def write_request(values: Mapping[str, object], timeout_s: float | None, *, until_accepted: bool) -> Any:
-    """Return the request for Write. ValueRangeError: a value has an unsupported Python type."""
+    """Return the request for Write.
+
+    Raises:
+        ValueRangeError: A value has an unsupported Python type.
+    """
     timeout_ms = round(1000 * (timeout_s or 0))
     return wire.WriteRequest(values=assignments(values), timeout_ms=timeout_ms, until_accepted=until_accepted)
 
@@ -228,14 +232,18 @@ class Stepped:
 
     @classmethod
     def of(cls, found: Any) -> Stepped:
-        """Convert a message to a finished step."""
+        """Convert a message about a finished step."""
         return cls(found.number, found.time_ns)
 
 
 def steps_requests(count: int, dt_s: float | None) -> list[Any]:
-    """Return the requests for Steps. ValueRangeError: count or length is out of range."""
+    """Return the requests for Steps.
+
+    Raises:
+        ValueRangeError: The count or the length is out of range.
+    """
     if not 0 <= count < 1 << 32:
-        raise ValueRangeError(f"{count} steps: from 0 to {(1 << 32) - 1} are allowed at once")
+        raise ValueRangeError(f"{count} steps: from 0 to {(1 << 32) - 1} steps are allowed in one call")
     return [wire.StepsRequest(dt_ns=ns(dt_s), count=count)] if count else []
 
 
@@ -300,5 +308,5 @@ def playing(found: Any) -> list[Playing]:
 
 
 def replay_patience_s(wish: Wish) -> float | None:
-    """Return the time-out of a request to replay, in s; None: use that of the client."""
+    """Return the time-out of a request to replay, in s; None: the client's time-out applies."""
     return _SEARCH_PATIENCE_S if "change" in wish or "event" in wish else None

@@ -23,11 +23,11 @@ _MAX_WAITING: Final = 4096
 
 Given = Array | list[Any]
 Arrays = Mapping[Column, Given | tuple[Given, Given]]
-"""Values by column: of the whole column in the table, or (slots, values)."""
+"""Values by column: either the values of the whole column in the table, or (slots, values)."""
 Raw = Iterable[Piece | tuple[int, bytes] | tuple[int, bytes, int]]
-"""(offset, bytes), or (offset, bytes, mask): see :class:`Piece`."""
+"""Each item is (offset, bytes) or (offset, bytes, mask): see :class:`Piece`."""
 Ranges = Iterable[tuple[int, int] | tuple[int, int, int]]
-"""(offset, size), or (offset, size, mask): bytes of a frame, or bits of them."""
+"""Each item is (offset, size) for bytes of a frame, or (offset, size, mask) for bits of these bytes."""
 
 
 def lay(
@@ -47,7 +47,7 @@ def lay(
         ValueRangeError: An argument is invalid.
     """
     if for_s is not None and not 0 < for_s <= 86_400:
-        raise ValueRangeError(f"for_s: {for_s} is not a number of seconds above 0, at most 86400")
+        raise ValueRangeError(f"for_s: {for_s} is not a number of seconds above 0 and at most 86400")
     lifetime_ms = 0 if for_s is None else max(1, round(1000 * for_s))
     request = InjectRequest()
     request.lay.patterns.extend(patterns)
@@ -64,7 +64,7 @@ class Held:
     """An injection of this client, with its table of registers."""
 
     def __init__(self, found: Any) -> None:
-        """Take the first answer, or None if there was none. RemoteError: it is invalid."""
+        """Read the endpoint's first answer (None: there was none). Raise RemoteError if it is invalid."""
         if found is None or not found.HasField("laid"):
             raise RemoteError("the endpoint's first answer to Inject is invalid")
         self.number: int = found.laid.number
@@ -101,7 +101,7 @@ class Held:
         slots, values = given if isinstance(given, tuple) else (None, given)
         expected = len(self.table.arrays.get(column, ())) if slots is None else len(slots)
         if len(values) != expected:
-            raise ValueRangeError(f"{FIELDS[column]}: {len(values)} values for {expected} elements")
+            raise ValueRangeError(f"{FIELDS[column]}: {len(values)} values were given for {expected} elements")
         if slots is not None:
             part.slots = np.asarray(slots, "<u4").tobytes()
         if column is Column.TEXT:
@@ -110,11 +110,11 @@ class Held:
             part.values = np.asarray(values, DTYPES[column]).tobytes()
 
     def keep(self, found: Any) -> None:
-        """Store the originals of a message. RemoteError: too many are unread."""
+        """Store the originals of a message. Raise RemoteError if too many are unread."""
         if found.originals:
             if len(self._waiting) >= _MAX_WAITING:
                 raise RemoteError(
-                    f"{_MAX_WAITING} messages with originals wait: iterate over them, or do not request originals"
+                    f"{_MAX_WAITING} messages with originals are unread: iterate over them, or do not request originals"
                 )
             self._waiting.append(found.originals)
 
@@ -127,14 +127,14 @@ class Held:
         """Yield the originals of the oldest unread message."""
         for update in self._waiting.popleft():
             if update.table != self.table.number:
-                raise RemoteError(f"an original of table {update.table}, which was not sent")
+                raise RemoteError(f"the endpoint sent an original of table {update.table}, but not the table")
             yield Update(self.table, update)
 
 
 def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outcome]:
     """Return the same outcome for every value.
 
-    ``more`` adds one with path "", for all arrays and raw bytes.
+    With ``more``, the last outcome is that of all arrays and raw bytes; its path is empty.
     """
     paths = [*values, *([""] if more else [])]
     return calls.outcomes(paths, [outcome])
@@ -144,14 +144,14 @@ def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outc
 
 
 def declare_request(declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool) -> Any:
-    """Return the request for Declare. ValueRangeError: a key or value is invalid."""
+    """Return the request for Declare. Raise ValueRangeError if a key or value is invalid."""
     given = [one if isinstance(one, Mapping) else msgspec.to_builtins(one) for one in declarations]
     tables = [declaration_to_wire(table, f"injection[{index}]") for index, table in enumerate(given)]
     return wire.DeclareRequest(declarations=tables, keep=keep)
 
 
 def declared(found: Any) -> tuple[Declared, ...]:
-    """Convert the first answer to Declare. RemoteError: it is invalid."""
+    """Convert the first answer to Declare. Raise RemoteError if it is invalid."""
     if found is None or not found.HasField("declared"):
         raise RemoteError("the endpoint's first answer to Declare is invalid")
     return tuple(Declared(one.source, one.number, one.name, one.seed) for one in found.declared.injections)

@@ -27,12 +27,12 @@ class BlockLayout(Layout):
 
     Attributes:
         source: Name of the source.
-        section: Number of the source's block, which a reload may replace.
+        section: Number of the source's block. It changes if a reload replaces the block.
         hash: Hash of the layout.
         period_ns: Time between two cycles, in ns.
         stale_ns: Age above which a frame is bad, in ns.
         writable: Patterns of the registers that may be written.
-        armed: True if an injection may reach the device.
+        armed: True if injections may change what is written to the device.
     """
 
     registers: tuple[Register, ...]
@@ -64,11 +64,15 @@ class BlockLayout(Layout):
             ValueError: The image has the wrong size.
         """
         if len(image) != self.size:
-            raise ValueError(f"{self.source}: a frame has {self.size} bytes, this has {len(image)}")
+            raise ValueError(f"{self.source}: a frame has {self.size} bytes, but the image has {len(image)}")
         return np.frombuffer(image, self._dtype)[0]  # type: ignore[no-any-return]
 
     def value(self, image: bytes, path: str) -> Any:
-        """Return one register of a raw frame as in :meth:`array`, but BOOLs as bools; PathError."""
+        """Return the value of one register of a raw frame: as in :meth:`array`, but BOOLs as bools.
+
+        Raises:
+            PathError: There is no such register.
+        """
         place = self.places.get(path.removeprefix(f"{self.source}/"), self.places.get(path))
         if place is None:
             paths = [f"{self.source}/{register.path}" for register in self.registers]
@@ -103,15 +107,19 @@ class BlockLayout(Layout):
 
 
 def layouts(parts: Iterable[Any]) -> Iterator[BlockLayout]:
-    """Yield the layouts in the messages of GetLayouts. RemoteError: a message is invalid."""
+    """Yield the layouts in the messages of GetLayouts. Raise RemoteError if one is invalid."""
     registers: list[Register] = []
     for part in parts:
         registers += map(Register.of, part.registers)
         if len(registers) > MAX_REGISTERS:
-            raise RemoteError(f"source {part.source}: a layout of more than {MAX_REGISTERS} registers")
+            raise RemoteError(
+                f"source {part.source}: the endpoint sent a layout of more than {MAX_REGISTERS} registers"
+            )
         if part.last:
             if any(register.offset + register.size > part.size for register in registers):
-                raise RemoteError(f"source {part.source}: registers that are not in its {part.size} bytes")
+                raise RemoteError(
+                    f"source {part.source}: the endpoint sent registers that exceed the block's {part.size} bytes"
+                )
             yield BlockLayout(
                 name=part.name,
                 number=part.number if part.HasField("number") else None,

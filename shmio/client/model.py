@@ -1,4 +1,4 @@
-"""Messages between an endpoint and a program that serves a model. No I/O."""
+"""Messages between an endpoint and a program that serves a model. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 RETRY_S: Final = 0.25
 """Time between two attempts to join, in s."""
 PATIENCE_S: Final = 10.0
-"""Time to wait for an instance that does not run, in s."""
+"""Time for which a model waits for an instance that does not run, in s."""
 _WHOLE: Final = frozenset({Column.INT32, Column.INT64, Column.UINT64})
 _FAILURE_CHARACTERS: Final = 400
 
@@ -87,7 +87,7 @@ class Part:
     """A source that a program computes, with its inputs and outputs."""
 
     def __init__(self, found: Any) -> None:
-        """Take the first answer, or None if there was none. RemoteError: it is invalid."""
+        """Read the endpoint's first answer (None: there was none). Raise RemoteError if it is invalid."""
         if found is None or found.WhichOneof("what") != "joined":
             raise RemoteError("the endpoint's first answer to Simulate is invalid")
         joined = found.joined
@@ -102,7 +102,7 @@ class Part:
         self.period_s: float = joined.period_ns / 1e9
 
     def take(self, found: Any) -> Work:
-        """Return the step that an answer requests. RemoteError: the answer is invalid."""
+        """Return the step that a message requests. Raise RemoteError if the message is invalid."""
         if found.WhichOneof("what") != "work":
             raise RemoteError("the endpoint sent something other than a step")
         work = found.work
@@ -142,7 +142,7 @@ class Part:
 
     @staticmethod
     def failed(step: int, reason: str) -> bytes:
-        """Return the answer that a step has failed."""
+        """Return an answer that reports that the step has failed, and why."""
         return wire.SimulateRequest(done=wire.Done(step=step, failure=_shorten(reason))).SerializeToString()
 
 
@@ -168,7 +168,7 @@ class Member:
         self.period_s = part.period_s
 
     def _present(self) -> int:
-        """Return the number of the step to answer. RemoteError: there is none."""
+        """Return the number of the step to answer. Raise RemoteError if there is none."""
         if self._work is None:
             raise RemoteError(f"{self.source}: there is no step to answer")
         return self._work.step
@@ -180,7 +180,7 @@ def join_request(source: str, name: str) -> bytes:
 
 
 class Rejoining:
-    """Lets a model join again after a lost connection, and stores its outputs for that."""
+    """Lets a model join again after a lost connection, with the outputs that it computed before."""
 
     def __init__(self, patience_s: float) -> None:
         self._patience_s = patience_s
@@ -208,9 +208,9 @@ class Rejoining:
             log.warning("%s: %s", part.source, work.refused)
 
     def answer(self, part: Part, work: Work, outputs: Mapping[str, object] | None) -> bytes:
-        """Return the answer with the outputs; after joining again, with earlier outputs, too.
+        """Return the answer with the outputs; after joining again, also with earlier outputs.
 
-        Errors are those of :meth:`Part.done`.
+        It raises the errors of :meth:`Part.done`.
         """
         outputs = {} if outputs is None else outputs
         if not isinstance(outputs, Mapping):
@@ -221,7 +221,7 @@ class Rejoining:
         return answer
 
     def failed(self, part: Part, work: Work, error: Exception) -> bytes:
-        """Return the answer that a step has failed; log each reason once."""
+        """Return an answer that reports that the step has failed; log each reason once."""
         text = explain(error)
         if text != self._failure:
             self._failure = text

@@ -1,8 +1,8 @@
 """Tables of registers with their latest values as numpy arrays, and the messages that fill them.
 
 On the wire, a packed field of elements with a fixed size looks the same as a ``bytes`` field
-(protobuf.dev, "Encoding"). This module uses that: it derives messages from the generated
-description, in which such a field is the bytes of a little-endian array.
+(protobuf.dev, "Encoding"). So this module derives message types in which such a field has the type
+``bytes``. The bytes are those of a little-endian array.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FIELDS: Final = {
 _NEAR_CANDIDATES: Final = 500
 _SHOWN: Final = 200
 MAX_SLOTS: Final = 1 << 22
-"""Maximum number of elements of a table; no endpoint sends more."""
+"""Maximum number of elements of a table. No endpoint sends larger tables."""
 
 
 # -- messages with packed arrays as bytes --------------------------------------------------------------------
@@ -101,8 +101,8 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
     Attributes:
         column: Column with the register's values.
         slot: The register's first slot in the column.
-        comment: The source's comment; only in layouts.
-        initial: The source's text of the initial value; only in layouts.
+        comment: Comment from the layout's source text; only in layouts.
+        initial: Initial value, as written in the layout's source text; only in layouts.
     """
 
     column: Column
@@ -110,15 +110,17 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
 
     @property
     def element(self) -> ElementType:
-        """The elementary type. RemoteError: it is a type of a newer version."""
+        """The elementary type. Raises RemoteError if this version does not know the type."""
         found = element_type(self.type)
         if found is None:
-            raise RemoteError(f"{self.path}: it has the type {self.type!r}, which this version does not know")
+            raise RemoteError(
+                f"{self.path}: this register has the type {self.type!r}, which this version does not know"
+            )
         return found
 
     @classmethod
     def of(cls, found: Any) -> Register:
-        """Convert a message. RemoteError: it is invalid."""
+        """Convert a message. Raise RemoteError if it is invalid."""
         try:
             return cls(
                 found.path,
@@ -146,7 +148,7 @@ def unknown(path: str, paths: Sequence[str], what: str) -> PathError:
 
 
 class Change(NamedTuple):
-    """Received elements of a column: ``values[i]`` belongs to ``slots[i]``; read-only arrays."""
+    """Received elements of a column, as read-only arrays: ``values[i]`` belongs to ``slots[i]``."""
 
     column: Column
     slots: Array
@@ -160,26 +162,30 @@ class Table:
     """
 
     def __init__(self, found: Any) -> None:
-        """Convert a message. RemoteError: it is invalid."""
+        """Convert a message. Raise RemoteError if it is invalid."""
         self.number: int = found.number
         self.source: str = found.source
         self.section: int = found.section
-        """Number of the source's block, which a reload may replace."""
+        """Number of the source's block. It changes if a reload replaces the block."""
         self.size: int = found.size
         """Size of a frame in bytes."""
         self.hash: bytes = found.hash
         self.direction = "in" if found.direction == wire.DIRECTION_IN else "out"
-        """``in`` if updates have what commands write, ``out`` if what consumers see."""
+        """``in`` if updates have the values that commands write, ``out`` if those that consumers see."""
         self.ranges = tuple((one.offset, one.size, one.mask) for one in found.ranges)
         """Bytes that an injection covers besides the registers: (offset, size, mask of bits)."""
         self.registers = tuple(map(Register.of, found.registers))
         sizes = dict(zip(Column, found.slots[1:], strict=False))
         if sum(sizes.values()) > MAX_SLOTS:
-            raise RemoteError(f"source {self.source}: a table of {sum(sizes.values())} elements")
+            raise RemoteError(
+                f"source {self.source}: the endpoint sent a table of {sum(sizes.values())} elements, which is too large"
+            )
         for register in self.registers:
             count = int(np.prod(register.shape, dtype=object)) if register.dims else 1
             if count != register.count or register.slot + count > sizes.get(register.column, 0):
-                raise RemoteError(f"{self.source}/{register.path}: its elements are not in the table")
+                raise RemoteError(
+                    f"{self.source}/{register.path}: the register's elements are outside the endpoint's table"
+                )
         self.arrays: dict[Column, Array] = {
             column: np.zeros(size, DTYPES[column]) for column, size in sizes.items() if size
         }
@@ -193,7 +199,7 @@ class Table:
         self.codes: Array | None = None
         """The status code of each register; None if the source gives registers no status."""
         self.times_ns: Array | None = None
-        """The source time of each register, UTC in ns; 0: that of the update."""
+        """The source time of each register, UTC in ns; 0: the time of the update applies."""
         self.state: object = None
         """Quality, reason, provenance and incarnation of the latest frame."""
         self._everything = {column: np.arange(len(array), dtype=np.uint32) for column, array in self.arrays.items()}
@@ -218,7 +224,7 @@ class Table:
         if found is None:
             found = self.places.get(path.removeprefix(f"{self.source}/"))
         if found is None:
-            raise unknown(path, self.paths, f"the registers of {self.source} that were asked for")
+            raise unknown(path, self.paths, f"the registers of {self.source} that were requested")
         return found
 
     def value(self, place: int, arrays: Mapping[Column, Array] | None = None) -> Any:
@@ -242,7 +248,7 @@ class Table:
 
     @cached_property
     def _starts(self) -> Mapping[Column, tuple[Array, Array]]:
-        """For each column, the ascending first slots of its registers, and the indices of these."""
+        """For each column: the first slots of its registers, ascending, and the registers' indices."""
         found: dict[Column, list[tuple[int, int]]] = {}
         for place, register in enumerate(self.registers):
             found.setdefault(register.column, []).append((register.slot, place))
@@ -265,15 +271,15 @@ class Table:
                 else:
                     self.arrays[column][slots] = news
         except (IndexError, ValueError, KeyError) as error:
-            raise RemoteError(f"source {self.source}: an invalid update: {error}") from None
+            raise RemoteError(f"source {self.source}: the endpoint sent an invalid update: {error}") from None
         return changes
 
     def read(self, values: Any) -> tuple[Change, ...]:
-        """Return a message's values. RemoteError: they are invalid."""
+        """Return a message's values. Raise RemoteError if they are invalid."""
         try:
             return tuple(self._read(values))
         except (ValueError, KeyError) as error:
-            raise RemoteError(f"source {self.source}: an invalid update: {error}") from None
+            raise RemoteError(f"source {self.source}: the endpoint sent an invalid update: {error}") from None
 
     def _read(self, values: Any) -> Iterator[Change]:
         for column, name in FIELDS.items():
@@ -289,7 +295,11 @@ class Table:
                 yield Change(column, slots, news)
 
     def take_statuses(self, found: Any) -> list[int]:
-        """Copy a message's statuses, and return the indices of their registers. RemoteError: they are invalid."""
+        """Copy a message's statuses, and return the indices of their registers.
+
+        Raises:
+            RemoteError: The statuses are invalid.
+        """
         places = np.frombuffer(found.registers, np.uint32)
         if self.codes is None or self.times_ns is None:
             self.codes = np.zeros(len(self.registers), np.uint32)
@@ -298,20 +308,24 @@ class Table:
             self.codes[places] = np.frombuffer(found.codes, "<u4")
             self.times_ns[places] = np.frombuffer(found.source_ns, "<i8")
         except (IndexError, ValueError) as error:
-            raise RemoteError(f"source {self.source}: an invalid update: {error}") from None
+            raise RemoteError(f"source {self.source}: the endpoint sent an invalid update: {error}") from None
         return list(map(int, places))
 
     def status(self, place: int) -> RegisterStatus | None:
-        """Return the status that the source gave a register; None if it gives registers none."""
+        """Return the status that the source gave a register; None if the source gives no statuses."""
         if self.codes is None or self.times_ns is None:
             return None
         return RegisterStatus(int(self.codes[place]), int(self.times_ns[place]))
 
     def mark(self, marks: Any, into: Array) -> None:
-        """Copy a message's marks into ``into``. RemoteError: they are invalid."""
+        """Set ``into`` to True for the registers that a message marks, else to False.
+
+        Raises:
+            RemoteError: The message marks a register that is not in the table.
+        """
         places = np.frombuffer(marks.registers, np.uint32)
         into[:] = False
         try:
             into[places] = True
         except IndexError as error:
-            raise RemoteError(f"source {self.source}: an invalid update: {error}") from None
+            raise RemoteError(f"source {self.source}: the endpoint sent an invalid update: {error}") from None

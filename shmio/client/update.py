@@ -14,7 +14,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 
 class Piece(NamedTuple):
-    """Raw bytes of a frame from ``offset`` on. ``mask`` selects bits of each byte; 0: all."""
+    """Raw bytes of a frame from ``offset`` on. ``mask`` selects bits of each byte; 0 selects all."""
 
     offset: int
     data: bytes
@@ -24,20 +24,20 @@ class Piece(NamedTuple):
 class Update:
     """One frame of a source, or a change of its quality.
 
-    If its table has the direction ``in``, it has the values that a command wrote. ``update[path]``
-    is the latest value of a register.
+    If the table has the direction ``in``, the update has the values that a command wrote.
+    ``update[path]`` is the latest value of a register.
 
     Attributes:
         changes: The received values; ``table.arrays`` has the latest values of all registers.
         clock_ns: Time since the instance's start, in ns.
         source_ns: UTC time of the values, in ns; 0 if there are no values yet.
         marked: True if the update also says which registers are invalid or injected.
-        missed: With every frame: number of frames lost before this one.
+        missed: With ``every_frame``: number of frames lost before this one.
         ended: True if a reload has removed the source, or all requested registers.
-        image: With raw frames: the frame as consumers see it.
-        raw: With raw frames: the frame as the source delivered it.
-        age_ns: With reads: the age of the frame, in ns.
-        pieces: With an injection over ranges: the changes in these ranges.
+        image: With ``frames``: the frame as consumers see it.
+        raw: With ``frames``: the frame as the source delivered it.
+        age_ns: After a read: the age of the frame, in ns.
+        pieces: For an injection over ranges: the changed bytes in these ranges.
     """
 
     __slots__ = (
@@ -47,7 +47,7 @@ class Update:
     )  # fmt: skip
 
     def __init__(self, table: Table, found: Any) -> None:
-        """Convert a message, and copy its values into the table. RemoteError: it is invalid."""
+        """Convert a message, and copy its values into the table. Raise RemoteError if it is invalid."""
         self.table = table
         self.frame: int = found.frame
         self.cycle: int = found.cycle
@@ -106,7 +106,7 @@ class Update:
     def reading(self, place: int, register: model.Register | None = None) -> Reading:
         """Return the reading of the register at index ``place``.
 
-        If ``register`` is given, the reading describes the register with it.
+        ``register``: description of the register for the reading; None: the table's description.
         """
         found = self.table.registers[place]
         value: Any = self.table.value(place) if self.source_ns else None
@@ -149,7 +149,11 @@ class Update:
         return self.table.value(self.table.place(path), self._originals)
 
     def quality_of(self, path: str) -> tuple[Quality, str]:
-        """Return the quality of a register, and the reason if it is not good; PathError."""
+        """Return the quality of a register, and the reason if it is not good.
+
+        Raises:
+            PathError: There is no such register.
+        """
         place = self.table.place(path)
         if self.quality is not Quality.BAD and self.table.invalid[place]:
             return Quality.BAD, f"the bytes are not a valid {self.table.registers[place].type}"
@@ -157,7 +161,11 @@ class Update:
         return (self.quality, self.reason) if status is None else worse(self.quality, self.reason, status)
 
     def provenance_of(self, path: str) -> Provenance:
-        """Return the origin of a register's value; PathError."""
+        """Return the origin of a register's value.
+
+        Raises:
+            PathError: There is no such register.
+        """
         return Provenance.INJECTED if self.table.injected[self.table.place(path)] else self.provenance
 
 
@@ -167,15 +175,18 @@ _PROVENANCES = {int(provenance): provenance for provenance in Provenance}
 
 
 class Tables:
-    """Tables of one stream, or of a client's reads, by number."""
+    """The tables of one stream, or of a client's reads, by number."""
 
     def __init__(self) -> None:
         self.known: dict[int, Table] = {}
 
     def updates(self, found: Any) -> Iterator[Update]:
-        """Yield the updates of a message, which may also have tables. RemoteError: it is invalid.
+        """Yield the updates of a message, which may also have tables.
 
-        Use each update before the next one, which changes the table's arrays in place.
+        Each update changes the table's arrays in place, so use it before you take the next.
+
+        Raises:
+            RemoteError: The message is invalid.
         """
         for one in found.tables:
             news = Table(one)
@@ -184,11 +195,11 @@ class Tables:
         for update in found.updates:
             table = self.known.get(update.table)
             if table is None:
-                raise RemoteError(f"an update of table {update.table}, which was not sent")
+                raise RemoteError(f"the endpoint sent an update of table {update.table}, but not the table")
             yield Update(table, update)
 
     def all_of(self, found: Any) -> Iterator[Update]:
-        """Yield all updates of a stream's message. Those of removed sources come last."""
+        """Yield all updates of a stream's message. Updates that end a source come last."""
         yield from self.updates(found)
         for end in found.ended:
             direction = "in" if end.direction == wire.DIRECTION_IN else "out"
@@ -200,7 +211,7 @@ class Tables:
 
 
 def _same(old: Table, news: Table) -> bool:
-    """Return whether a table replaces another one."""
+    """Return whether ``news`` replaces ``old``, because both have one source and direction."""
     return (old.source, old.direction) == (news.source, news.direction)
 
 
@@ -215,15 +226,16 @@ class Snapshot:
             yield from update.table.paths
 
     def of(self, path: str) -> Update:
-        """Return the update that has a register. PathError: none has it.
+        """Return the update that has a register. The path may omit the source if there is only one.
 
-        The path may omit the source if there is only one.
+        Raises:
+            PathError: No update has the register.
         """
         update = self.updates.get(path.partition("/")[0])
         if update is None and len(self.updates) == 1:
             (update,) = self.updates.values()
         if update is None:
-            raise unknown(path, list(self), f"what was read of {', '.join(self.updates) or 'no source'}")
+            raise unknown(path, list(self), f"the registers that were read of {', '.join(self.updates) or 'no source'}")
         return update
 
     def __getitem__(self, path: str) -> Any:

@@ -47,7 +47,7 @@ class Update(Protocol):
 
     @property
     def incarnation(self) -> int:
-        """Number of the source's process."""
+        """Number of starts of the source's process, including the present one."""
 
     @property
     def clock_ns(self) -> int:
@@ -59,15 +59,15 @@ class Update(Protocol):
 
     @property
     def quality(self) -> Quality:
-        """Quality of the frame, bad once it is stale."""
+        """Quality of the frame. A stale frame is bad."""
 
     @property
     def reason(self) -> str:
-        """Reason why the quality is not good, or what a reload has removed."""
+        """Reason why the quality is not good. With ``ended``: what a reload has removed."""
 
     @property
     def provenance(self) -> Provenance:
-        """Origin of the source's own values."""
+        """Origin of the values that the source delivered; injections do not change it."""
 
     @property
     def missed(self) -> int:
@@ -77,16 +77,16 @@ class Update(Protocol):
     def ended(self) -> bool:
         """True if a reload has removed the source or its subscribed registers.
 
-        The source has no more updates.
-
-        When all sources have ended, the iteration waits until it is closed or the instance ends.
+        Then no more updates of the source follow. When all sources have ended, the iteration waits
+        until it is closed or the instance ends.
         """
 
     @property
     def readings(self) -> Sequence[Reading]:
-        """Registers that may have changed since the previous update; in the first update, all.
+        """Readings of the registers that may have changed since the previous update.
 
-        Read them before you take the next update.
+        The first update has readings of all subscribed registers. Use the readings of an update
+        before you take the next update.
         """
 
 
@@ -118,49 +118,50 @@ class Events(Held, Protocol):
         """Return the object itself."""
 
     def __next__(self) -> Event:
-        """Wait for the next event. NotRunningError: the instance has ended."""
+        """Wait for the next event. Raise NotRunningError if the instance has ended."""
 
 
 class Shadow(Held, Protocol):
     """An injection to which this program gives values.
 
-    Closing it lifts it, unless it was laid with ``keep``.
+    Closing the object lifts the injection, unless the program laid it with ``keep``.
     """
 
     @property
     def number(self) -> int:
-        """Number of the injection, with which any program may lift it."""
+        """Number of the injection. Any program may lift the injection by its number."""
 
     def set(self, values: Mapping[str, object]) -> list[Outcome]:
         """Give values by path, and return the outcome of each.
 
-        An outcome is ``rejected`` if the injection does not cover the path, or has been lifted. On
-        a remote cell, all values of one call have the same outcome, the worst of them. There, a
-        wrong path or value is also ``rejected``, and a lifted injection may raise RemoteError.
+        An outcome is ``rejected`` if the injection does not cover the path, or has been lifted.
+
+        On a remote cell, all values of one call have the same outcome, the worst of them. A wrong
+        path or value is also ``rejected`` there, and a lifted injection may raise RemoteError.
 
         Raises:
             PathError: There is no such register (only on this host).
             ValueRangeError: A value does not fit its register, or has a type that no register has.
-            CommandError: The injection is over, or the source's queue has no room.
+            CommandError: The injection has ended, or the source's queue has no room.
         """
 
 
 class Campaign(Held, Protocol):
     """Declared injections that this program has laid, and their events.
 
-    Iterate over it for the events: the iteration ends when all injections are lifted. Closing it
-    lifts the remaining ones, unless they were laid with ``keep``.
+    Iterate over the campaign for the events. The iteration ends when all injections are lifted.
+    Closing the campaign lifts the remaining injections, unless they were laid with ``keep``.
     """
 
     @property
     def declared(self) -> tuple[Declared, ...]:
-        """The injections, in the order of the declarations."""
+        """The laid injections, in the order of the declarations."""
 
     def __iter__(self) -> Iterator[Happening]:
         """Return the object itself."""
 
     def __next__(self) -> Happening:
-        """Wait for the next event. NotRunningError: the instance has ended."""
+        """Wait for the next event. Raise NotRunningError if the instance has ended."""
 
 
 class ReadsClock(Protocol):
@@ -205,7 +206,7 @@ class Cell(Held, Protocol):
         """
 
     def subscribe(self, *patterns: str, every_frame: bool = False, max_rate_hz: float = 0.0) -> Subscription:
-        """Follow registers: their present values, then each change.
+        """Follow registers: the iterator returns their present values, then each change.
 
         Args:
             patterns: As for :meth:`get`.
@@ -237,13 +238,13 @@ class Cell(Held, Protocol):
             The outcome of each value, under the path that you gave, in the same order.
 
         Raises:
-            PathError: A path names nothing. On this host also: the paths belong to several sources
-                or to none, or one ends in ``/out``.
+            PathError: A path names nothing. On this host also: the paths belong to several sources,
+                there are no values, or a path ends in ``/out``.
             ValueRangeError: A value does not fit its register, or a register is given twice. On a
                 remote cell also: the values belong to several sources, or there are none.
             CommandError: A register is not writable, or the source's queue has no room. On a remote
                 cell also: a path ends in ``/out``.
-                After any of these errors, nothing has been sent.
+                After each of these errors, the source has received nothing.
         """
 
     def inject(self, *patterns: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
@@ -251,13 +252,13 @@ class Cell(Held, Protocol):
 
         Args:
             patterns: As for :meth:`get`.
-            priority: Of several injections over a register, that with the highest is outermost.
+            priority: An injection with a higher priority covers those with a lower one.
             keep: Whether the injection stays when this program ends, until somebody lifts it.
             name: Name of the injection in events and lists.
 
         Raises:
             PathError: A pattern names nothing, or the patterns differ in source or direction.
-            CommandError: The source refuses, or does not answer.
+            CommandError: The source refuses the injection, or does not answer.
         """
 
     def declare(self, declarations: Iterable[Any], *, keep: bool = False) -> Campaign:
@@ -266,17 +267,17 @@ class Cell(Held, Protocol):
         Args:
             declarations: Mappings with the keys of an ``[[injection]]`` table, or
                 :class:`shmio.config.Declaration` objects.
-            keep: Whether the injections stay when this program ends, until they end or are lifted.
+            keep: Whether the injections stay when this program ends, until they are over or lifted.
 
         Raises:
             ValueRangeError: A declaration is wrong; nothing was laid.
-            CommandError: A source refuses, or does not answer; nothing was laid.
+            CommandError: A source refuses an injection, or does not answer; nothing was laid.
         """
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
         """Return the present injections of these sources, or of all.
 
-        Within a source, the innermost comes first.
+        Within a source, the innermost injection comes first.
         """
 
     def lift(self, source: str, number: int) -> None:
@@ -288,7 +289,9 @@ class Cell(Held, Protocol):
         """
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources, or of all, whoever laid them, and return them.
+        """Lift all injections of these sources, or of all sources, whoever laid them.
+
+        Return the result for each injection.
 
         Raises:
             CommandError: Some injections were not lifted; the message gives the reasons.
@@ -296,10 +299,10 @@ class Cell(Held, Protocol):
 
     @property
     def clock(self) -> ReadsClock:
-        """State of the instance's clock. Call it: ``clock()``."""
+        """Function that reads the instance's clock: ``cell.clock()`` returns its state."""
 
     def real_sources(self) -> list[str]:
-        """Return the names of the sources that steps do not move, such as those with a device."""
+        """Return the names of the sources that no step moves, such as sources with a real device."""
 
     def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
         """Take control of time, move it by steps, and wait until all sources have done them.
@@ -329,21 +332,23 @@ class Cell(Held, Protocol):
         """
 
     def pause(self) -> Clock:
-        """Take control of time, and stop it until it is stepped or played; return its state.
+        """Take control of time, and stop it until the next step or play. Return the clock's state.
 
         Raises:
             TimeError: Another program owns time, or a step failed while time was played.
         """
 
     def release(self) -> Clock:
-        """Return to real time, which continues from the present virtual time; return its state.
+        """Let real time run again, from the present virtual time. Return the clock's state.
 
         Raises:
             TimeError: Another program owns time, or time was virtual from the instance's start.
         """
 
     def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
-        """Control the replays of recordings, and return their status; no argument: only return it.
+        """Control the replays of recordings, and return their status.
+
+        Without arguments, only return the status.
 
         Args:
             wish: Requested changes: see :class:`shmio.model.replay.Wish`.

@@ -14,7 +14,7 @@ class ClockMode(IntEnum):
 
     WALL = 0
     VIRTUAL = 1
-    """Only steps move time, from take-over until release or the instance's end."""
+    """Only steps move time. Virtual time lasts from take-over until release or the instance's end."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -24,19 +24,19 @@ class Clock(NamedTuple):
     """State of an instance's clock.
 
     Attributes:
-        mode: Whether time is real or virtual.
+        mode: Whether time is real (wall time) or virtual.
         step: Number of the last requested step.
-        time_ns: The instance's clock after that step; in wall time, the present clock.
-        dt_ns: Length of that step.
+        time_ns: Time of the instance's clock after that step, in ns; in wall time, the present time.
+        dt_ns: Length of that step, in ns.
         done: Number of the last step that all sources have finished.
-        step_size_ns: Length of a step that is requested without one.
-        playing: True while the owner of time steps it continuously.
+        step_size_ns: Length of a step whose request names no length, in ns.
+        playing: True while the program that owns time steps it continuously.
         rate: Speed of playing, relative to real time.
         stepping: True while the last requested step is under way.
-        owner: Pid of the owner of time; 0: nobody.
-        note: Text about the processes that a step waits for, or the problem of the last step.
-        resumed_ns: In wall time: the clock at the last release of time.
-        offset_ns: In wall time: the clock minus the real time since the instance's start.
+        owner: Pid of the program that owns time; 0: no program owns it.
+        note: The processes that a step waits for, or the problem of the last step, as text.
+        resumed_ns: In wall time: the time of the clock at the last release of time, in ns.
+        offset_ns: In wall time: the clock minus the real time since the instance's start, in ns.
     """
 
     mode: ClockMode = ClockMode.WALL
@@ -64,14 +64,14 @@ class Clock(NamedTuple):
 
     @property
     def present_ns(self) -> int:
-        """The instance's clock; during a step the time before it."""
+        """Time of the instance's clock, in ns; during a step, the time before the step."""
         return self.time_ns - self.dt_ns if self.stepping else self.time_ns
 
     @property
     def basis(self) -> tuple[ClockMode, int, int, int]:
-        """Base of clock and cycles in wall time. It changes when time is taken over or released."""
+        """Values that determine clock and cycles in wall time; take-over and release change them."""
         return self.mode, self.step, self.resumed_ns, self.offset_ns
 
     def lead(self, period_ns: int) -> int:
-        """Return the lead of cycles over the clock in wall time: cycle = clock // period + lead."""
+        """Return the number to add to ``clock // period`` to get the cycle in wall time."""
         return self.step - self.resumed_ns // period_ns

@@ -34,13 +34,13 @@ class EventKind(StrEnum):
     DIVERTED = "diverted"
     """An injection took these values, which came from a writer or from an inner injection."""
     TAKEN = "taken"
-    """Injections took all of the item; nothing was left for the device."""
+    """Injections took all values of the item, so that the device got none of them."""
     INJECTED = "injected"
     """An injection was laid."""
     LIFTED = "lifted"
     """An injection was lifted."""
     SHADOWED = "shadowed"
-    """An injection gave values, which consumers see."""
+    """A program gave values to an injection, and consumers see them."""
     ACTIVATED = "activated"
     """A declared injection became active."""
     DEACTIVATED = "deactivated"
@@ -62,26 +62,26 @@ class Event:
     Attributes:
         source: Name of the source.
         kind: Kind of the event.
-        number: Number of the event, ascending in each source until a reload replaces the source; 0
-            with ``removed``.
+        number: Number of the event; 0 with ``removed``. The numbers of a source's events ascend until a
+            reload replaces the source.
         frame: Number of the last frame before the event.
         cycle: Cycle of the source's schedule.
-        incarnation: Number of the source's process.
+        incarnation: Number of starts of the source's process, including the present one.
         clock_ns: The instance's clock, in ns.
         utc_ns: UTC time, in ns.
         quality: Quality after the event.
         text: The reason, the note, or the name of the injection.
         injection: Number of the injection that the event is about; 0: none.
-        command: Number that the writer gave the command that the event is about; 0: none.
+        command: Number of the command that the event is about, chosen by its writer; 0: none.
         by: The event's cause: ``grpc``, ``mqtt``, or a program such as ``program 1``. Empty if
             there is none or it is unknown.
         direction: ``in`` if the event is about data for the device, ``out`` if about data for
             consumers. Empty if it is about no registers, or the direction is unknown.
         paths: The registers, elements, slices or bits that the event is about, at most 2048. If a
-            command has several items, ``rejected`` and ``taken`` name only those of the first. So
-            do other outcomes if ``accepted`` was lost.
-        values: Values by path, with ``accepted``, ``diverted`` and ``shadowed``. None stands for
-            bytes that are not valid for their type.
+            command has several items, ``rejected`` and ``taken`` name only the paths of the first
+            item. Other outcomes do the same if the event ``accepted`` was missed.
+        values: Values by path; only with ``accepted``, ``diverted`` and ``shadowed``. None stands
+            for bytes that are not valid for their type.
         missed: Number of the source's events lost since the previous event.
     """
 

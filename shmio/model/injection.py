@@ -17,7 +17,8 @@ class Running(msgspec.Struct, Generic[DeclarationT], frozen=True):
         declaration: The declaration: in a segment a ``Declaration``, for programs a mapping with
             the keys of an ``[[injection]]`` table.
         state: ``waiting``, ``active``, ``over``, or ``lifted`` before its end.
-        seed: The run's only source of randomness. The source draws it if the declaration has none.
+        seed: Seed of all random numbers of the run. If the declaration has no seed, the source draws
+            one.
         runs: Number of activations.
         cycle: Cycle of the last activation.
         time_ns: The instance's clock at the last activation, in ns.
@@ -35,14 +36,15 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
     """A present injection. In lists, the innermost of each source comes first.
 
     Attributes:
-        number: Number of the injection, with which any program may lift it.
+        number: Number of the injection. Any program may lift the injection by its number.
         direction: ``out`` or ``in``.
-        priority: Priority; the highest is outermost.
-        keep: True if it stays when the program that laid it ends.
+        priority: An injection with a higher priority covers those with a lower one.
+        keep: True if the injection stays when the program that laid it ends.
         name: Name of the injection.
-        writer: Number of the command queue that it came from; 4294967295: from the configuration.
-        pid: Process that laid it; 0: from the configuration.
-        ranges: The covered bits as (offset, size, mask).
+        writer: Number of the command queue that the injection came from; 4294967295: the injection
+            comes from the configuration.
+        pid: Process that laid the injection; 0: the injection comes from the configuration.
+        ranges: The covered bits, as (offset in bytes, size in bytes, mask).
         running: State of a declared injection; None: a program gives the values.
         source: Name of the source; empty in the segment, where the block has the name.
     """
@@ -61,7 +63,7 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """A declared injection that was laid; its ``seed`` is the declared one or a random one."""
+    """A declared injection that was laid. ``seed`` is random if the declaration has no seed."""
 
     source: str
     number: int
@@ -101,7 +103,7 @@ class Happening:
 class Lifted:
     """Result of lifting an injection.
 
-    If it was not lifted, ``failure`` is the reason, else empty.
+    ``failure`` is the reason why the injection was not lifted; empty if it was lifted.
     """
 
     source: str

@@ -20,9 +20,9 @@ class Playing:
         length_s: Length of the played range, in s.
         speed: Speed relative to the instance's clock.
         paused: True while the replay is paused.
-        loop: True if it starts again at the end.
-        over: True if it has reached the end.
-        until_s: The position at which it will pause, in s; None: at the end.
+        loop: True if the replay starts again at the end.
+        over: True if the replay has reached the end.
+        until_s: The position at which the replay will pause, in s; None: it plays to the end.
     """
 
     source: str
@@ -59,4 +59,4 @@ class Wish(TypedDict, total=False):
     jump: bool
     """With ``change`` or ``event``: go there at once instead of playing."""
     sources: Iterable[str]
-    """Only these sources, and others that replay the same recording."""
+    """Change only the replays of these sources, and of others that replay the same recording."""

@@ -3,8 +3,8 @@
 An image of a layout with :attr:`Layout.status_offset` ends in this area, so that rings, recordings
 and replays carry it like all other bytes. It holds two arrays in the order of the
 layout's registers: the OPC UA status codes (u32, OPC 10000-4, section 7.39), padded to 8 bytes, and
-the source times (i64, ns since 1970 UTC; 0: unknown, the time of the frame counts). They have the
-byte order of the layout.
+the source times (i64, ns since 1970 UTC; 0: unknown, so that the time of the frame applies). They
+have the byte order of the layout.
 """
 
 from __future__ import annotations
@@ -166,7 +166,8 @@ class RegisterStatus(NamedTuple):
 
     Attributes:
         code: OPC UA status code.
-        source_ns: UTC time of the value at its origin, in ns since 1970; 0: that of the frame.
+        source_ns: UTC time of the value at its origin, in ns since 1970; 0: the time of the frame
+            applies.
     """
 
     code: int
@@ -190,7 +191,7 @@ def describe(code: int) -> str:
 
 
 def worse(quality: Quality, reason: str, status: RegisterStatus) -> tuple[Quality, str]:
-    """Return the worse of a frame's quality and of a register's status, with its reason."""
+    """Return the worse quality, of a frame or of a register's status, and the reason for it."""
     return (quality, reason) if quality <= status.quality else (status.quality, status.reason)
 
 
@@ -206,9 +207,9 @@ class StatusArea:
         if layout.status_offset is None:
             raise ValueError(f"{layout.name}: the layout has no status area")
         self.codes_offset = layout.status_offset
-        """Where the codes begin."""
+        """Offset of the status codes in an image, in bytes."""
         self.times_offset = layout.size - _TIME_BYTES * len(layout.registers)
-        """Where the source times begin."""
+        """Offset of the source times in an image, in bytes."""
         order = ">" if layout.byte_order == "big" else "<"
         self._code, self._time = struct.Struct(f"{order}I"), struct.Struct(f"{order}q")
         self._severity_at = 0 if layout.byte_order == "big" else 3  # the byte of a code that has its severity
@@ -219,7 +220,7 @@ class StatusArea:
         return bisect_right(self._first_bits, 8 * register.offset + (register.bit or 0)) - 1
 
     def indices(self, registers: Iterable[Register]) -> list[int]:
-        """Return the index of each register, see :meth:`index`."""
+        """Return the index of each register: see :meth:`index`."""
         return [self.index(register) for register in registers]
 
     def code_range(self, index: int) -> tuple[int, int]:
@@ -241,7 +242,7 @@ class StatusArea:
         return _QUALITIES[image[self.codes_offset + _CODE_BYTES * index + self._severity_at] >> 6]
 
     def worst(self, image: Buffer, indices: Iterable[int]) -> tuple[int, RegisterStatus]:
-        """Return the index with the worst quality among these, and its status; the first of equals."""
+        """Return the first of the indices whose status has the worst quality, and this status."""
         found = min(indices, key=lambda index: self.quality(image, index))
         return found, self.get(image, found)
 
@@ -252,16 +253,16 @@ class StatusArea:
 
 
 def status_registers(layout: Layout, registers: Iterable[Register], *, times: bool = True) -> list[Register]:
-    """Return the statuses of registers as registers themselves, for tables and comparisons.
+    """Return registers that hold the statuses of other registers, for tables and comparisons.
 
     Args:
         layout: The layout of the registers.
-        registers: Registers, elements or parts. Those of one register of the layout share its status.
+        registers: Registers, elements or parts. All elements and parts of a register share its status.
         times: Whether to include the source times.
 
     Returns:
-        For each register ``PATH#status``, a DWORD, and ``PATH#source_ns``, a LINT; nothing if the
-        layout has no status area. No other path contains a ``#``.
+        For each register, the DWORD ``PATH#status`` and the LINT ``PATH#source_ns``; an empty list
+        if the layout has no status area. No other path contains a ``#``.
 
     """
     area = status_area(layout)
@@ -279,7 +280,7 @@ def status_registers(layout: Layout, registers: Iterable[Register], *, times: bo
 
 
 class _StatusCodec:
-    """Decodes a register to None while its status is bad; otherwise like the register's codec."""
+    """Codec of a register that decodes to None while the register's status is bad."""
 
     def __init__(self, register: Register, layout: Layout, area: StatusArea) -> None:
         self._codec = codec(register, layout.byte_order)
@@ -292,7 +293,7 @@ class _StatusCodec:
 
 
 def trusted_codec(register: Register, layout: Layout) -> RegisterCodec:
-    """Return a register's codec, which decodes to None while the source calls the register bad."""
+    """Return a codec for a register that decodes to None while the register's status is bad."""
     area = status_area(layout)
     return codec(register, layout.byte_order) if area is None else _StatusCodec(register, layout, area)
 

@@ -35,9 +35,9 @@ class Provenance(IntEnum):
 
 
 class Column(IntEnum):
-    """Array in which a client has the values of a type.
+    """Array in which a client stores the values of a type.
 
-    Numbers are those of ``Values`` in shmio.v1.
+    Each number is that of the array's field in the message ``Values`` of shmio.v1.
     """
 
     BOOL = 1
@@ -57,13 +57,13 @@ class Reading:
         source: Name of the source.
         register: The register or array element, with its path within the source, type, dimensions
             and comment.
-        value: The last known value, even while the quality is bad; None if there never was one.
+        value: The last known value, even while the quality is bad; None if there never was a value.
         quality: Quality of the value.
         reason: Reason why the quality is not good; empty if it is.
         provenance: Where the value comes from: live, simulated, replayed or injected.
         source_time: The source's time stamp, UTC in s; None if there never was a value.
         age_s: Age of the value by the source's clock, in s; None if there never was a frame. In
-            updates of a remote cell it is unknown: 0, or None while the quality is bad.
+            updates of a remote cell the age is unknown: 0, or None while the quality is bad.
     """
 
     source: str
@@ -82,7 +82,7 @@ class Reading:
 
 
 class OutcomeKind(StrEnum):
-    """Kind of outcome of a value."""
+    """What became of a written value."""
 
     WRITTEN = "written"
     """The device confirmed the value."""

@@ -22,7 +22,7 @@ class Events(AsyncIterator[Event]):
 
     @classmethod
     async def begin(cls, stream: Stream) -> Self:
-        """Wait until the endpoint follows the sources."""
+        """Wait until the endpoint follows the sources, and return the iterator."""
         try:
             await stream.first()
         except BaseException:

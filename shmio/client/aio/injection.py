@@ -15,10 +15,11 @@ from shmio.model.values import Outcome
 
 
 class Shadow(AsyncIterator[Update]):
-    """An injection to which this program gives values; iterate over it for the originals.
+    """An injection to which this program gives values.
 
-    Several tasks may give values, and one may iterate. ``table`` has the registers that the
-    injection covers, with the latest originals.
+    Iterate over it for the originals, which are the values that the injection covers. Several tasks
+    may give values, and one may iterate. ``table`` has the registers that the injection covers, with
+    the latest originals.
     """
 
     def __init__(self, channel: Channel, stream: Duplex, held: injection.Held) -> None:
@@ -26,7 +27,7 @@ class Shadow(AsyncIterator[Update]):
         self._stream = stream
         self._held = held
         self.number = held.number
-        """Number of the injection, with which any program may lift it."""
+        """Number of the injection. Any program may lift the injection by its number."""
         self.table = held.table
         self._turn = Condition()
         self._answers: dict[int, Any] = {}  # by sequence number; None until the answer comes
@@ -59,12 +60,12 @@ class Shadow(AsyncIterator[Update]):
             raw: Values as raw bytes.
 
         Returns:
-            An outcome for each value: all have the worst one. It is ``rejected`` if a path or value
-            is wrong, or the injection does not cover the path.
+            An outcome for each value. All values have the same outcome, the worst of them. It is
+            ``rejected`` if a path or value is wrong, or the injection does not cover the path.
 
         Raises:
             ValueRangeError: A value has an unsupported Python type.
-            CommandError: The injection is over.
+            CommandError: The injection has ended.
             RemoteError: Somebody has lifted the injection, or the instance has ended.
         """
         values, raw = values or {}, list(raw)
@@ -78,7 +79,7 @@ class Shadow(AsyncIterator[Update]):
                 if not await self._turn.wait_until(
                     lambda: self._answers[sequence] is not None or self._over, calls.WRITE_PATIENCE_S
                 ):
-                    raise RemoteError(f"{self._channel.target.address}: it did not answer in time")
+                    raise RemoteError(f"{self._channel.target.address}: the endpoint did not answer in time")
                 if self._answers[sequence] is None:
                     self._check()
                 return injection.ends(values, self._answers[sequence], more=bool(arrays or raw))
@@ -101,7 +102,7 @@ class Shadow(AsyncIterator[Update]):
         await self._stream.write(data)
 
     async def __anext__(self) -> Update:
-        """Wait for the next originals, which come only if ``originals`` was given."""
+        """Wait for the next originals. They come only if the injection was laid with ``originals``."""
         async with self._turn:
             if not self._updates:
                 await self._turn.wait_until(lambda: self._held.waits or self._over)
@@ -116,7 +117,7 @@ class Shadow(AsyncIterator[Update]):
         if self._error is not None:
             raise self._error
         if self._over:
-            raise CommandError(f"the injection {self.number} is over")
+            raise CommandError(f"injection {self.number} has ended")
 
     async def _read(self) -> None:
         error: ShmioError | None = None
@@ -153,14 +154,15 @@ class Lift(Protocol):
     """Function that lifts an injection of a source by its number."""
 
     async def __call__(self, source: str, number: int) -> None:
-        """Lift an injection; PathError, CommandError if that fails."""
+        """Lift an injection. Raise PathError or CommandError if that fails."""
 
 
 class Campaign(AsyncIterator[Happening]):
     """Declared injections that were laid together.
 
-    Iterate over it for their events, in one task: the iteration ends when all injections have
-    ended. ``declared`` has the injections in the order of the declarations, with their seeds.
+    To follow their events, iterate over the campaign in one task. The iteration ends when all
+    injections have ended. ``declared`` has the injections in the order of the declarations, with
+    their seeds.
     """
 
     def __init__(self, stream: Stream, first: Any, lift: Lift, *, keep: bool) -> None:
@@ -173,7 +175,7 @@ class Campaign(AsyncIterator[Happening]):
 
     @classmethod
     async def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
-        """Read the first answers to Declare, and return the campaign."""
+        """Read the first answers to the call Declare, and return the campaign."""
         try:
             return cls(stream, await stream.first(), lift, keep=keep)
         except BaseException:

@@ -77,7 +77,7 @@ class Stream(AsyncIterator[Any]):
         return found
 
     async def first(self) -> Any:
-        """Return the first answer; None if the stream was closed. RemoteError: time-out."""
+        """Return the first answer; None if the stream was closed. Raise RemoteError after a time-out."""
         try:
             async with asyncio.timeout(calls.WRITE_PATIENCE_S):
                 return await anext(self, None)
@@ -85,7 +85,7 @@ class Stream(AsyncIterator[Any]):
             raise calls.unanswered(self._channel.target) from None
 
     async def to_list(self) -> list[Any]:
-        """Return all answers. RemoteError: the channel was closed meanwhile."""
+        """Return all answers. Raise RemoteError if the channel was closed meanwhile."""
         found = [one async for one in self]
         if self._channel.closed:
             raise RemoteError(f"{self._channel.target.address}: the client was closed")
@@ -129,7 +129,7 @@ class Duplex(Stream):
 
 @contextmanager
 def _closing() -> Iterator[None]:
-    """Suppress the cancellation of a call by close, but not that of the task."""
+    """Suppress CancelledError if the call was cancelled, but not if the task was cancelled."""
     try:
         yield
     except asyncio.CancelledError:
@@ -138,7 +138,7 @@ def _closing() -> Iterator[None]:
 
 
 class Condition(asyncio.Condition):
-    """Condition with a time-out, for which several tasks wait."""
+    """Condition for which several tasks can wait, each with a time-out."""
 
     async def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Wait until the predicate is true. Return False after a time-out."""

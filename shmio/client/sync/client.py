@@ -32,16 +32,16 @@ from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 class Client:
     """Client of an instance; several threads may use it. Close it, or use ``with``.
 
-    It has the methods of :class:`shmio.Cell`, and more.
+    A client has the methods of :class:`shmio.Cell`, and more.
 
     Raises:
-        PathError, ValueRangeError, CommandError, QualityError: As from a local cell.
+        PathError, ValueRangeError, CommandError, QualityError: In the same cases as a local cell.
         EndpointError: The endpoint has reached a limit, for this client or for all.
         RemoteError: The endpoint cannot be reached, or refuses this client.
     """
 
     def __init__(self, target: Target, timeout_s: float = 10.0) -> None:
-        """Take the target, and the time-out in s of calls that the endpoint answers at once."""
+        """Create a client. ``timeout_s`` is the time-out in s of calls that the endpoint answers at once."""
         self.target = target
         self._channel = Channel(target, timeout_s)
         self._layouts: Mapping[str, BlockLayout] | None = None
@@ -95,7 +95,7 @@ class Client:
         if named != {(source, register.path) for source, register in chosen} or any(
             update.table.hash != layouts[source].hash for source, update in found.items()
         ):
-            raise PathError(f"{', '.join(patterns)}: a reload has changed what this names; try again")
+            raise PathError(f"{', '.join(patterns)}: a reload changed the registers while they were read; try again")
         return [
             found[source].reading(found[source].table.places[register.path], register) for source, register in chosen
         ]
@@ -144,10 +144,10 @@ class Client:
                 each update has the newest frame.
             frames: Whether to receive raw frames of the sources instead of values.
             max_rate_hz: Maximum number of updates per second of each source; 0 for no limit.
-            deadband: Changes of a number by at most this are not reported.
+            deadband: A change of a number is reported only if it is larger than this.
 
         Returns:
-            An iterator over updates. The first one raises PathError if a pattern names nothing.
+            An iterator over updates. If a pattern names nothing, its first call raises PathError.
         """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
@@ -161,7 +161,7 @@ class Client:
             PathError: There is no such source.
             ValueRangeError: There are too many sources.
             EndpointError: Too many clients follow events.
-            RemoteError: The endpoint cannot be reached, or does not admit this client.
+            RemoteError: The endpoint cannot be reached, or refuses this client.
         """
         return Events.begin(Stream(self._channel, self._stub.Events, wire.EventsRequest(sources=sources)))
 
@@ -206,8 +206,8 @@ class Client:
     ) -> Shadow:
         """Lay an injection over registers of one source, all of /out or all of /in.
 
-        It is lifted when you close it, at the end of its ``with`` block, when this program
-        ends, or after ``for_s``.
+        The injection is lifted when you close it, at the end of its ``with`` block, when this
+        program ends, or after ``for_s``.
 
         Args:
             patterns: Registers, elements, slices, structures or globs.
@@ -216,8 +216,9 @@ class Client:
             priority: Injections with a higher priority cover those with a lower one.
             keep: Whether the injection stays when this program ends, until somebody lifts it.
             name: Name in the list of injections.
-            for_s: Time in s after which it is lifted.
-            originals: Whether to receive the covered values: iterate over the injection.
+            for_s: Time in s after which the injection is lifted; None: no limit.
+            originals: Whether to receive the covered values. To read them, iterate over the
+                injection.
 
         Raises:
             PathError: A pattern names nothing.
@@ -233,12 +234,12 @@ class Client:
     def declare(self, declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool = False) -> Campaign:
         """Lay declared injections, all or none. Their sources run them without this program.
 
-        They are lifted when you close the campaign, at the end of its ``with`` block, or when
-        this program ends. Iterate over the campaign for its events.
+        The injections are lifted when you close the campaign, at the end of its ``with``
+        block, or when this program ends. Iterate over the campaign for its events.
 
         Args:
             declarations: Mappings with the keys of an ``[[injection]]`` table.
-            keep: Whether they stay when this program ends, until they end or somebody lifts them.
+            keep: Whether the injections stay when this program ends, until they are over or lifted.
 
         Raises:
             ValueRangeError: A declaration is invalid.
@@ -250,7 +251,7 @@ class Client:
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
         """Return the present injections of these sources, or of all.
 
-        Of each source, the innermost is first.
+        Within a source, the innermost injection comes first.
         """
         request = wire.ListInjectionsRequest(sources=sources)
         return injection.injections(self._call(self._stub.ListInjections, request))
@@ -267,6 +268,8 @@ class Client:
     def lift_all(self, *sources: str) -> list[Lifted]:
         """Lift all injections of these sources, or of all sources, whoever laid them.
 
+        Return the result for each injection.
+
         Raises:
             CommandError: Some injections were not lifted.
         """
@@ -276,7 +279,9 @@ class Client:
         return found
 
     def simulation(self, source: str, name: str = "") -> Simulation:
-        """Join a source with the connector ``remote`` as its model, to compute its steps.
+        """Join a source as the model that computes its steps.
+
+        The source must have the connector ``remote``.
 
         Args:
             source: Name of the source.
@@ -339,7 +344,7 @@ class Client:
         return calls.clock((self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
 
     def real_sources(self) -> list[str]:
-        """Return the names of the sources that steps do not move, such as those with a device."""
+        """Return the names of the sources that no step moves, such as sources with a real device."""
         return [one["name"] for one in (self.status())["processes"] if one.get("real_time")]
 
     def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
@@ -378,7 +383,7 @@ class Client:
         return Steps(Duplex(self._channel, self._stub.Steps, *requests), count)
 
     def set_step_size(self, dt_s: float) -> Clock:
-        """Take control of time, and set the step size: the length of steps requested without one.
+        """Take control of time, and set the step size: the length of steps whose request names no length.
 
         Args:
             dt_s: The size in s.
@@ -403,11 +408,11 @@ class Client:
         return self._move(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate))
 
     def pause(self) -> Clock:
-        """Take control of time, and stop it. TimeError: another program owns time."""
+        """Take control of time, and stop it. Raise TimeError if another program owns time."""
         return self._move(self._stub.Pause, wire.PauseRequest())
 
     def release(self) -> Clock:
-        """Return to real time, which continues from the present virtual time.
+        """Let real time run again, from the present virtual time.
 
         Raises:
             TimeError: Another program owns time, or time was virtual from the instance's start.
@@ -415,7 +420,9 @@ class Client:
         return self._move(self._stub.Release, wire.ReleaseRequest())
 
     def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
-        """Control the replays of recordings, and return their status; no argument: only return it.
+        """Control the replays of recordings, and return their status.
+
+        Without arguments, only return the status.
 
         Args:
             wish: Requested changes: see :class:`shmio.model.replay.Wish`. A replay that is resumed
@@ -430,7 +437,7 @@ class Client:
         return calls.playing(found)
 
     def _move(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Clock:
-        """Call a method that moves time. TimeError: the endpoint refuses, or a step failed."""
+        """Call a method that controls time. Raise TimeError if the endpoint refuses, or a step failed."""
         try:
             return calls.clock(self._call(method, request, timeout_s))
         except CommandError as error:
@@ -465,7 +472,7 @@ class Subscription(Iterator[Update]):
         self._waiting: Iterator[Update] = iter(())
 
     def __next__(self) -> Update:
-        """Wait for the next update. Use each before the next one, which changes its arrays.
+        """Wait for the next update, which changes the arrays of the previous update in place.
 
         Raises:
             RemoteError: The instance has ended.
@@ -496,7 +503,7 @@ class Steps(Iterator[Stepped]):
     """
 
     def __init__(self, stream: Duplex, count: int) -> None:
-        """Take the stream, and the number of steps that it has requested."""
+        """Create the iterator for a stream on which ``count`` steps have been requested."""
         self._stream = stream
         self._left = count
         self._waiting: Iterator[Any] = iter(())
@@ -524,7 +531,7 @@ class Steps(Iterator[Stepped]):
     def step(self, dt_s: float | None = None) -> Stepped:
         """Request one more step, and wait for it and all earlier ones.
 
-        Errors: as for the iteration.
+        It raises the same errors as the iteration.
         """
         self._stream.write(*calls.steps_requests(1, dt_s))
         self._left += 1
@@ -532,7 +539,7 @@ class Steps(Iterator[Stepped]):
         for done in self:
             last = done
         if last is None:
-            raise CommandError("the steps were closed")
+            raise CommandError("the stream of steps was closed")
         return last
 
     def close(self) -> None:
@@ -573,13 +580,13 @@ class Simulation(Member, Iterator[Work]):
 
         Raises:
             LostError: The endpoint has ended, or a reload has changed the source.
-            RemoteError: The connection failed otherwise.
+            RemoteError: The connection failed for another reason.
         """
         self._work = self._part.take(next(self._stream))
         return self._work
 
     def done(self, outputs: Mapping[str, object]) -> None:
-        """Answer the present step with outputs by path. Those left out keep their values.
+        """Answer the present step with outputs by path. Outputs left out keep their values.
 
         Raises:
             PathError: There is no such output; nothing was sent.

@@ -23,7 +23,7 @@ class Events(Iterator[Event]):
 
     @classmethod
     def begin(cls, stream: Stream) -> Self:
-        """Wait until the endpoint follows the sources."""
+        """Wait until the endpoint follows the sources, and return the iterator."""
         try:
             stream.first()
         except BaseException:

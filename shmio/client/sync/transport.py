@@ -70,7 +70,7 @@ class Stream(Iterator[Any]):
             self._channel.target.fail(error)
 
     def first(self) -> Any:
-        """Return the first answer; None if the stream was closed. RemoteError: time-out."""
+        """Return the first answer; None if the stream was closed. Raise RemoteError after a time-out."""
         late = threading.Event()
 
         def give_up() -> None:
@@ -91,7 +91,7 @@ class Stream(Iterator[Any]):
             timer.join()
 
     def to_list(self) -> list[Any]:
-        """Return all answers. RemoteError: the channel was closed meanwhile."""
+        """Return all answers. Raise RemoteError if the channel was closed meanwhile."""
         found = list(self)
         if self._channel.closed:
             raise RemoteError(f"{self._channel.target.address}: the client was closed")
@@ -137,7 +137,7 @@ class Duplex(Stream):
 
 
 class Condition(threading.Condition):
-    """Condition with a time-out, for which several threads wait."""
+    """Condition for which several threads can wait, each with a time-out."""
 
     def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Wait until the predicate is true. Return False after a time-out."""
@@ -145,7 +145,7 @@ class Condition(threading.Condition):
 
 
 class Background(threading.Thread):
-    """Daemon thread that runs a function, and does not keep the program from ending."""
+    """Daemon thread that runs a function. The program can end while the thread runs."""
 
     def __init__(self, run: Callable[[], None], name: str) -> None:
         super().__init__(target=run, name=name, daemon=True)

@@ -173,7 +173,7 @@ def test_raw_frames_are_decoded_by_the_layout(segment: Segment, connects: Connec
         assert len(layout.value(update.raw, "name").tobytes()) == 10
         with pytest.raises(PathError):
             layout.value(update.raw, "nothing")
-        with pytest.raises(ValueError, match="a frame has 628 bytes, this has 1"):
+        with pytest.raises(ValueError, match="a frame has 628 bytes, but the image has 1"):
             layout.array(b"x")
 
     with_client(segment, connects, test)
@@ -198,7 +198,9 @@ def test_errors_are_those_of_a_local_program(segment: Segment, connects: Connect
 @BOTH
 def test_too_large_message_is_refused_with_a_remedy(segment: Segment, connects: Connect) -> None:
     async def test(_: Endpoint, cell: Any) -> None:
-        with pytest.raises(EndpointError, match=r"^too much for one message: give or ask for fewer values at once \("):
+        with pytest.raises(
+            EndpointError, match=r"^the values are too large for one message: send or request fewer at once \("
+        ):
             await cell.write({"cell/name": "x" * (2 << 20)})
 
     with_client(segment, connects, test)
@@ -219,8 +221,8 @@ def test_address_without_an_endpoint(connects: Connect) -> None:
     [
         ("tls", None, "or it speaks TLS: then name the CA"),
         ("mutual", "ca.pem", "or it needs a client certificate"),
-        ("plain", "ca.pem", "it speaks plain text: leave the CA out"),
-        ("tls", "other.pem", "its certificate is not from the CA"),
+        ("plain", "ca.pem", "the endpoint does not use TLS: leave the CA out"),
+        ("tls", "other.pem", "its certificate is not from the CA given"),
         ("of another", "ca.pem", "its certificate does not name this host"),
     ],
 )

@@ -183,7 +183,7 @@ def test_an_injection_ends_when_its_time_is_over(segment: Segment) -> None:
         with cell.inject("cell/axis", for_s=0.05, originals=True) as shadow:
             drain(shadow)
             assert cell.injections() == []
-            with pytest.raises(CommandError, match="is over"):
+            with pytest.raises(CommandError, match="has ended"):
                 shadow.set({"cell/axis/position": 1.0})
 
     with_client(segment, test)
@@ -211,7 +211,7 @@ def test_invalid_injections_and_values_are_refused(segment: Segment) -> None:
             assert "not covered" in outcome.text
             (outcome,) = shadow.set({"cell/axis/position": "x"})
             assert outcome.kind == "rejected"
-            with pytest.raises(ValueRangeError, match="3 values for 2 elements"):
+            with pytest.raises(ValueRangeError, match="3 values were given for 2 elements"):
                 shadow.set(arrays={Column.FLOAT: [1.0, 2.0, 3.0]})
             (outcome,) = shadow.set(arrays={Column.INT32: ([7], [1])})
             assert "has no slot 7" in outcome.text
