@@ -1,8 +1,8 @@
-"""The block of a source: its process publishes frames and events, which readers copy and follow.
+"""The block of a source in shared memory: its frames and events, which readers copy or follow.
 
-:meth:`BlockWriter.publish` publishes a frame. Readers copy the newest one (:meth:`Block.latest`),
-or read each one in order (:class:`Cursor`, and :class:`FrameFollower`, which also reports changes
-of the quality). The ring is in C: ``ring.h``.
+The source's process calls :meth:`BlockWriter.publish` for each frame. Readers copy the newest frame
+(:meth:`Block.latest`), or read each frame in order: with :class:`Cursor`, or with
+:class:`FrameFollower`, which also reports changes of the quality. The ring is in C: ``ring.h``.
 """
 
 from __future__ import annotations
@@ -41,13 +41,14 @@ class Frame(NamedTuple):
         cycle: Number of the period in the source's schedule; in virtual time, number of the step.
         publish_ns: CLOCK_MONOTONIC at publication; in virtual time, the virtual clock's equivalent.
         clock_ns: The instance's clock at publication.
-        source_ns: The source's time stamp, UTC. A bad frame repeats the last image with its time
-            stamp. 0: there never was an image, and the bytes are zeros.
+        source_ns: The source's time stamp, UTC. A bad frame repeats the last image and its time
+            stamp. 0: the source has never delivered an image, and all bytes of the image are zero.
         incarnation: Number of starts of the source's process, including the present one.
         quality: Quality of the image at publication.
         provenance: Where the raw image comes from.
         event: Number of the last event before the frame.
-        delay_us: Maximum age of the image at publication: the time that the device took to answer.
+        delay_us: Maximum age of the image at publication, in us: the time that the device took to
+            answer.
         reason: Reason why the quality is not good.
         raw: The image that the source delivered, in its own byte order.
         effective: The image with injections, which consumers see; None if nothing is injected.
@@ -73,7 +74,7 @@ class Frame(NamedTuple):
         return self.raw if self.effective is None else self.effective
 
     def age_ns(self, now_ns: int) -> int:
-        """Return the maximum age of the image: the time since the device was asked for it.
+        """Return the maximum age of the image in ns: the time since the source requested it.
 
         Args:
             now_ns: The present time by the block's clock, :meth:`Block.now_ns`.
@@ -94,7 +95,7 @@ _PROVENANCES: Final = tuple(Provenance)
 
 
 def decode_frame(fields: FrameTuple) -> Frame:
-    """Convert what a ring returns to a frame."""
+    """Convert the tuple that :class:`Ring` returns for a frame."""
     (number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, reason,
      raw, effective) = fields  # fmt: skip
     return Frame(
@@ -109,7 +110,10 @@ def decode_frame(fields: FrameTuple) -> Frame:
 Entry = TypeVar("Entry")
 
 _POLL_NS: Final = 1_000_000_000
-"""Polling interval of a waiting reader: a dead supervisor rings no doorbell when a block ends."""
+"""Interval at which a waiting reader checks whether its block has been retired.
+
+A supervisor that dies after it has retired the block may not have rung the doorbell.
+"""
 
 
 class Cursor(Generic[Entry]):
@@ -133,7 +137,7 @@ class Cursor(Generic[Entry]):
 
     @property
     def last(self) -> int:
-        """Number of the last entry read, or counted as missed."""
+        """Number of the last entry that this cursor has read or counted as missed."""
         return self._last
 
     @property
@@ -209,7 +213,7 @@ class Attributes:
     writable: tuple[str, ...] = ()
     """Patterns of the registers that may be written."""
     armed: bool = False
-    """True if an injection may reach the device."""
+    """True if injections may change what is written to the device."""
     stepped: bool = False
     """True if the source uses the instance clock: it publishes a frame for each step of time."""
     outputs: tuple[str, ...] = ()
@@ -270,13 +274,16 @@ class Block:
     ) -> None:
         self.source = source
         self.section = section
-        """Index of the layout's section; unique among the blocks of one run of the instance."""
+        """Index of the section with the block's layout.
+
+        No two blocks of an instance's run have the same.
+        """
         self._load_layout = load_layout
         self.ring = ring
         self.events = EventRing(events, retired)
         self.commands = commands
         self.standing = standing
-        """The present injections of the source."""
+        """The existing injections of the source."""
         self.declared = declared
         """The injections that the configuration declares for the source."""
         self.attributes = attributes
@@ -308,9 +315,9 @@ class Block:
 
     @property
     def incarnation(self) -> int:
-        """Number of the process that writes the block, counted from 1.
+        """Number of starts of the source's process, including the present one.
 
-        A command names its process.
+        A command is only for the incarnation that it names.
         """
         return self.ring.incarnation
 
@@ -327,7 +334,8 @@ class Block:
     def now_ns(self) -> int:
         """Return the present time in ns on the clock by which frames age.
 
-        This is the clock of the playhead, the instance clock, or CLOCK_MONOTONIC.
+        A replay uses the clock of its playhead. Another source that uses the instance clock uses
+        that, and all others use CLOCK_MONOTONIC.
         """
         if self.playhead is not None:
             return self.playhead.now_ns()
@@ -338,9 +346,10 @@ class Block:
         return frame.assess(self.stale_ns, self.now_ns())
 
     def came_with(self, frame: Frame, step: int) -> bool:
-        """Return whether a frame belongs to the present step of virtual time, or to a later one.
+        """Return whether a frame belongs to a step of virtual time, or to a later step.
 
-        Always False for a block that does not use the instance clock.
+        For a block that replays a recording, the step is always the present one. The result is
+        always False for a block that does not use the instance clock.
         """
         if self.playhead is not None:
             return self.playhead.came_now(frame.number)
@@ -400,12 +409,12 @@ _MAX_DELAY_US: Final = 2**32 - 1
 
 
 class Stamp(NamedTuple):
-    """Times of a publication.
+    """The times of one publication, in ns.
 
     Attributes:
-        publish_ns: Time comparable to CLOCK_MONOTONIC.
+        publish_ns: CLOCK_MONOTONIC; in virtual time, the virtual clock's equivalent.
         clock_ns: The instance's clock.
-        utc_ns: UTC; for events only.
+        utc_ns: UTC. Only events use it. 0: the present time.
     """
 
     publish_ns: int
@@ -417,7 +426,7 @@ class BlockWriter:
     """Writing side of a block, in the source's process. Several threads may use it."""
 
     def __init__(self, block: Block, clock_ns: Callable[[int], int], at: Stamp | None = None) -> None:
-        """Begin a new incarnation, and publish the event of its start.
+        """Increase the block's incarnation by one, and publish the STARTED event.
 
         Args:
             block: The block to write.
@@ -428,18 +437,21 @@ class BlockWriter:
         self._clock_ns = clock_ns
         self._turn = threading.Lock()  # so that frames and events are in one order
         self.cycle = 0
-        """The present cycle, used to stamp events."""
+        """The present cycle. Each event gets this number."""
         self.at_ns: int | None = None
-        """Publish time in virtual time, comparable to CLOCK_MONOTONIC; None: now."""
+        """Publish time in virtual time, as the equivalent of CLOCK_MONOTONIC; None: now."""
         self.utc_ns: Callable[[int], int] | None = None
-        """Converts :attr:`at_ns` to UTC, which is then used for events."""
+        """Converts :attr:`at_ns` to the UTC time of events.
+
+        None: events get the present UTC time.
+        """
         self._quality = Quality.BAD
         self.incarnation = block.ring.begin()
         block.events.ring.begin(self.incarnation)
         self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"), at=at)
 
     def now_ns(self) -> int:
-        """Return the publish time that a frame would get now."""
+        """Return the publish time that a frame would get if it were published now."""
         return self.block.now_ns() if self.at_ns is None else self.at_ns
 
     def publish(
@@ -499,7 +511,7 @@ class BlockWriter:
 
         Args:
             record: The content of the event.
-            quality: The new quality, for a QUALITY event; None: that of the last frame.
+            quality: The new quality, for a QUALITY event; None: the quality of the last frame.
             at: Times of the publication; None: now.
 
         Returns:
@@ -529,12 +541,12 @@ class QualityChange(Enum):
 
     NONE = "none"
     DETAIL = "detail"
-    """The quality or its reason has changed, but not between bad and not bad."""
+    """The reason has changed, or the quality has changed between good and uncertain."""
     RECOVERED = "recovered"
     """The quality is no longer bad, or the first frame is not bad."""
     BAD = "bad"
     GAP = "gap"
-    """The quality is not bad, but the previous frame had become stale before this one came."""
+    """The quality is not bad, but the previous frame had become stale before the new one came."""
 
 
 _BAD: Final = Quality.BAD  # looking up an enum's member is slow, and each frame needs these
@@ -542,7 +554,9 @@ _NONE: Final = QualityChange.NONE
 
 
 class FrameFollower(Cursor[Frame]):
-    """Reads a block's frames from the newest one on, and tracks the quality. For one thread.
+    """Reads a block's frames from the newest one on, and tracks the quality.
+
+    Use it from one thread.
 
     Read a frame with :meth:`poll`, :meth:`read` or :meth:`newest`, then pass it to :meth:`take`. If
     there is no new frame, call :meth:`became_stale`.
@@ -553,9 +567,9 @@ class FrameFollower(Cursor[Frame]):
 
         Args:
             block: The block.
-            catch_up_s: If :meth:`read` is behind by more than this time, or by more than half the
-                ring, it skips to the newest frame and counts the others as missed. None: it never
-                skips.
+            catch_up_s: If the unread frames cover more than this time, or more than half the ring,
+                :meth:`read` skips to the newest frame and counts the skipped ones as missed. None:
+                it never skips.
             notice_gaps: Whether :meth:`take` reports :attr:`QualityChange.GAP`.
         """
         super().__init__(block.ring, decode_frame, max(0, block.ring.head() - 1), lambda: block.retired)
@@ -563,7 +577,7 @@ class FrameFollower(Cursor[Frame]):
         self.frame: Frame | None = None
         """The last frame taken; None before the first."""
         self.quality = Quality.BAD
-        """Quality when the last frame was taken or its age checked."""
+        """Quality at the last call of :meth:`take`, or since the last frame became stale."""
         self.reason = "no data yet"
         """Reason why the quality is not good; empty if it is."""
         self._notice_gaps = notice_gaps
@@ -577,7 +591,7 @@ class FrameFollower(Cursor[Frame]):
         return self.quality is _BAD and self.frame is not None and self.frame.quality is not _BAD
 
     def read(self, limit: int) -> Iterator[Frame]:
-        """Yield at most ``limit`` new frames; if too far behind, skip to the newest first."""
+        """Yield at most ``limit`` new frames. If too many are unread, skip to the newest first."""
         if self._most_behind is not None and self.behind > self._most_behind:
             newest = self._ring.head()
             self.missed += newest - 1 - self._last
@@ -588,7 +602,7 @@ class FrameFollower(Cursor[Frame]):
             yield frame
 
     def newest(self) -> Frame | None:
-        """Return the newest frame, and continue after it; None if there is none yet.
+        """Return the newest frame, and continue reading after it. None: there is no frame yet.
 
         Raises:
             SegmentError: The writer overtook the reader at every attempt to copy.
@@ -603,8 +617,8 @@ class FrameFollower(Cursor[Frame]):
 
         Args:
             frame: The frame.
-            aged: Whether to assess its quality now, by its age; otherwise it counts as at
-                publication.
+            aged: True: assess the frame's quality now, by its age. False: use the quality that it
+                had at publication.
         """
         last, before = self.frame, self.quality
         self.frame = frame
@@ -627,7 +641,7 @@ class FrameFollower(Cursor[Frame]):
         return change
 
     def became_stale(self) -> bool:
-        """Return True once, after the last frame has become stale."""
+        """Return True at the first call after the last frame has become stale, else False."""
         if self.frame is None or self.quality is _BAD:
             return False
         quality, reason = self.block.assess(self.frame)

@@ -1,8 +1,9 @@
 """Find the registers that differ between two images of a block.
 
-Bytes are compared, not values: a NaN that stays the same has not changed, but 0.0 that became -0.0
-has. Of a BOOL only its bit is compared; padding is ignored. If the layout has a status area, a
-register has also changed if its status code has; its source time does not count.
+The comparison is of bytes, not of values: a NaN whose bytes stay the same has not changed, but a
+change from 0.0 to -0.0 counts. For a BOOL, only its bit is compared. Padding is ignored. If the
+layout has a status area, a register has also changed if its status code has changed. A change of
+its source time alone does not count.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ class ChangeScan:
     """Compares two images over the given registers, in C. Immutable."""
 
     def __init__(self, registers: Sequence[Register], statuses: StatusArea | None = None) -> None:
-        """Prepare the comparison of these registers; ``statuses`` is the status area of their layout."""
+        """Prepare a comparison.
+
+        ``statuses`` is the layout's status area; None: compare no status codes.
+        """
         self._table = b"".join(entries([register], index, statuses) for index, register in enumerate(registers))
 
     @classmethod
     def joined(cls, parts: Iterable[bytes]) -> ChangeScan:
-        """Create a scan from parts made by :func:`entries`."""
+        """Create a scan of several groups of registers, each encoded by :func:`entries`."""
         scan = cls(())
         scan._table = b"".join(parts)
         return scan
@@ -42,7 +46,7 @@ class ChangeScan:
 
 
 def entries(registers: Sequence[Register], index: int, statuses: StatusArea | None = None) -> bytes:
-    """Encode the part of a scan that reports a change of any of these registers as ``index``."""
+    """Encode a part of a scan, which reports ``index`` if any of these registers has changed."""
     found = [_ENTRY.pack(*run, index) for register in registers for run in runs(register)]
     if statuses is not None:
         indices = dict.fromkeys(statuses.indices(registers))
@@ -51,7 +55,10 @@ def entries(registers: Sequence[Register], index: int, statuses: StatusArea | No
 
 
 def runs(register: Register) -> Iterator[tuple[int, int, int]]:
-    """Yield (offset, size, mask) of the bytes that hold a register's data; mask 0: whole bytes."""
+    """Yield (offset, size, mask) for each run of bytes that hold a register's data.
+
+    ``mask`` has the bits that belong to the register; 0: all bits.
+    """
     offset, element = register.offset, register.element
     if register.partial:
         masks = bits_of(register)

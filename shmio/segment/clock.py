@@ -1,16 +1,19 @@
-"""The clock page: the instance's time, the requested step, and the delivered steps of processes.
+"""The clock page: the instance's time, the requested step, and the steps that processes delivered.
 
-docs/reference/segment-format.md describes its bytes. Only the owner of time writes the page. Each
-process has a doorbell in it, which is rung when the process must act on a change of the page.
+docs/reference/segment-format.md describes its bytes. Only the owner of time writes the instance's
+time and the requested step. Each process writes which step it has delivered, and has a doorbell in
+the page, which wakes it when it must act on a change.
 
-When time is released (``Coordinator.release``), real time continues from the last virtual time, and
-cycles continue from the last step's number, so neither ever decreases. The page has the base of
-both. From it, every process, even one that starts later, computes the same:
+When a program releases time (``Coordinator.release``), real time continues from the last virtual
+time, and cycles continue from the number of the last step. So neither ever decreases. The page has
+``offset_ns``, ``resumed_ns`` and the number of the last step. From these, every process computes
+the same clock and cycles, even a process that starts later:
 
 - clock = CLOCK_MONOTONIC - ``started`` + ``offset_ns``;
-- cycle of a block = clock // period + lead, lead = step - ``resumed_ns`` // period.
+- cycle of a block = clock // period + lead, where lead = step - ``resumed_ns`` // period.
 
-All three are 0 until time is released for the first time. Frames of devices never use the offset.
+``offset_ns``, ``resumed_ns`` and the lead are 0 until time is released for the first time. Frames
+of devices never use the offset.
 """
 
 from __future__ import annotations
@@ -52,7 +55,13 @@ class DoubleBuffer:
     """
 
     def __init__(self, memory: memoryview, copies: tuple[int, int], complaint: str) -> None:
-        """Take the offsets of the copies, and the message of the error if both are corrupt."""
+        """Create the buffer.
+
+        Args:
+            memory: The mapped segment.
+            copies: Offsets of the two copies.
+            complaint: Message of the error that :meth:`read` raises if both copies are corrupt.
+        """
         self._memory = memory
         self._copies = copies
         self._complaint = complaint
@@ -82,7 +91,7 @@ class ClockPage:
             offset: Offset of the section.
             size: Size of the section in bytes.
             head: The segment's header.
-            owned: Returns whether a process owns time.
+            owned: Returns whether a living process owns time.
 
         Raises:
             ValueError: The section does not match the header.
@@ -97,7 +106,7 @@ class ClockPage:
         self._last = b"", Clock()  # the last state read
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
         self.bell = Doorbell(memory, offset + _BELL_AT)
-        """Doorbell that is rung at every change of the page."""
+        """Doorbell that the owner of time rings after a change of the page."""
         self.delivered_bell = Doorbell(memory, offset + _DELIVERED_BELL_AT)
         """Doorbell that processes ring when they have delivered a step."""
 
@@ -105,7 +114,7 @@ class ClockPage:
     def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int) -> None:
         """Write the page of a new segment.
 
-        With ``virtual``, time stands still at ``time_ns`` until it is stepped.
+        With ``virtual``, the clock stays at ``time_ns`` until the first step.
         """
         struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
         state = Clock(ClockMode.VIRTUAL, time_ns=time_ns) if virtual else Clock()
@@ -152,9 +161,10 @@ class ClockPage:
             self.bell.ring()
 
     def now_ns(self) -> int:
-        """Return the present time by which frames on this clock age.
+        """Return the present time in ns by which frames of sources on the instance clock age.
 
-        It is comparable to CLOCK_MONOTONIC. In wall time, both are equal until the first take-over.
+        It equals CLOCK_MONOTONIC until a program takes control of time for the first time. From
+        then on, it follows the instance's clock.
         """
         mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # a part: this is called often
         if not mode:
@@ -164,35 +174,38 @@ class ClockPage:
         return self._started_ns + present_ns
 
     def present_ns(self) -> int:
-        """Return the instance's clock; during a step the time before it."""
+        """Return the instance's clock in ns. During a step, this is the time before the step."""
         return self.now_ns() - self._started_ns
 
     def monotonic_ns(self, time_ns: int) -> int:
-        """Convert a time of the instance's clock to one comparable to CLOCK_MONOTONIC."""
+        """Convert a time of the instance's clock to the publish time of frames."""
         return self._started_ns + time_ns
 
     def utc_ns(self, monotonic_ns: int) -> int:
-        """Convert a time comparable to CLOCK_MONOTONIC to UTC.
+        """Convert a publish time of frames, such as :meth:`now_ns`, to UTC in ns.
 
-        If time was virtual from the start, the result is the same in each run.
+        If time is virtual from the start, UTC begins at ``SIMULATED_UTC_NS`` in each run.
         """
         since_ns = monotonic_ns - self._started_ns
         return (SIMULATED_UTC_NS if self.stepped else self._started_utc_ns) + since_ns
 
     def slot_bell(self, index: int) -> Doorbell:
-        """Return the doorbell that is rung when the process in a slot must act."""
+        """Return the doorbell that wakes the process in a slot when it must act on a change."""
         return Doorbell(self._memory, self._entry(index) + 8)
 
     def delivered(self, index: int) -> int | None:
-        """Return the last step that a slot's process has delivered; None if it delivers none."""
+        """Return the last step that the process in a slot has delivered to its clients.
+
+        None: steps do not wait for this process.
+        """
         count = _atomics.load64(self._memory, self._entry(index))
         return count - 1 if count else None
 
     def deliver(self, index: int, step: int) -> None:
-        """Record that the process in a slot has delivered everything up to this step.
+        """Record that the process in a slot has delivered all frames and events up to this step.
 
-        Only that process may call it. After its first call, each step waits for it while it is
-        alive.
+        Only that process may call it. From its first call on, each step waits for that process to
+        deliver it, as long as the process is alive.
         """
         _atomics.store64(self._memory, self._entry(index), step + 1)
         self.delivered_bell.ring()
@@ -210,7 +223,10 @@ class ClockPage:
 
 
 def time_lock(head: Header) -> int:
-    """Return the lock byte of the owner of time: the next after those of the process table."""
+    """Return the number of the lock byte that the owner of time holds.
+
+    It follows the slots' bytes.
+    """
     return head.process_capacity + 1
 
 

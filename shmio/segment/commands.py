@@ -1,8 +1,8 @@
-"""Commands to a source, sent from each writer's process through a queue of its own.
+"""Commands to a source, which each writer sends through its own queue.
 
-A block has a queue for each writer, so that writers never contend, and one doorbell for all queues.
-The source decides whether and in which order to execute commands, and reports the outcomes as
-events. From the events, readers collect the outcomes of a command (:class:`CommandOutcomes`) and
+A block has one queue for each writer, so that writers never compete, and one doorbell for all
+queues. The source decides whether and in which order to execute commands, and reports the outcomes
+as events. From the events, readers collect the outcomes of a command (:class:`CommandOutcomes`) and
 its writes (:class:`CommandAssembler`).
 """
 
@@ -23,7 +23,7 @@ from shmio.segment import _atomics
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 WRITERS: Final = 8
-"""Number of command queues of a block; processes.py assigns them."""
+"""Number of command queues of a block; processes.py assigns each queue to a writer."""
 _MIN_CAPACITY: Final = 1 << 14
 MAX_WRITES: Final = 4096
 """Maximum number of items in a command."""
@@ -44,22 +44,29 @@ class CommandKind(IntEnum):
     WRITE = 1
     """Write the items to the device, or to injections that cover them."""
     INJECT = 2
-    """Lay an injection over the bits that the items' data set.
+    """Create an injection that covers the bits that are set in the items' data.
 
-    Its number is that of the command.
+    The injection gets the command's number.
     """
     SHADOW = 3
-    """Give values to an injection: to consumers if it covers ``/out``, to the device if ``/in``."""
+    """Give values to an injection.
+
+    If the injection covers ``/out``, consumers see the values. If it covers ``/in``, the device
+    gets them.
+    """
     LIFT = 4
-    """Lift an injection; there are no items."""
+    """Remove an injection. The command has no items."""
     DECLARE = 5
-    """Lay an injection that the source runs by itself; the only item is its declaration in JSON."""
+    """Create a declared injection, which the source runs.
+
+    The only item is the declaration in JSON.
+    """
     NOTE = 6
-    """Add a note, which is the command's name, to the events; there are no items."""
+    """Add a note to the events. The command's ``name`` is the note; there are no items."""
 
 
 EMPTY: Final = frozenset({CommandKind.LIFT, CommandKind.NOTE})
-"""Kinds without items."""
+"""Kinds of commands that have no items."""
 
 
 class Direction(IntEnum):
@@ -85,11 +92,12 @@ class Command:
     Attributes:
         writer: Number of the writer's queue.
         id: Number that the writer gave the command.
-        incarnation: Number of the source's process that the command is for.
+        incarnation: Incarnation of the source's process that the command is for. Any other rejects
+            it.
         deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
         writes: The items.
         kind: Kind of command.
-        injection: The injection to lift, or to give values to.
+        injection: Number of the injection to lift, or to give values to.
         direction: With INJECT: the direction.
         priority: With INJECT: the priority; the highest is outermost.
         keep: With INJECT: whether the injection outlives its client.
@@ -132,16 +140,16 @@ class Command:
             head = _COMMAND.unpack_from(record)
             number, incarnation, count, deadline_ns, kind, flags, name_size, priority, injection = head
             if (count > 0) == (CommandKind(kind) in EMPTY) or count > MAX_WRITES:
-                raise ValueError(f"kind {kind} with {count} items")
+                raise ValueError(f"a command of kind {kind} cannot have {count} items")
             name = record[_COMMAND.size : _COMMAND.size + name_size]
             if len(name) != name_size or name_size > MAX_NAME_BYTES or flags > Direction.IN | _KEEP:
-                raise ValueError(f"flags {flags}, a name of {name_size} bytes")
+                raise ValueError(f"the command has invalid flags ({flags}) or an invalid name size ({name_size} bytes)")
             at, writes = _COMMAND.size + name_size + -name_size % 8, []
             for _ in range(count):
                 offset, size, mask = _WRITE.unpack_from(record, at)
                 at += _WRITE.size
                 if size == 0 or size > len(record) - at or (mask and (size != 1 or mask & mask - 1)):
-                    raise ValueError(f"item of {size} bytes, mask {mask}")
+                    raise ValueError(f"an item has an invalid size ({size} bytes) or mask ({mask})")
                 writes.append(Write(offset, mask, record[at : at + size]))
                 at += size + -size % 8
         except struct.error as error:
@@ -153,7 +161,7 @@ class Command:
 
 
 def capacity_for(layout_size: int) -> int:
-    """Return a queue's data size in bytes: a power of two, several times the size of the block."""
+    """Return the capacity of a queue in bytes: a power of two, at least 4 times ``layout_size``."""
     wanted = max(_MIN_CAPACITY, 4 * layout_size)
     return 1 << (wanted - 1).bit_length()
 
@@ -170,14 +178,14 @@ def section_header(layout_size: int) -> bytes:
 
 
 class CommandQueues:
-    """The commands section of a block. Its geometry is checked once and kept."""
+    """The commands section of a block. The constructor checks the geometry, and keeps it."""
 
     def __init__(self, memory: memoryview, offset: int, size: int) -> None:
         """Check the geometry. ValueError: it is inconsistent."""
         self._memory = memory
         self._offset = offset
         if size < _SECTION_HEADER_SIZE:
-            raise ValueError("commands section is shorter than its header")
+            raise ValueError("the commands section is shorter than its header")
         geometry: tuple[int, int, int, int] = _SECTION.unpack_from(memory, offset)
         self.writers, self._stride, self.capacity, _ = geometry
         sound = (
@@ -192,7 +200,7 @@ class CommandQueues:
             raise ValueError("the queues do not fit in the commands section")
 
     def push(self, writer: int, record: bytes) -> bool:
-        """Append a record to a writer's queue, and ring the doorbell; False: there is no room."""
+        """Append a record to a writer's queue, and ring the doorbell. False: there is no room."""
         taken = _atomics.queue_push(self._memory, self._queue(writer), self.capacity, record)
         self.wake()  # even if full: a writer may have died after its push, before it rang
         return taken
@@ -219,7 +227,7 @@ class CommandQueues:
 
     def _queue(self, writer: int) -> int:
         if not 0 <= writer < self.writers:
-            raise ValueError(f"writer {writer}; there are {self.writers}")
+            raise ValueError(f"there is no writer {writer}: the section has {self.writers} queues")
         return self._offset + _SECTION_HEADER_SIZE + writer * self._stride
 
 
@@ -228,20 +236,20 @@ NO_COMMAND: Final = (0, 0, 0)
 
 
 class CommandWrites(NamedTuple):
-    """The writes of one command to one injection or to the device, in the order of the events."""
+    """The writes of one command to one injection or to the device, in the order of their events."""
 
     injection: int
     event: Event
-    """The last event of these writes, with their time and writer."""
+    """The last event about these writes; it has their time and writer."""
     writes: tuple[Write, ...]
 
 
 class CommandAssembler:
-    """Assembles commands from DIVERTED events, or from events of another kind with data.
+    """Collects the writes of each command from events of one kind (default: DIVERTED).
 
-    Pass it all events of a block, in order. A command is complete at the next event of another kind
-    about it, or at the first event of another command. Writes without a command (number 0) are
-    complete with their last item.
+    Pass it all events of a block, in order. A command is complete when an event of another kind
+    about the same command follows, or an event about another command. Writes without a command
+    (number 0) are complete with their last item.
     """
 
     def __init__(self, kind: EventKind = EventKind.DIVERTED) -> None:
@@ -271,11 +279,11 @@ class CommandAssembler:
 
 
 End = tuple[EventKind, str]
-"""Outcome of an item, with its reason: one of ``ENDS``, or ACCEPTED (see ``until_accepted``)."""
+"""Outcome of an item and its reason. The kind is one of ``ENDS``, or ACCEPTED."""
 
 
 def worst(ends: Sequence[End]) -> End:
-    """Return the first outcome that is not a success, or the first of all if there is none."""
+    """Return the first outcome that is not a success; if all are successes, the first outcome."""
     return next((end for end in ends if end[0] not in DONE), ends[0])
 
 
@@ -283,7 +291,12 @@ class CommandOutcomes:
     """Collects the outcomes of one command's items."""
 
     def __init__(self, items: int, *, until_accepted: bool = False) -> None:
-        """With ``until_accepted``, acceptance counts as the outcome of an item."""
+        """Start without outcomes.
+
+        Args:
+            items: Number of the command's items.
+            until_accepted: Whether ACCEPTED already counts as the outcome of an item.
+        """
         self._items = items
         self._until_accepted = until_accepted
         self._ends: dict[int, End] = {}
@@ -300,24 +313,24 @@ class CommandOutcomes:
         return len(self._ends) == self._items
 
     def of(self, items: Iterable[int], missing: str) -> End:
-        """Return the outcome of a value with these items.
+        """Return the outcome of a value that consists of these items.
 
-        ``missing``: the reason if one is unknown.
+        ``missing`` is the reason to give for an item whose outcome is not known.
         """
         return worst([self._ends.get(item, (EventKind.UNKNOWN, missing)) for item in items])
 
 
 def apply(image: bytearray, writes: Iterable[Write]) -> None:
-    """Apply writes to an image. A write outside it is ignored; only a faulty process makes one."""
+    """Apply writes to an image. Ignore writes outside it, which only a faulty process sends."""
     for write in writes:
         if write.data and write.offset + len(write.data) <= len(image):
             write_to(write, image)
 
 
 def decode_writes(layout: Layout, image: bytes, writes: Iterable[Write]) -> dict[str, Value]:
-    """Decode the written values from an image, by path.
+    """Decode the values that writes set in an image, by path.
 
-    Registers that were written in part yield elements or bits.
+    If a write covers only a part of a register, the paths are those of its elements or bits.
     """
     named = (part for path in paths_of(layout, writes) for part in find_each(layout, path))
     return {part.path: codec(part, layout.byte_order).decode(image) for part in named}

@@ -9,15 +9,19 @@ from typing import Final, Protocol
 from shmio.segment import _atomics
 
 TURN_NS: Final = 200_000_000
-"""Maximum time between two notifications: listeners must also check the age of frames, and changes
-that ring no doorbell.
+"""Maximum time between two notifications.
+
+Listeners also check the age of frames, and look for changes that ring no doorbell.
 """
 _STOP_AGAIN_S: Final = 0.01
-"""Interval at which :meth:`Relay.join` repeats its request, which a thread may miss."""
+"""Interval at which :meth:`Relay.join` repeats its request to stop: the thread may miss one."""
 
 
 class Doorbell:
-    """A futex word in shared memory. Ringing it wakes all waiters, and needs a writable mapping."""
+    """A futex word in shared memory. Ringing it wakes all waiters.
+
+    Only :meth:`ring` needs a writable mapping.
+    """
 
     def __init__(self, memory: memoryview, offset: int) -> None:
         self._memory = memory
@@ -40,23 +44,26 @@ class Doorbell:
         return _atomics.bell_wait(self._memory, self._offset, seen, timeout_ns)
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int) -> None:
-        """Signal wake-ups to ``descriptor`` until stopped, in the thread of a :class:`Relay`."""
+        """Make ``descriptor`` readable at each ring.
+
+        :class:`Relay` runs this in its thread until stopped.
+        """
         _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
 
 
 class WakeSource(Protocol):
-    """Source of wake-ups: a :class:`Doorbell`, or a ring of a block, which contains a doorbell."""
+    """What a :class:`Relay` can wait for: a :class:`Doorbell`, or a ring that has a doorbell."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
-        """Signal wake-ups to ``descriptor`` until stopped, without the GIL."""
+        """Make ``descriptor`` readable at each ring, until stopped. It does not hold the GIL."""
 
 
 class Relay:
-    """Signals the rings of a doorbell to an event loop, through a file descriptor.
+    """Wakes an event loop, through a file descriptor, when a doorbell rings.
 
-    A thread waits for the doorbell without the GIL (``relay.h``). The ``descriptor`` becomes
-    readable at first, after each ring, and after ``turn_ns`` without one. It stays so until
-    :meth:`heard` is called.
+    A thread waits for the doorbell without the GIL (``relay.h``). It makes ``descriptor`` readable
+    at the start, after each ring, and after ``turn_ns`` without a ring. The descriptor stays
+    readable until the loop calls :meth:`heard`.
     """
 
     def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
@@ -76,18 +83,18 @@ class Relay:
     def heard(self) -> None:
         """Acknowledge a notification.
 
-        Call this before you check for changes: then you miss none.
+        Call this before you check for changes, so that you miss none.
         """
         if not self._stopped:  # the descriptor may have been closed and reused
             _atomics.relay_heard(self._shared, self.descriptor)
 
     def stop(self) -> None:
-        """Stop signalling. The thread ends within ``turn_ns``, and closes the descriptor."""
+        """Request the thread to stop. It ends within ``turn_ns``, and closes the descriptor."""
         self._stopped = True
         _atomics.relay_stop(self._shared)
 
     def join(self) -> None:
-        """Stop, and wait until the thread has ended, at most ``turn_ns``."""
+        """Stop the thread, and wait until it has ended, at most ``turn_ns``."""
         while self._thread.is_alive():
             self.stop()
             self._thread.join(_STOP_AGAIN_S)

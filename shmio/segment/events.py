@@ -1,7 +1,8 @@
 """Events of a block: commands and their outcomes, injections, changes of quality, starts and ends.
 
-An event ring works like a frame ring, and has the same writer. Each event has the number of the
-last frame before it, and each frame that of the last event, so frames and events are in one order.
+An event ring works like a frame ring, and the same process writes both. Each event has the number
+of the last frame before it, and each frame has the number of the last event before it. So the order
+of frames and events is known.
 """
 
 from __future__ import annotations
@@ -25,46 +26,50 @@ EVENT_SIZE: Final = _RECORD.size + EVENT_DATA_SIZE
 
 
 class EventKind(IntEnum):
-    """Kind of an event. An accepted item of a command is followed by one of the :data:`ENDS`."""
+    """Kind of an event. For each accepted item of a command, an event of :data:`ENDS` follows."""
 
     STARTED = 1
     STOPPED = 2
     QUALITY = 3
     ACCEPTED = 4
     REJECTED = 5
-    """The source rejected the whole command before it did anything."""
+    """The source rejected the whole command, and executed no part of it."""
     WRITTEN = 6
     """The device confirmed the write."""
     REFUSED = 7
     """The device refused the write."""
     EXPIRED = 8
-    """The write was not sent to the device, and will not be."""
+    """The source has not sent the write to the device, and never will."""
     UNKNOWN = 9
-    """The write was sent, but no answer came."""
+    """The source sent the write to the device, but no answer came."""
     DIVERTED = 10
-    """An injection took this data, which came from a writer or from an inner injection."""
+    """An injection took these values, which came from a writer or from an inner injection."""
     TAKEN = 11
-    """Injections took all of the item; nothing was left for the device."""
+    """Injections took the whole item, so the device gets nothing."""
     INJECTED = 12
-    """An injection was laid; this ends its command, whose number it has.
+    """The source created an injection, which has the number of the command that requested it.
 
-    The data is a part of a JSON document. For a declared injection, the document is the declaration
-    with the seed in use. For others, it has ``direction``, ``priority``, ``keep`` and ``ranges``,
-    which are (offset, size, bits).
+    The event ends that command. Its data is a part of a JSON document. For a declared injection,
+    the document is the declaration with the seed in use. For other injections, it has
+    ``direction``, ``priority``, ``keep`` and ``ranges``; each range is (offset, size, bits).
     """
     LIFTED = 13
-    """An injection was lifted, with the reason; this ends the command that requested it, if any."""
-    SHADOWED = 14
-    """An injection gave this data, which the previous frame is the first to show."""
-    ACTIVATED = 15
-    """A declared injection became active; over ``/out``, the previous frame is the first with it.
+    """An injection ended; the text is the reason.
 
-    ``item`` counts the activations.
+    If a command lifted it, the event ends the command.
+    """
+    SHADOWED = 14
+    """A client gave these values to an injection. The previous frame is the first that has them."""
+    ACTIVATED = 15
+    """A declared injection became active.
+
+    If it covers ``/out``, the previous frame is the first that it changes. ``item`` is the number
+    of activations so far.
     """
     DEACTIVATED = 16
     """A declared injection is no longer active."""
     NOTED = 17
-    """A note was added, which is the text; this ends its command."""
+    """A client added a note, which is the event's text. The event ends the client's command."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -84,9 +89,9 @@ ENDS: Final = frozenset(
         EventKind.NOTED,
     }
 )
-"""Kinds that end an item; REJECTED ends a whole command."""
+"""Kinds of events that state the outcome of an item; REJECTED is the outcome of a whole command."""
 DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN, EventKind.SHADOWED})
-"""Kinds of :data:`ENDS` for a value that reached its target, or was taken by an injection."""
+"""Kinds of :data:`ENDS` that are a success: the device, consumers or an injection got the value."""
 
 
 class Event(NamedTuple):
@@ -94,24 +99,25 @@ class Event(NamedTuple):
 
     Attributes:
         number: Number of the event.
-        kind: The :class:`EventKind`; a plain number if this version does not know it.
+        kind: The :class:`EventKind`; a plain number if this version of shmio does not know the
+            kind.
         frame: Number of the last frame before the event.
         cycle: Cycle of the source's schedule.
-        publish_ns: CLOCK_MONOTONIC at publication, or a comparable time in virtual time.
+        publish_ns: CLOCK_MONOTONIC at publication; in virtual time, the virtual clock's equivalent.
         clock_ns: The instance's clock at publication, in ns.
         utc_ns: UTC at publication, in ns.
-        incarnation: Number of the source's process.
+        incarnation: Number of starts of the source's process, including the present one.
         quality: Quality after the event.
         writer: Number of the command queue that the command came from, or NO_WRITER.
         command: Number that the writer gave the command; 0: none.
-        item: The first item of the command that the event is about.
+        item: Index of the first item of the command that the event is about.
         items: Number of the command's items that the event is about.
         offset: Offset of the first item's write.
         mask: Mask of the first item's write; 0: whole bytes.
         size: Size of the first item's write in bytes.
         data: The written bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only.
         text: The reason, the note, or the name of the injection.
-        injection: The injection that the event is about; 0: none.
+        injection: Number of the injection that the event is about; 0: none.
     """
 
     number: int
@@ -141,7 +147,7 @@ class Event(NamedTuple):
 
 
 class Record(NamedTuple):
-    """The content of an event, chosen by its writer."""
+    """The content of an event that a source is about to publish; see :class:`Event`."""
 
     kind: EventKind
     text: str = ""
@@ -163,7 +169,7 @@ class Record(NamedTuple):
 
 
 def decode_event(fields: FrameTuple) -> Event:
-    """Decode an event. Bounds are checked, because another process wrote the bytes."""
+    """Decode an event, and check its fields' bounds, because another process wrote the bytes."""
     number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, _, text, raw, _ = fields
     kind, data_size, writer, command, item, offset, mask, items, size, injection = _RECORD.unpack_from(raw)
     data = raw[_RECORD.size : _RECORD.size + min(data_size, EVENT_DATA_SIZE)]

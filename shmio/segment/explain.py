@@ -1,6 +1,6 @@
 """Explain events: name their registers, values, direction and writer.
 
-This module loads numpy, which takes time, so import it only when needed.
+This module imports numpy, which takes time, so import the module only when you need it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shmio.segment.events import EVENT_DATA_SIZE, NO_WRITER, Event, EventKind
 from shmio.segment.processes import GUEST_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096
-"""Maximum number of unfinished commands, and of injections, that an explainer remembers."""
+"""Maximum number of unfinished commands that an explainer remembers; also that of injections."""
 MAX_LAID_BYTES: Final = 1 << 16
 
 _INWARD: Final = frozenset(
@@ -36,7 +36,7 @@ _INWARD: Final = frozenset(
         EventKind.REJECTED,
     }
 )
-"""Kinds about writes to the device, including those of injections over ``/in``."""
+"""Kinds of events about writes toward the device, also if an injection took the write."""
 _WITH_VALUES: Final = frozenset({EventKind.ACCEPTED, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_WRITES: Final = frozenset({*_INWARD, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_INJECTIONS: Final = frozenset(
@@ -46,7 +46,10 @@ _ROLES: Final = {writer: name for name, writer in WRITERS.items()}
 
 
 class Place(NamedTuple):
-    """A register or a part of one, with its full path, and with its value if known."""
+    """A register or a part of a register, with its full path.
+
+    ``valued`` tells whether ``value`` is known.
+    """
 
     path: str
     register: Register
@@ -70,9 +73,9 @@ class Explained(NamedTuple):
     Attributes:
         places: The registers that the event concerns.
         direction: ``in``, ``out`` or empty.
-        by: The event's cause: grpc, mqtt or a program; empty if there is none or it is unknown.
-        laid: Definition of the injection that was laid, with the last event of the definition.
-        partial: True if the event is part of a definition, and further parts follow.
+        by: Who caused the event, such as grpc, mqtt or ``program 1``; empty: no client, or unknown.
+        laid: Definition of the new injection. Only the last event of the definition has it.
+        partial: True if the event has a part of a definition, and further parts follow.
     """
 
     places: tuple[Place, ...]
@@ -88,7 +91,10 @@ class _Injection(NamedTuple):
 
 
 class Explainer:
-    """Explains the events of one block, in their order."""
+    """Explains the events of one block.
+
+    Pass the events in order: each may refer to earlier ones.
+    """
 
     def __init__(self, source: str, layout: Layout | None, most: int | None = None) -> None:
         """Start without known injections.
@@ -105,11 +111,11 @@ class Explainer:
         self._documents: dict[int, bytes] = {}
         self._under_way: dict[tuple[int, int, int], dict[int, list[Place]]] = {}
         self._gone: frozenset[int] = frozenset()
-        """Injections that event ``_gone_at``, or one before it, has lifted."""
+        """Injections that ended before event ``_gone_at`` or with it."""
         self._gone_at = 0
 
     def know(self, present: Iterable[Injection[Any]]) -> None:
-        """Remember injections that were laid before the next event."""
+        """Remember existing injections, so that later events about them can be explained."""
         for one in present:
             if one.number not in self._injections and len(self._injections) < MAX_REMEMBERED:
                 # The event of a declared injection names no registers, so none are named here.
@@ -117,11 +123,11 @@ class Explainer:
                 self._injections[one.number] = _Injection(one.direction, places)
 
     def resume(self, present: Sequence[Injection[Any]], newest: int) -> None:
-        """Continue after a loss of events, which may have ended commands or injections.
+        """Continue after events were lost, among them possibly the ends of commands or injections.
 
         Args:
-            present: The injections that are laid now.
-            newest: Number of the newest event after ``present`` was read.
+            present: The injections that exist now.
+            newest: Number of the newest event, determined after ``present`` was read.
         """
         self._under_way.clear()
         self._documents.clear()
@@ -158,9 +164,10 @@ class Explainer:
         return Explained(places, direction, by(event.writer), laid, partial)
 
     def _of_command(self, event: Event) -> tuple[Place, ...]:
-        """Return the places that a command writes.
+        """Return the registers that the event's items write.
 
-        An event that ends several items at once gets the places of their acceptance.
+        An event that ends several items at once carries no data. Their registers are known from the
+        ACCEPTED events of the items.
         """
         if event.kind in _WITH_VALUES:
             places = self._places(event.offset, len(event.data), event.mask, event.data)
@@ -185,7 +192,7 @@ class Explainer:
             known += (place._replace(value=None, valued=False) for place in self._at_most(places, known))
 
     def _at_most(self, places: Sequence[Place], before: Sequence[Place]) -> Sequence[Place]:
-        """Return those places that may be named in addition to those before."""
+        """Return the first of these places, as many as may be named in addition to ``before``."""
         return places if self._most is None else places[: self._most - len(before)]
 
     def _places(self, offset: int, size: int, mask: int, data: bytes = b"") -> tuple[Place, ...]:
@@ -214,7 +221,11 @@ class Explainer:
     # ---- injections --------------------------------------------------------------------------------------------------
 
     def _laid(self, event: Event) -> dict[str, Any] | None:
-        """Return an injection's definition once it is complete, and remember its places."""
+        """Add an event's part to the definition of an injection; return the complete definition.
+
+        Return None if parts are missing. When the definition is complete, remember what the
+        injection covers.
+        """
         document = (self._documents.pop(event.injection, b"") if event.offset else b"") + event.data
         try:
             laid = msgspec.json.decode(document, type=dict[str, Any])
@@ -236,7 +247,7 @@ class Explainer:
         return laid
 
     def _over(self, ranges: object) -> tuple[Place, ...]:
-        """Return the places that ranges (offset, size, bits of each byte) cover."""
+        """Return the registers that ranges cover; a range is (offset, size, bits in each byte)."""
         try:
             parts = msgspec.convert(ranges, list[tuple[int, int, int]])
         except msgspec.ValidationError:
@@ -254,18 +265,18 @@ def _is_whole(register: Register, bits: bytearray) -> bool:
 
 
 def by(writer: int) -> str:
-    """Return the owner of a command queue: an endpoint, a program, or empty for none."""
+    """Name the owner of a command queue: an endpoint or a program; empty if there is no owner."""
     if writer == NO_WRITER:
         return ""
     return _ROLES.get(writer, f"program {writer + 1}" if writer < GUEST_SLOTS else f"writer {writer}")
 
 
 ABOUT: Final = ("path", "value", "direction", "by")
-"""Columns of a table of events that say what an event is about; see :func:`cells_of`."""
+"""Headings of the cells that :func:`cells_of` returns."""
 
 
 def kind_of(event: Event) -> str:
-    """Return the name of an event's kind, also of a kind that this version does not know."""
+    """Return the name of an event's kind; ``kind N`` if this version of shmio does not know it."""
     try:
         return str(EventKind(event.kind))
     except ValueError:  # of a later version
@@ -273,7 +284,7 @@ def kind_of(event: Event) -> str:
 
 
 def object_of(event: Event, explained: Explained) -> dict[str, Any]:
-    """Return what an event is about as an object for JSON; ``data`` is in hexadecimal digits."""
+    """Return what an event is about, as an object for JSON; ``data`` is in hexadecimal digits."""
     places = explained.places
     return {
         "by": explained.by,
@@ -292,9 +303,10 @@ def _json(value: Any) -> str:
 
 
 def cells_of(explained: Explained, dumps: Callable[[Any], str] = _json) -> tuple[str, ...]:
-    """Return what an event is about as cells of a table, under ABOUT.
+    """Return what an event is about, as cells of a table with the columns of ``ABOUT``.
 
-    The values of several registers are one JSON object, encoded by ``dumps``.
+    If the event concerns several registers, the cell of the value has one JSON object, encoded by
+    ``dumps``.
     """
     places = explained.places
     valued = [place for place in places if place.valued]

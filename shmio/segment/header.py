@@ -54,7 +54,7 @@ class State(IntEnum):
 
 
 class SectionKind(IntEnum):
-    """Content of a section. Readers skip unknown kinds."""
+    """Kind of a section's content. Readers skip sections of unknown kinds."""
 
     LAYOUT = 1
     FRAMES = 2
@@ -86,7 +86,7 @@ class Header:
     control: str
 
     def write(self, memory: memoryview) -> None:
-        """Write everything except the magic, which :func:`finish` writes last."""
+        """Write all fields but the magic number, which :func:`finish` writes last."""
         packed = _HEADER.pack(
             0, ABI_VERSION, HEADER_SIZE, self.epoch, self.size, self.started_utc_ns, self.started_ns,
             0, 0,  # generation and section count, see change_sections
@@ -138,8 +138,8 @@ class Header:
 class SectionEntry:
     """An entry of the section table.
 
-    ``layout`` is the index of the block's layout section. A section without a block has its own
-    index.
+    If the section belongs to a block, ``layout`` is the index of the block's layout section.
+    Otherwise it is the section's own index.
     """
 
     kind: int
@@ -154,17 +154,19 @@ class SectionEntry:
 def change_sections(
     memory: memoryview, header: Header, append: Sequence[SectionEntry], retire: Sequence[int] = ()
 ) -> None:
-    """Append entries to the section table, then retire others, which are given by index.
+    """Append entries to the section table, then retire the entries with the indices ``retire``.
 
-    Readers see all new entries before any old one is retired. If two blocks have the same name, the
-    later one is in use.
+    Readers see all new entries before any old entry is retired. Meanwhile, two blocks may have the
+    same name; readers use the later one.
 
     Raises:
         FormatError: The table has no room.
     """
     generation, count = table_state(memory)
     if count + len(append) > header.section_capacity:
-        raise FormatError(f"the section table is full: {count} of {header.section_capacity}")
+        raise FormatError(
+            f"the section table has {count} of {header.section_capacity} entries, and no room for {len(append)} more"
+        )
     for index, entry in enumerate(append, count):
         at = header.sections_offset + index * SECTION_SIZE
         fields = (entry.kind, int(entry.retired), entry.offset, entry.size, entry.layout, 0)
@@ -179,7 +181,10 @@ def change_sections(
 
 
 def table_state(memory: memoryview) -> tuple[int, int]:
-    """Return the table's generation, which each change increases, and its number of entries."""
+    """Return the generation of the section table, and its number of entries.
+
+    Each change of the table increases the generation.
+    """
     word = _atomics.load64(memory, GENERATION_OFFSET)
     return word & 0xFFFFFFFF, word >> 32
 
@@ -190,9 +195,11 @@ def retired(memory: memoryview, header: Header, index: int) -> bool:
 
 
 def read_sections(memory: memoryview, header: Header, count: int, name: str) -> list[SectionEntry]:
-    """Read the first ``count`` entries. FormatError: one is not within the segment."""
+    """Read the first ``count`` entries. FormatError: a section is not within the segment."""
     if count > header.section_capacity:
-        raise FormatError(f"{name}: more sections than the table has room for")
+        raise FormatError(
+            f"{name}: the header counts {count} sections, but the section table has room for {header.section_capacity}"
+        )
     entries = []
     for index in range(count):
         kind, flags, offset, size, layout, _, label, digest = _SECTION.unpack_from(
@@ -205,7 +212,7 @@ def read_sections(memory: memoryview, header: Header, count: int, name: str) -> 
 
 
 def finish(memory: memoryview) -> None:
-    """Write the magic, so that the segment can be opened."""
+    """Write the magic number. From then on, processes can open the segment."""
     _atomics.store64(memory, 0, MAGIC)
 
 
@@ -235,7 +242,10 @@ def _config_field(file: Path) -> bytes:
 
 
 def write_supervised_since(memory: memoryview, since_ns: int) -> None:
-    """Write the supervisor's start time. It is needed only if clock 0 is another time."""
+    """Write the time at which the supervisor started, CLOCK_MONOTONIC in ns.
+
+    This is needed only if the instance's clock was not 0 at that time.
+    """
     _atomics.store64(memory, SUPERVISED_SINCE_OFFSET, since_ns)
 
 

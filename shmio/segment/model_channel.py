@@ -32,7 +32,7 @@ _COMPUTED: Final = 1  # flag: a model has done a step
 
 
 class ModelPorts(NamedTuple):
-    """Inputs and outputs of a remote model. An in-out register is in both."""
+    """Inputs and outputs of a remote model. An in-out register is both an input and an output."""
 
     inputs: tuple[Register, ...]
     """Registers that the model reads."""
@@ -41,9 +41,10 @@ class ModelPorts(NamedTuple):
 
 
 class ConnectedModel(NamedTuple):
-    """A connected model.
+    """A remote model that is connected to a source.
 
-    ``number`` counts the connections from 1. ``pid`` is the process that writes the answers.
+    ``number`` is the number of the connection, from 1. ``pid`` is the process that writes the
+    model's answers.
     """
 
     number: int
@@ -52,17 +53,17 @@ class ConnectedModel(NamedTuple):
 
 
 class ModelRequest(NamedTuple):
-    """A source's request for a step of the model.
+    """A source's request to a model to compute one step.
 
     Attributes:
         number: Number of the request; the same step may be requested again.
         step: Number of the step.
         time_ns: The instance's clock after the step.
         dt_ns: Length of the step.
-        until_ns: CLOCK_MONOTONIC at which the source stops waiting.
-        doubt: Reason why inputs may be wrong; empty: they are right.
-        commanded: The image with the model's inputs.
-        shown: The image with the outputs so far.
+        until_ns: CLOCK_MONOTONIC at which the source stops waiting for the answer.
+        doubt: Reason why the model's inputs may be wrong; empty: there is none.
+        commanded: The block's image with the values that the model reads.
+        shown: The block's image with the present values of the model's outputs.
     """
 
     number: int
@@ -76,9 +77,10 @@ class ModelRequest(NamedTuple):
 
 
 class ModelAnswer(NamedTuple):
-    """The answer to a request.
+    """A model's answer to a request.
 
-    ``image`` has the outputs; it is not used if there is a ``failure``.
+    ``image`` is the block's image with the computed outputs. ``failure`` is the reason if the step
+    failed, and the image is then not used.
     """
 
     image: bytes
@@ -86,11 +88,11 @@ class ModelAnswer(NamedTuple):
 
 
 def model_ports(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -> ModelPorts:
-    """Find a model's inputs and outputs by the patterns of ``outputs`` and ``inouts``.
+    """Find a model's inputs and outputs. All registers that are not in ``outputs`` are inputs.
 
     Raises:
-        ConfigError: A pattern names no register, or a register is in both; the message starts with
-            the key.
+        ConfigError: A pattern names no register, or ``outputs`` and ``inouts`` name the same one.
+            The message starts with the key.
     """
     computed, both = (_named(layout, *item) for item in (("outputs", outputs), ("inouts", inouts)))
     if twice := sorted(computed & both):
@@ -119,7 +121,7 @@ def _named(layout: Layout, key: str, patterns: Sequence[str]) -> set[int]:
 
 
 def section(ring_header: bytes, slot_bytes: int) -> tuple[int, bytes]:
-    """Return size and first bytes of a new section; ``ring_header`` is that of both its rings."""
+    """Return size and first bytes of a new section. Both its rings get ``ring_header``."""
     ring_size = _atomics.RING_HEADER_SIZE + SLOTS * slot_bytes
     begin = _SIZE.pack(ring_size).ljust(_RINGS_AT, b"\0") + ring_header.ljust(ring_size, b"\0") + ring_header
     return _RINGS_AT + 2 * ring_size, begin
@@ -141,7 +143,7 @@ class ModelChannel:
         self.asked = _atomics.Ring(memory, first, ring_size)
         self.answered = _atomics.Ring(memory, first + ring_size, ring_size)
         if self.asked.frame_size != self.answered.frame_size:
-            raise ValueError("the model channel's rings differ in size")
+            raise ValueError("the model channel's rings for requests and answers differ in the size of a frame")
 
     @property
     def frame_size(self) -> int:
@@ -149,7 +151,10 @@ class ModelChannel:
         return self.asked.frame_size
 
     def model(self) -> ConnectedModel | None:
-        """Return the model that another process has connected; None if none has, or it has died."""
+        """Return the connected model.
+
+        None: there is none, or the process that serves it has died.
+        """
         return self._read() if self._shared.locked(self._lock_byte) else None
 
     def _read(self) -> ConnectedModel:
@@ -160,14 +165,14 @@ class ModelChannel:
         return ConnectedModel(number, pid, text(name))
 
     def computed(self) -> bool:
-        """True if a model has done a step: the connected one or an earlier one."""
+        """Return whether the connected model or an earlier one has computed a step."""
         data = _atomics.cell_read(self._memory, self._offset + _JOINED_AT, _JOINED.size)
         return data is not None and _JOINED.unpack(data)[1] == _COMPUTED
 
     # ---- for the source's process --------------------------------------------------------------------------------
 
     def ask(self, ask: ModelRequest, publish_ns: int) -> int:
-        """Request a step, and return the request's number. ``publish_ns``: time of the frame."""
+        """Send a request, and return its number. ``publish_ns``: publish time of the frame."""
         return self.asked.publish(
             ask.commanded, ask.shown, ask.step, publish_ns, ask.time_ns, ask.until_ns,
             Quality.UNCERTAIN if ask.doubt else Quality.GOOD, Provenance.SIMULATED, ask.dt_ns, 0,
@@ -175,7 +180,10 @@ class ModelChannel:
         )  # fmt: skip
 
     def answer_to(self, number: int) -> ModelAnswer | None:
-        """Return the newest answer if it is to this request: a late answer is never used."""
+        """Return the newest answer if it is for this request, else None.
+
+        A late answer is never used.
+        """
         fields = self.answered.latest()
         if fields is None or fields[8] != number:
             return None
@@ -197,7 +205,7 @@ class ModelChannel:
         _atomics.cell_write(self._memory, self._offset + _JOINED_AT, data)
 
     def leave(self) -> None:
-        """Release the channel, and wake a source that waits for an answer."""
+        """Unlock the channel, and wake a source that waits for an answer."""
         self._shared.unlock(self._lock_byte)
         self.answered.wake()
 
@@ -214,7 +222,11 @@ class ModelChannel:
     def answer(self, ask: ModelRequest, now_ns: int, image: bytes | bytearray, failure: str | None = None) -> None:
         """Answer a request.
 
-        ``failure``: the reason if the step failed; ``now_ns``: CLOCK_MONOTONIC.
+        Args:
+            ask: The request.
+            now_ns: The present time, CLOCK_MONOTONIC.
+            image: The block's image with the computed outputs.
+            failure: Reason why the step failed; None: it succeeded.
         """
         if failure is None and not self.computed():
             self._write(self._read(), _COMPUTED)

@@ -1,7 +1,7 @@
 """The playhead of a block that replays a recording: its position, and requests to move it.
 
 docs/reference/segment-format.md describes its section. The source's process writes the state. To
-move the playhead, a program takes the section's lock, writes a request, and waits for the answer. A
+move the playhead, a program locks the section, writes a request, and waits for the answer. A
 position is a time of the recorded instance's clock, in ns since its start.
 """
 
@@ -25,7 +25,10 @@ from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
 
 OWN_WORDS: Final = "replay: "
-"""Prefix of the reasons and event texts that a replay creates. Recorded ones have no prefix."""
+"""Prefix of the reasons and event texts that the replay itself creates.
+
+Recorded texts have no prefix.
+"""
 MIN_SPEED: Final = 0.01
 MAX_SPEED: Final = 1000.0
 
@@ -50,22 +53,23 @@ class PlayState(NamedTuple):
     Attributes:
         begin_ns: Start of the played range.
         end_ns: End of the played range, exclusive.
-        anchor_ns: A time of the instance's clock, the anchor.
-        position_ns: Position at the anchor, from which it moves ``speed`` times as fast as the
-            clock.
+        anchor_ns: The anchor: a time of the instance's clock from which the position is computed.
+        position_ns: Position at the anchor. From there, the playhead moves ``speed`` times as fast
+            as the instance's clock.
         until_ns: Position at which the replay stops.
-        base_ns: Publish time of position 0, comparable to CLOCK_MONOTONIC.
+        base_ns: Publish time, as in a frame, that corresponds to position 0.
         utc_ns: UTC of position 0.
         speed: Speed relative to the instance's clock.
         paused: True while the replay is paused.
         loop: True if the replay starts again at the end.
-        own_clock: True if frames have the recorded clock, False if they have the instance's.
+        own_clock: True if the published frames keep the recorded clock; False if they have the
+            clock of the instance that replays.
         over: True if the replay has reached its end.
-        step: Number of the last answered step of virtual time.
+        step: Number of the last step of virtual time that the source has finished.
         asked: Number of the last request that was answered.
-        answer: The answer to that request.
+        answer: The answer to request ``asked``.
         begun: Number of the last step of virtual time that the source has begun.
-        head: Number of the newest frame when it began that step.
+        head: Number of the newest frame when the source began step ``begun``.
     """
 
     begin_ns: int
@@ -87,7 +91,10 @@ class PlayState(NamedTuple):
     head: int = 0
 
     def reach_ns(self, clock_ns: int) -> int:
-        """Return the position at a time of the instance's clock as if the recording had no end."""
+        """Return the position at a time of the instance's clock.
+
+        The result may lie after the end of the recording.
+        """
         if self.paused or clock_ns <= self.anchor_ns:
             return self.position_ns
         passed_ns = clock_ns - self.anchor_ns
@@ -114,11 +121,14 @@ class PlayState(NamedTuple):
         return clock_ns
 
     def next_round(self) -> PlayState:
-        """Return the state at the start of the next round, for a replay that wraps."""
+        """Return the state at the start of the next round, for a replay that plays in a loop."""
         return self._replace(anchor_ns=self.due_ns(self.end_ns), position_ns=self.begin_ns)
 
     def settled(self, clock_ns: int) -> PlayState:
-        """Return the state after all finished rounds; paused if ``until_ns`` has been reached."""
+        """Return the state at a time of the instance's clock, with the anchor in the present round.
+
+        The state is paused if ``until_ns`` has been reached.
+        """
         reach_ns = self.reach_ns(clock_ns)
         if self.paused or reach_ns < self.until_ns:
             return self
@@ -133,7 +143,7 @@ class PlayState(NamedTuple):
         return self._replace(anchor_ns=clock_ns, position_ns=self.at_ns(clock_ns))
 
     def moved_as(self, other: PlayState) -> PlayState:
-        """Return this state with position, speed and pauses of another replay."""
+        """Return this state, but with position, speed, pause and loop of another replay."""
         return self._replace(
             anchor_ns=other.anchor_ns,
             position_ns=other.position_ns,
@@ -148,7 +158,8 @@ class PlayState(NamedTuple):
 class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
     """A request to change a replay at time ``clock_ns`` of the instance's clock. None: no change.
 
-    The replay pauses once at the position ``until_ns``. With a ``position_ns``, None means the end.
+    The replay pauses once, at the position ``until_ns``. If ``position_ns`` is given and
+    ``until_ns`` is None, it plays to the end.
     """
 
     clock_ns: int
@@ -160,7 +171,10 @@ class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_d
 
 
 class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_defaults=True):
-    """A request to find the first change of a register, or event of a kind, after ``after_ns``."""
+    """A request to find the next change of a register, or the next event of a kind.
+
+    The search starts after the position ``after_ns``.
+    """
 
     after_ns: int
     path: str = ""
@@ -170,7 +184,8 @@ class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_d
 class PlayheadAnswer(msgspec.Struct, omit_defaults=True):
     """The answer to a request.
 
-    ``error`` is the reason for a failure, ``position_ns`` a found position.
+    ``error`` is the reason if the request failed; else it is empty. ``position_ns`` is the position
+    that a search has found; None: it has found nothing.
     """
 
     error: str = ""
@@ -217,7 +232,7 @@ class Playhead:
         )  # fmt: skip
 
     def now_ns(self) -> int:
-        """Return the present time by which frames age: the publish time of the position."""
+        """Return the present time by which frames age: the publish time of the present position."""
         play = self.read()
         return time.monotonic_ns() if play is None else play.base_ns + play.at_ns(self._clock.present_ns())
 
@@ -227,7 +242,10 @@ class Playhead:
         return play is not None and state.stepping and play.begun == state.step and number > play.head
 
     def clock_ns(self, publish_ns: int) -> int:
-        """Return the clock with which to publish an entry of this publish time now."""
+        """Return the clock that a frame or event gets if it is published now.
+
+        ``publish_ns`` is its publish time.
+        """
         play = self.read()
         return self._clock.present_ns() if play is None or not play.own_clock else publish_ns - play.base_ns
 
@@ -244,9 +262,9 @@ class Playhead:
         self._state.write(data)
 
     def asks(self, answered: int) -> tuple[int, PlayheadRequest | None] | None:
-        """Return number and content of the last request unless its number is ``answered``.
+        """Return the number and the content of the last request, unless its number is ``answered``.
 
-        The content is None if it is invalid.
+        The content is None if the request is invalid.
         """
         asked = self._asked()
         if asked is None or asked[0] == answered:
@@ -273,10 +291,10 @@ class Playhead:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Lock the section for requests.
+        """Lock the section, so that only this program makes requests.
 
         Raises:
-            CommandError: Another program does not release the lock.
+            CommandError: Another program did not release the lock in time.
         """
         with self._turn:
             until_s = time.monotonic() + _LOCK_S
@@ -292,19 +310,24 @@ class Playhead:
     def ask(self, ask: PlayheadRequest) -> int:
         """Write a request, and return its number.
 
-        The caller has the lock, and afterwards rings the source's doorbell. CommandError: the
-        request is too long.
+        The caller must have locked the section (:meth:`held`), and must then ring the source's
+        doorbell.
+
+        Raises:
+            CommandError: The request is too long.
         """
         document = msgspec.json.encode(ask)
         if len(document) > _MAX_ASK:
-            raise CommandError("the request is too long")
+            raise CommandError(
+                f"the request to the replay has {len(document)} bytes, but at most {_MAX_ASK} are allowed"
+            )
         play = self.read()
         number = max(self.asked(), play.asked if play else 0) + 1
         _atomics.cell_write(self._memory, self._ask_at, _ASK.pack(number, os.getpid(), 0, document))
         return number
 
     def found(self, number: int) -> PlayheadAnswer | None:
-        """Return the answer to a request; None if there is none yet."""
+        """Return the answer to a request; None if the source has not answered it yet."""
         play = self.read()
         if play is None or play.asked != number:
             return None
@@ -315,6 +338,6 @@ class Playhead:
 
 
 def with_answer(play: PlayState, number: int, found: PlayheadAnswer) -> PlayState:
-    """Return the state with an added answer to a request."""
+    """Return the state with the answer to request ``number``."""
     found = PlayheadAnswer(cut(found.error, _MAX_ERROR).decode(), found.position_ns)
     return play._replace(asked=number, answer=msgspec.json.encode(found).decode())

@@ -1,8 +1,9 @@
 """The process table: the instance's processes, their state and counters.
 
-The supervisor writes a slot's name, kind, digest and one cell. The worker writes its heartbeat and
-the other cell, and locks its slot. The kernel releases the lock when the worker dies, so its death
-is always noticed.
+The table has a slot for each process, which is called its worker. The supervisor writes the slot's
+name, kind and digest, and the cell :class:`Supervised`. The worker locks its slot, and writes its
+heartbeat and the cell :class:`Report`. The kernel releases the lock when the worker dies, so its
+death is always noticed.
 """
 
 from __future__ import annotations
@@ -39,17 +40,20 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "opcua": ("sessions", "items", "writes", "refused"),
     "recorder": ("frames", "events", "missed", "bytes"),
 }
-"""Names of a worker's counters, by kind of process, in the order of the report (at most 8)."""
+"""Names of a worker's counters, at most 8, by kind of process.
+
+:attr:`Report.counters` has this order.
+"""
 
 
 GUEST_SLOTS: Final = 4
-"""Number of slots for other programs that write.
+"""Number of guest slots: slots for programs that write but are not part of the instance.
 
 They are the last slots of the table, and have the first command queues.
 """
 
 WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5, "opcua": 6}
-"""Command queue of each process of the instance that sends commands, by its name.
+"""Number of the command queue of each process of the instance that sends commands, by name.
 
 The name of such a process equals its kind.
 """
@@ -86,13 +90,16 @@ class ProcessSpec:
 
     @property
     def writer(self) -> int | None:
-        """Command queue of the process; None if it sends no commands, as the MQTT broker."""
+        """Number of the process's command queue; None if it sends no commands."""
         return WRITERS.get(self.kind) if self.name == self.kind else None
 
 
 @dataclass(frozen=True, slots=True)
 class Supervised:
-    """The supervisor's part of a slot. ``note`` has the reason if the process is not running."""
+    """The supervisor's part of a slot.
+
+    ``note`` says why the process is not running; else it is empty.
+    """
 
     phase: Phase = Phase.STOPPED
     restarts: int = 0
@@ -104,7 +111,7 @@ class Supervised:
 class Report:
     """The worker's part of a slot.
 
-    :data:`COUNTERS` names the counters; ``note`` describes a problem.
+    :data:`COUNTERS` names the counters. ``note`` describes a problem of the worker.
     """
 
     pid: int = 0
@@ -158,7 +165,7 @@ class ProcessSlot:
     def report(self) -> Report:
         """The worker's part, as last written.
 
-        Until a new worker has started, it is the previous one's.
+        Between a restart and the first report of the new worker, it is the previous worker's part.
         """
         data = _atomics.cell_read(self._memory, self._offset + _REPORT_AT, _REPORT.size)
         if data is None:
@@ -191,12 +198,19 @@ class ProcessSlot:
         return self._shared.try_lock(self.index + 1)
 
     def alive(self) -> bool:
-        """Return whether another process, or another segment object, has locked the slot."""
+        """Return whether the slot's process is alive.
+
+        It is alive if another process, or another segment object of this process, has locked the
+        slot.
+        """
         return self._shared.locked(self.index + 1)
 
 
 class ProcessTable(Sequence[ProcessSlot]):
-    """The instance's own processes, in table order; ``guests`` are the slots for other programs."""
+    """The slots of the instance's processes, in order.
+
+    ``guests`` are the slots for other programs.
+    """
 
     def __init__(self, shared: SharedObject, memory: memoryview, header: Header) -> None:
         self._shared, self._memory, self._header = shared, memory, header

@@ -1,4 +1,4 @@
-"""The segment as a whole: the supervisor builds and changes it; workers and readers open it."""
+"""The segment of an instance. The supervisor creates and changes it. Other processes open it."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ _OWN_SECTIONS = 1  # sections of no block: the clock page
 _SPARE_PROCESSES = 16 + GUEST_SLOTS
 _EVENT_STRIDE = _align(_atomics.RAW_OFFSET + EVENT_SIZE, 64)
 _FIRST_LINK = 2
-"""Number that determines the lock byte of a block's model channel or playhead.
+"""Used to compute the lock byte of a block's model channel or playhead.
 
-The lock byte is the number of process slots + this number + the index of the layout section.
+lock byte = number of process slots + this number + index of the block's layout section
 """
 
 _RING = struct.Struct("<8Iqq")
@@ -69,7 +69,8 @@ _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: buil
 class Origin:
     """Start time of an instance that replays a recording.
 
-    ``clock_ns`` is the instance's clock at the start, ``started_utc_ns`` the UTC of clock 0.
+    ``clock_ns`` is the instance's clock when the instance starts. ``started_utc_ns`` is the UTC
+    time at which the instance's clock is 0.
     """
 
     clock_ns: int
@@ -78,7 +79,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class BlockSpec:
-    """Specification of a source's block."""
+    """What is needed to create the block of a source."""
 
     source: str
     layout: Layout
@@ -99,7 +100,7 @@ class BlockSpec:
     def slots(self) -> int:
         """Number of frames in the ring: a power of two, at least 8.
 
-        It is enough for 8 s, unless the memory limit allows less.
+        The ring holds the frames of at least 8 s, unless ``ring_bytes`` is too small for that.
         """
         wanted = max(8, _RING_SECONDS * 1_000_000_000 // self.period_ns)
         slots: int = 1 << (wanted - 1).bit_length()
@@ -113,7 +114,7 @@ class BlockSpec:
         return sum(_align(size, 64) for _, size, _ in self.sections())
 
     def sections(self) -> list[tuple[SectionKind, int, bytes]]:
-        """Return kind, size in bytes and first bytes of each section; the rest is zeros."""
+        """Return kind, size in bytes and first bytes of each section. All other bytes are zero."""
         layout, attributes = self.layout.to_json(), msgspec.json.encode(self.attributes)
         effective = _atomics.RAW_OFFSET + _align(self.layout.size, 8)
         slot = self.slot_bytes, self.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0
@@ -213,7 +214,10 @@ def read_block(
 
 
 def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
-    """Wake all processes that wait at these sections. A needless wake-up is harmless."""
+    """Wake all processes that wait at doorbells in these sections.
+
+    A needless wake-up is harmless.
+    """
     for entry in entries:
         with suppress(ValueError):  # no process waits at an inconsistent section
             if entry.kind in (SectionKind.FRAMES, SectionKind.EVENTS):
@@ -249,7 +253,10 @@ def _build_segment(
     stepped: bool,
     origin: Origin | None = None,
 ) -> None:
-    """Allocate a new shared-memory object and write the whole segment, the magic last."""
+    """Allocate a new shared-memory object, and write the whole segment.
+
+    Write the magic number last.
+    """
     now_ns, begin_ns = time.monotonic_ns(), origin.clock_ns if origin else 0
     size = segment_size(blocks, len(processes))
     sections_size, processes_size = _table_sizes(len(blocks), len(processes))
@@ -314,7 +321,7 @@ class Segment:
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
         self._turn = threading.RLock()
-        """Lock for changes of ``blocks``: several threads may call :meth:`refresh`."""
+        """Lock for changes of ``blocks``, because several threads may call :meth:`refresh`."""
         self.clock = _read_clock(shared, self.header, self._sections())
         self._known: dict[int, Block] = {}  # by index of the layout section
         self.blocks = self._find_blocks()
@@ -333,7 +340,7 @@ class Segment:
         stepped: bool = False,
         origin: Origin | None = None,
     ) -> Segment:
-        """Create a new segment, and take its supervisor's lock.
+        """Create a new segment, and lock it as its supervisor.
 
         Args:
             instance: Name of the instance.
@@ -344,7 +351,7 @@ class Segment:
             config: Resolved path of the configuration file.
             group: Group whose members may read the segment.
             stepped: Whether time is virtual from the start.
-            origin: The start time for a replay; None: the clock starts at 0, now.
+            origin: Start time of an instance that replays a recording; None: the clock is 0 now.
 
         Raises:
             AlreadyRunningError: A segment of this name exists, with or without a living supervisor
@@ -380,12 +387,12 @@ class Segment:
         Args:
             instance: Name of the instance.
             writable: Whether to map it writable.
-            config: Configuration file that it must have been started from; None: any.
+            config: Configuration file from which the instance must have been started; None: any.
 
         Raises:
-            NotRunningError: There is no such segment.
-            FormatError: Another version made it, or it is inconsistent.
-            SegmentError: There is no permission to open it.
+            NotRunningError: The instance has no segment.
+            FormatError: Another version of shmio made the segment, or it is inconsistent.
+            SegmentError: This user may not open the segment.
             WrongInstanceError: The instance was started from another configuration file.
         """
         name = PREFIX + instance
@@ -433,7 +440,7 @@ class Segment:
         return {entries[index].name: self._found(index) for index in layouts if not entries[index].retired}
 
     def _found(self, layout: int) -> Block:
-        """Return the block whose layout is in this section: the same object at each call."""
+        """Return the block whose layout is in this section. All calls return the same object."""
         if layout not in self._known:
             self._known[layout] = read_block(self.shared, self.memory, self.header, self._entries, layout, self.clock)
         return self._known[layout]
@@ -442,7 +449,10 @@ class Segment:
     def ended(self) -> list[Block]:
         """Blocks that reloads have retired, the oldest first, as of the last :meth:`refresh`.
 
-        Their rings can still be read. FormatError: a block is inconsistent.
+        Readers can still read their rings.
+
+        Raises:
+            FormatError: A block is inconsistent.
         """
         with self._turn:
             entries = enumerate(self._entries)
@@ -450,7 +460,7 @@ class Segment:
             return [self._found(index) for index in layouts]
 
     def _sections(self) -> list[SectionEntry]:
-        """Read the section table of one generation."""
+        """Read the section table. If it changes meanwhile, read it again."""
         while True:
             self._generation, count = header.table_state(self.memory)
             if len(self.memory) < self.shared.size:  # the segment has grown; blocks keep their old mapping
@@ -466,11 +476,13 @@ class Segment:
 
     @property
     def outdated(self) -> bool:
-        """True if a :meth:`refresh` is due."""
+        """True if a reload has changed the segment since the last :meth:`refresh`."""
         return self.generation != self._generation
 
     def refresh(self) -> bool:
-        """Update blocks and process table after a reload. Blocks that remain are the same objects.
+        """Update the blocks and the process table after a reload.
+
+        Remaining blocks stay the same objects.
 
         Several threads may call it.
 
@@ -488,7 +500,7 @@ class Segment:
             return True
 
     def reserve(self, add: Sequence[BlockSpec]) -> int:
-        """Reserve room for the blocks that :meth:`change` is to add, so that it cannot fail.
+        """Reserve room for blocks to add, so that :meth:`change` cannot fail.
 
         Returns:
             The offset of the reserved room.
@@ -515,8 +527,8 @@ class Segment:
     def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
         """Add blocks, then retire others. Only the supervisor may call this.
 
-        Readers see the changes in this order. A source named in both gets a new block in place of
-        the old one.
+        Readers see the changes in this order. If a source is in both ``add`` and ``retire``, the
+        new block replaces the old one.
 
         Raises:
             SegmentError: There is no room; nothing has changed.
@@ -526,14 +538,17 @@ class Segment:
         self._change(_write_blocks(self.memory, at, first, add), {self.blocks[name].section for name in retire})
 
     def end_replaced(self) -> None:
-        """Finish a :meth:`change` whose supervisor died, and wake the waiters at retired blocks."""
+        """Finish a :meth:`change` during which the supervisor died.
+
+        Wake processes that wait at retired blocks.
+        """
         replaced = {block.section for block in self._known.values() if block not in self.blocks.values()}
         parts = enumerate(self._sections())
         ended = {index for index, part in parts if part.kind == SectionKind.LAYOUT and part.retired}
         self._change((), replaced | ended)  # even if these are none: the generation may not be up to date
 
     def _change(self, add: Sequence[SectionEntry], ending: Collection[int]) -> None:
-        """Append entries, and retire the blocks that have these layout sections."""
+        """Append entries, and retire the blocks whose layouts are in the sections ``ending``."""
         parts = list(enumerate(self._sections()))
         ended = {i: part for i, part in parts if (i if part.kind == SectionKind.LAYOUT else part.layout) in ending}
         header.change_sections(self.memory, self.header, add, list(ended))
@@ -541,13 +556,13 @@ class Segment:
         wake(self.memory, ended.values())
 
     def clock_ns(self, now_ns: int) -> int:
-        """Convert a time comparable to CLOCK_MONOTONIC to ns of the instance's clock."""
+        """Convert a publish time of frames to the instance's clock, in ns."""
         return now_ns - self.header.started_ns
 
     def writer(self, source: str, at: Stamp | None = None) -> BlockWriter:
         """Open a source's block for writing. Only the process in the source's slot may do so.
 
-        ``at``: times of the start event; None: now.
+        ``at``: times of the STARTED event; None: now.
         """
         block = self.blocks[source]
         return BlockWriter(block, self.clock_ns if block.playhead is None else block.playhead.clock_ns, at)
@@ -583,13 +598,16 @@ class Segment:
             raise NotRunningError(f"instance {self.instance!r} has stopped")
 
     def set_state(self, pid: int, state: State, note: str = "") -> None:
-        """Write the supervisor's pid, the instance's state and a note, as its supervisor."""
+        """Write the supervisor's pid, the instance's state and a note.
+
+        Only the supervisor may call this.
+        """
         header.write_supervisor(self.memory, pid, state)
         header.write_note(self.memory, note)
         supervisor_beat(self.memory)
 
     def lead_to(self, control: str, config: Path) -> None:
-        """Write start time, control socket and configuration of a supervisor that takes over.
+        """Write the start time, control socket and configuration of a supervisor that takes over.
 
         Only that supervisor may call this. Processes that opened the segment before keep the old
         paths.
@@ -602,7 +620,7 @@ class Segment:
     def unlink(self) -> None:
         """Remove the segment's name if it still belongs to this segment.
 
-        Only a clean stop does so.
+        Call this only when the instance stops cleanly.
         """
         if self.shared.current():
             shm.unlink(self.shared.name)
@@ -613,7 +631,7 @@ class Segment:
         return self.shared.closed
 
     def close(self) -> None:
-        """Release mapping and locks. Blocks that are still in use keep the mapping."""
+        """Release the mapping and the locks. Blocks that are still in use keep the mapping."""
         self.blocks, self._known = {}, {}
         with suppress(BufferError):  # a Ring is still referenced
             self.memory.release()

@@ -44,7 +44,7 @@ class SharedObject:
         """Create an empty object with mode 0600, or 0640 with a group.
 
         Raises:
-            FileExistsError: It exists.
+            FileExistsError: An object of this name exists already.
         """
         try:
             memory = posix_ipc.SharedMemory(f"/{name}", posix_ipc.O_CREX, mode=0o600)
@@ -69,8 +69,8 @@ class SharedObject:
         """Open an existing object.
 
         Raises:
-            FileNotFoundError: There is none.
-            SegmentError: No permission.
+            FileNotFoundError: There is no object of this name.
+            SegmentError: This user may not open the object.
         """
         try:
             memory = posix_ipc.SharedMemory(f"/{name}", 0, read_only=not writable)
@@ -85,7 +85,7 @@ class SharedObject:
         return cls(name, memory.fd, writable=writable)
 
     def allocate(self, size: int) -> None:
-        """Reserve all pages up to ``size``. Without that, a process could get SIGBUS later.
+        """Reserve memory for the first ``size`` bytes, so that no process gets SIGBUS later.
 
         Raises:
             SegmentError: There is no room in shared memory.
@@ -110,8 +110,8 @@ class SharedObject:
     def map(self) -> mmap.mmap:
         """Map the whole object, read-only unless it was opened writable.
 
-        Calls return the same mapping until the object grows. Older mappings stay valid while
-        referenced.
+        All calls return the same mapping until the object grows. An older mapping stays valid as
+        long as it is referenced.
         """
         if self._map is None or len(self._map) < self.size:
             access = mmap.PROT_READ | (mmap.PROT_WRITE if self.writable else 0)
@@ -142,11 +142,14 @@ class SharedObject:
         return kind != fcntl.F_UNLCK
 
     def taken(self, byte: int) -> bool:
-        """Return whether any object has locked the byte, this one included."""
+        """Return whether any object, including this one, has locked the byte."""
         return byte in self._held or self.locked(byte)
 
     def current(self) -> bool:
-        """Return whether the name still refers to this object: it was not removed or replaced."""
+        """Return whether the name still refers to this object.
+
+        False: the name was removed or reused.
+        """
         try:
             return (DIRECTORY / self.name).stat().st_ino == self.inode
         except FileNotFoundError:
@@ -158,9 +161,9 @@ class SharedObject:
         return self._fd < 0
 
     def close(self) -> None:
-        """Release mapping, descriptor and locks.
+        """Release the mapping, the descriptor and the locks.
 
-        A view that is still referenced keeps the mapping.
+        The mapping remains as long as a view of it is referenced.
         """
         if self._fd < 0:
             return

@@ -1,4 +1,4 @@
-"""Claim or clear a stale segment: a supervisor that died has left it, with its processes."""
+"""Claim or clear a stale segment, which a supervisor left when it died, perhaps with processes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRACE_S = 3.0
 
 
 class Worker(NamedTuple):
-    """A living process of the instance. Whoever gets this object must close ``pidfd``."""
+    """A living process of the instance. The caller that gets this object must close ``pidfd``."""
 
     name: str
     pid: int
@@ -32,14 +32,16 @@ class Worker(NamedTuple):
 
 
 def claim(instance: str) -> SharedObject | None:
-    """Take the supervisor's lock of an instance's stale segment. Only one of several callers does.
+    """Take the supervisor's lock of an instance's stale segment.
+
+    Only one of several callers gets it.
 
     Returns:
         The segment's object; None if there is no segment.
 
     Raises:
         AlreadyRunningError: A supervisor is alive.
-        SegmentError: There is no permission.
+        SegmentError: This user may not open the segment.
     """
     try:
         shared = SharedObject.open(PREFIX + instance, writable=True)
@@ -65,19 +67,19 @@ def read(shared: SharedObject, instance: str) -> Segment:
     """Open a claimed segment.
 
     Raises:
-        UnfinishedError: Its creator died.
-        FormatError: It has another version.
+        UnfinishedError: The segment is incomplete, because its creator died.
+        FormatError: Another version of shmio made the segment.
     """
     if shared.size < HEADER_SIZE:
         raise UnfinishedError(f"{shared.name} is not a complete shmio segment")
     segment = Segment(shared, instance)
     if segment.header.version != __version__:
-        raise FormatError(f"{shared.name} was made by shmio {segment.header.version}, this is {__version__}")
+        raise FormatError(f"{shared.name} was made by shmio {segment.header.version}, but this is shmio {__version__}")
     return segment
 
 
 def living(instance: str) -> bool:
-    """Return whether processes of the instance run, of any version of shmio.
+    """Return whether any process of the instance runs, whatever its version of shmio.
 
     Raises:
         SegmentError: There is no permission to open the segment.
@@ -93,7 +95,7 @@ def living(instance: str) -> bool:
 
 
 def clear(instance: str, forget_control: Callable[[str], object] = lambda _: None) -> list[str]:
-    """Stop the orphans of a dead supervisor, and unlink its segment, if there is one.
+    """Stop the processes that a dead supervisor has left, and remove its segment, if there is one.
 
     Args:
         instance: Name of the instance.
@@ -134,7 +136,10 @@ def clear_claimed(
 
 
 def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
-    """End every process that has locked a slot, and lock all slots against late processes."""
+    """End every process that has locked a slot.
+
+    Lock all slots, so that no process can start later.
+    """
     held = {slot.index: slot for slot in segment.processes if not shared.try_lock(slot.index + 1)}
     found: list[Worker] = []
     deadline = time.monotonic() + GRACE_S
@@ -160,7 +165,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
 
 
 def _stop_mapping(shared: SharedObject, instance: str) -> list[str]:
-    """End this user's workers that map a segment of unknown format writable."""
+    """End this user's workers that have mapped the segment writable. Its format is unknown."""
     with _opened(_workers(shared)) as found:
         end(instance, found)
         return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]
@@ -183,7 +188,10 @@ def _workers(shared: SharedObject) -> Iterator[Worker]:
 
 
 def _module(folder: Path) -> str:
-    """Return the shmio module that a process runs with ``-m``; empty for commands of shmio."""
+    """Return the shmio module that a process runs with ``python -m``.
+
+    The result is empty if it runs no such module, or a module of ``shmio.cli``.
+    """
     with suppress(OSError, ValueError):
         words = (folder / "cmdline").read_bytes().split(b"\0")
         module = words[words.index(b"-m") + 1].decode(errors="replace")
@@ -205,7 +213,7 @@ def _opened(workers: Iterable[Worker]) -> Iterator[list[Worker]]:
 def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
     """Return the process that has locked a slot; None if it is unknown or has ended.
 
-    It must map the segment, because another program may have its pid now.
+    The process must have mapped the segment; otherwise the pid belongs to another program now.
     """
     pid = slot.report.pid
     if not pid:
@@ -223,7 +231,10 @@ def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
 
 
 def _maps(pid: int, inode: int, right: str = "") -> bool:
-    """Return whether a process maps the shared memory with this permission."""
+    """Return whether a process has mapped the shared memory ``inode``.
+
+    With ``right`` (a letter such as ``w``), the mapping must have this permission.
+    """
     device = shm.DIRECTORY.stat().st_dev
     wanted = f"{os.major(device):02x}:{os.minor(device):02x}", str(inode)
     with suppress(OSError):
@@ -236,10 +247,10 @@ def _maps(pid: int, inode: int, right: str = "") -> bool:
 
 
 def end(instance: str, workers: Iterable[Worker]) -> None:
-    """End processes by SIGTERM, then SIGKILL, with ``GRACE_S`` for each, and wait for them.
+    """End processes by SIGTERM, and after ``GRACE_S`` by SIGKILL. Wait until they have ended.
 
     Raises:
-        SegmentError: Some do not end, or belong to another user; the message names them.
+        SegmentError: Some processes do not end, or belong to another user. The message names them.
     """
     alive = {worker.pidfd: worker for worker in workers}
     stuck: list[str] = []
@@ -276,7 +287,7 @@ def _foreign(pid: int) -> str:
 
 
 def survivor(pid: int) -> str:
-    """Describe a process that runs even after SIGKILL, with the remedy."""
+    """Describe a process that still runs after SIGKILL, with the remedy."""
     state = ""
     with suppress(OSError, IndexError):  # "pid (name) state …", where the name may be anything: proc_pid_stat(5)
         state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0]

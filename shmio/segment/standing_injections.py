@@ -1,8 +1,8 @@
-"""The present injections of a block: readable by all, and resumed by a restarted source.
+"""Lists of a block's injections: the existing ones, and those that the configuration declares.
 
-The supervisor writes the injections that the configuration declares to a second section. Both
-sections are cells (docs/reference/segment-format.md) with a JSON document of at most STANDING_SIZE
-bytes.
+Each list is a section of the block: a cell (docs/reference/segment-format.md) with a JSON document
+of at most STANDING_SIZE bytes. The source writes the existing injections, which every process can
+read, and which the source resumes after a restart. The supervisor writes the configured ones.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CELL_SIZE: Final = 8 + STANDING_SIZE
 
 
 class StandingInjection(Injection[Declaration], frozen=True, omit_defaults=True):
-    """A present injection in the list of its block, in which the innermost comes first."""
+    """An existing injection of a source. In the list of its block, the innermost comes first."""
 
     @property
     def configured(self) -> bool:
@@ -38,15 +38,18 @@ class StandingInjection(Injection[Declaration], frozen=True, omit_defaults=True)
 
     @property
     def lifted(self) -> bool:
-        """True if the injection was lifted; a configured one remains in the list."""
+        """True if the injection was lifted but is still in the list.
+
+        Only an injection that the configuration declares stays in the list.
+        """
         return self.running is not None and self.running.state == "lifted"
 
     def covers(self, register: Register) -> bool:
-        """Return whether the injection is in effect for any bit of a register."""
+        """Return whether the injection is in effect, and covers any bit of a register."""
         return self.active and self.reaches(register)
 
     def reaches(self, register: Register) -> bool:
-        """Return whether the injection is laid over any bit of a register."""
+        """Return whether the injection covers any bit of a register, also while not in effect."""
         start, stop = register.offset, register.offset + register.size
         own = bits_of(register)
         shared = (
@@ -79,11 +82,13 @@ def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
     """Join JSON items to a document.
 
     Raises:
-        ValueError: It would be too long with ``growth`` more bytes.
+        ValueError: The document, with ``growth`` more bytes, would be too long.
     """
     document = b"[" + b",".join(items) + b"]"
     if len(document) + growth > STANDING_SIZE:
-        raise ValueError("the injections of one source are too large: lay fewer, or cover whole structures or arrays")
+        raise ValueError(
+            "the injections of one source are too large: create fewer, or cover whole structures or arrays"
+        )
     return document
 
 
@@ -91,9 +96,9 @@ class DocumentCell(Generic[_Item]):
     """A section of a block that holds a list of items. Only one process writes it."""
 
     def __init__(self, memory: memoryview, offset: int, size: int, decoder: msgspec.json.Decoder[tuple[_Item, ...]]):
-        """Open the section. ValueError: it is too short."""
+        """Open the section. ValueError: the section is too short."""
         if size < CELL_SIZE:
-            raise ValueError("the section of its injections is too short")
+            raise ValueError("the section of the source's injections is too short")
         self._memory = memory
         self._offset = offset
         self._decoder = decoder
@@ -104,7 +109,7 @@ class DocumentCell(Generic[_Item]):
         return _atomics.load64(self._memory, self._offset)
 
     def read(self) -> tuple[_Item, ...]:
-        """Read all items; none if the section is corrupt."""
+        """Read all items. Return an empty tuple if the section is corrupt."""
         data = _atomics.cell_read(self._memory, self._offset, STANDING_SIZE)
         document = (data or b"").rstrip(b"\0")
         try:
@@ -122,10 +127,10 @@ DeclaredCell = DocumentCell[Declaration]
 
 
 def standing_cell(memory: memoryview, offset: int, size: int) -> StandingCell:
-    """Open the section of present injections, which the source writes.
+    """Open the section of existing injections, which the source writes.
 
     Raises:
-        ValueError: It is too short.
+        ValueError: The section is too short.
     """
     return DocumentCell(memory, offset, size, _STANDING)
 
@@ -134,11 +139,11 @@ def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
     """Open the section of configured injections, which the supervisor writes.
 
     Raises:
-        ValueError: It is too short.
+        ValueError: The section is too short.
     """
     return DocumentCell(memory, offset, size, _DECLARED)
 
 
 def declared_document(declarations: Iterable[Declaration]) -> bytes:
-    """Encode configured injections as a document. ValueError: it is too long."""
+    """Encode configured injections as a document. ValueError: the document is too long."""
     return encode(msgspec.json.encode(declaration) for declaration in declarations)
