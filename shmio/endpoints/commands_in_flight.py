@@ -19,7 +19,7 @@ It is a quarter of the event ring, so that no event is overwritten before it is 
 """
 
 Done = Callable[[Sequence[End]], None]
-"""Called once for a command, with the outcome of each of its values."""
+"""Function that is called once for each command, with the outcome of each of its values."""
 
 
 def in_words(end: End) -> str:
@@ -52,7 +52,7 @@ class InFlightCommand:
     """A command in flight.
 
     Attributes:
-        incarnation: The process of the source that the command was sent to.
+        incarnation: Number of starts of the source's process when the command was sent.
         until_ns: Deadline for the outcomes, in ns of the monotonic clock.
         cost: The queue space and the events that the command may need.
         values: For each value, the range of its items.
@@ -70,9 +70,9 @@ class InFlightCommand:
     done: Done
     accepted: Callable[[], None] | None = None
     taken: bool = False
-    """True if the source has taken the command out of the queue."""
+    """True if the source has taken the command from the queue."""
     open_events: int = 0
-    """The most events that the command may still cause."""
+    """Maximum number of events that the command may still cause."""
 
     def hear(self, event: Event) -> bool:
         """Process an event of the command, and return whether all outcomes are known."""
@@ -96,9 +96,9 @@ class InFlightTable:
 
     def __init__(self, writer: int) -> None:
         self.open_events = 0
-        """The most events that all commands together may still cause."""
+        """Maximum number of events that all commands together may still cause."""
         self.untaken_bytes = 0
-        """Size of the commands that the source may not have taken from the queue yet, in bytes."""
+        """Size of the commands that may still be in the source's queue, in bytes."""
         self._writer = writer
         self._by_number: dict[int, InFlightCommand] = {}
 
@@ -122,11 +122,11 @@ class InFlightTable:
         """Add a command that was sent.
 
         Args:
-            ticket: The command, as the source's writer returned it.
+            ticket: The command, as the function that sent it has returned it.
             cost: The queue space and the events that it may need.
             done: Called once, with the outcome of each value.
             accepted: Called once, if the source accepts the command.
-            until_accepted: Acceptance already ends the command.
+            until_accepted: Whether the command ends as soon as the source accepts it.
 
         """
         self._by_number[ticket.number] = InFlightCommand(
@@ -159,14 +159,14 @@ class InFlightTable:
         return True
 
     def hurry(self) -> None:
-        """Shorten all time-outs after missed events, because outcomes may be among these."""
+        """Shorten all time-outs after missed events, because these may have contained outcomes."""
         self._hurry(self._by_number.values())
 
     def expire(self) -> bool:
         """End the commands whose deadline has passed.
 
         Returns:
-            True if the source has not even taken one of them from the queue.
+            True if at least one of them is still in the source's queue.
 
         """
         now_ns = time.monotonic_ns()

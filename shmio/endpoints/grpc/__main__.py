@@ -116,12 +116,12 @@ async def _serve(worker: Worker) -> None:
 
 
 async def _follow(worker: Worker, feeds: Feeds, services: Services) -> None:
-    """Adopt what a reload has changed.
+    """Adopt the changes of a reload.
 
-    No call may begin between the change of the feeds and the move of the services' streams.
+    No call may begin after the feeds have changed and before the services' streams have moved.
     """
     if changed := await feeds.follow():
-        worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
+        worker.log.info("a reload added, changed or removed %s", ", ".join(changed))
         services.move(changed)
 
 
@@ -130,7 +130,7 @@ def _end_now(worker: Worker) -> NoReturn:
 
     A clean-up would free memory that gRPC's threads still write to.
     """
-    worker.log.error("gRPC stopped serving; this process ends, and the supervisor starts another")
+    worker.log.error("gRPC stopped serving; this process ends, and the supervisor starts a new one")
     logging.shutdown()
     os._exit(1)
 
@@ -142,7 +142,7 @@ async def _calls_end() -> None:
 
 
 class _Place(NamedTuple):
-    """Settings of the instance outside its ``[grpc]`` section."""
+    """Settings of the instance that are not in its ``[grpc]`` section."""
 
     config_file: Path | None
     gid: int | None

@@ -19,7 +19,7 @@ M = TypeVar("M", bound=Sized)
 
 
 class BlockImage(Protocol):
-    """An image of a block with its number and time: of a frame, of a step, or of writes."""
+    """An image of a block, with the number and time of its frame, step or write."""
 
     @property
     def number(self) -> int:
@@ -83,7 +83,7 @@ class Subject:
 def unless_bad(
     encode: Callable[[BlockImage], M | None], registers: Sequence[Register], layout: Layout
 ) -> Callable[[BlockImage], M | None]:
-    """Return a function that encodes like ``encode``, but returns None if the source calls a register bad."""
+    """Return a function like ``encode`` that returns None if the source reports a bad register."""
     area = status_area(layout)
     if area is None:
         return encode
@@ -120,10 +120,10 @@ def delimited(data: bytes) -> bytes:
 
 
 def field(field_number: int, data: bytes) -> bytes:
-    """Encode a field of type bytes, text or message, or with packed numbers."""
+    """Encode a field of type bytes, text or message, or a field of packed numbers."""
     return varint(field_number << 3 | 2) + varint(len(data)) + data
 
 
 def number(field_number: int, value: int) -> bytes:
-    """Encode a field of type enum, or with a non-negative integer."""
+    """Encode a field that has an enum or a non-negative integer."""
     return varint(field_number << 3) + varint(value)

@@ -28,7 +28,7 @@ from shmio.segment import Block, Event, EventKind
 from shmio.segment.commands import End, InjectionOptions
 
 RETRY_S: Final = 0.25
-"""Pause before asking a source again to lift an injection."""
+"""Pause in s before asking a source again to lift an injection."""
 
 BATCH_EVENTS: Final = 32
 """Maximum number of events that are processed before the event loop serves the streams again."""
@@ -77,7 +77,7 @@ class CommandClient:
 
     @property
     def alive(self) -> bool:
-        """True while the client follows the block's events, or if the block has retired."""
+        """True while the client follows the block's events, or if a reload retired the block."""
         return self._reader.alive or self.block.retired
 
     @property
@@ -134,7 +134,7 @@ class CommandClient:
             done: Called once within a bounded time, with the outcome of each value.
             accepted: Called before that, if the source accepts the command.
             timeout_s: How long to wait for outcomes, in s; None: the default.
-            until_accepted: Acceptance already ends the command.
+            until_accepted: Whether the command ends as soon as the source accepts it.
 
         Raises:
             CommandError: A register is not writable, or the source does not answer.
@@ -153,7 +153,9 @@ class CommandClient:
         *,
         raw: Sequence[Write] = (),
     ) -> None:
-        """Give values to an injection of this process, otherwise as :meth:`send`.
+        """Give values to an injection of this process; wait for room if necessary.
+
+        After an error nothing was sent, and neither ``done`` nor ``accepted`` is called.
 
         Args:
             injection: Number of the injection.
@@ -178,7 +180,7 @@ class CommandClient:
             bits: Mask of the block, with the bits set that the injection covers.
             follower: Receives the injection's events.
             done: Called once, with the outcome.
-            laid: Options of the injection.
+            laid: Options of the injection, such as its name and priority.
 
         Returns:
             The injection's number.
@@ -300,7 +302,7 @@ class CommandClient:
                 self._set_timer()
 
     def _missed(self, count: int) -> None:
-        """Handle missed events: outcomes of commands may have been among them."""
+        """Handle missed events, which may have contained outcomes of commands."""
         reason = f"{count} events of source {self.block.source} were missed"
         self.write_subscriptions.skip()
         self.followers.skip()
@@ -384,7 +386,7 @@ async def give(
 ) -> Sequence[End]:
     """Give values and raw bytes to an injection, and wait for the outcomes.
 
-    Adjacent writes have one outcome.
+    Adjacent writes share one outcome.
     """
     answer = Answer()
     await commands.give(injection, values, answer.done, raw=raw)
@@ -431,7 +433,7 @@ async def _laid(commands: CommandClient, send: Callable[[Done], int]) -> int:
 
 
 async def lift(commands: CommandClient, injection: int) -> str:
-    """Lift an injection; return why that failed, or an empty text."""
+    """Lift an injection. Return why that failed; empty if it succeeded."""
     try:
         _check(commands)
         answer = Answer()
@@ -439,14 +441,14 @@ async def lift(commands: CommandClient, injection: int) -> str:
         ((_, reason),) = await answer
     except CommandError as error:
         reason = str(error)
-    return (reason or "the source has not lifted it yet") if stands(commands, injection) else ""
+    return (reason or "the source has not lifted the injection yet") if stands(commands, injection) else ""
 
 
 async def have_lifted(commands: CommandClient, injection: int, name: str) -> None:
     """Lift an injection of this process, and retry until the source has done so.
 
-    The retries are necessary because no other process lifts the injection while this one lives. The
-    injection's follower gets no more events.
+    The retries are necessary because no other process lifts the injection while this process lives.
+    The injection's follower gets no more events.
 
     Args:
         commands: The client of the source.
@@ -461,7 +463,7 @@ async def have_lifted(commands: CommandClient, injection: int, name: str) -> Non
 
 
 def stands(commands: CommandClient, injection: int) -> bool:
-    """Return whether the source still has an injection."""
+    """Return whether the client's source still has this injection."""
     standing = commands.block.standing.read()
     return not commands.block.retired and any(one.number == injection and not one.lifted for one in standing)
 

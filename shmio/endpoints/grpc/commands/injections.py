@@ -119,14 +119,14 @@ class InjectionFollowers:
 
 
 class InjectionBase:
-    """The image that one injection replaces: the source's bytes with the inner layers applied."""
+    """The image that an injection replaces: the source's image with the inner injections applied."""
 
     def __init__(self, block: Block, image: bytes = b"") -> None:
-        """Begin without inner layers.
+        """Begin without inner injections.
 
         Args:
             block: The block of the injection.
-            image: Initial values of the inner layers; default: zeros.
+            image: Initial values of the inner injections; default: zeros.
 
         """
         self.number = 0
@@ -143,7 +143,7 @@ class InjectionBase:
         apply(self.given, writes)
 
     def restack(self) -> bool:
-        """Look up the inner layers again.
+        """Look up the inner injections again.
 
         Returns:
             True if the image that the injection replaces has changed.

@@ -12,9 +12,9 @@ from shmio.segment.commands import NO_COMMAND, apply
 
 
 class PendingImage:
-    """The image of a frame, with the commands applied that were accepted after the frame.
+    """The image of a frame, to which all commands accepted after the frame have been applied.
 
-    ``mask`` has the bits set that the current command writes.
+    In ``mask``, the bits that the current command writes are set.
     """
 
     def __init__(self, block: Block) -> None:
@@ -26,7 +26,7 @@ class PendingImage:
     def begin(self, number: int) -> None:
         """Begin a command that was accepted after frame ``number``.
 
-        If a new frame arrives between the parts of the command, the image stays as it is.
+        A new frame that arrives between the parts of the command does not change the image.
         """
         if number != self._frame:
             frame = self._block.read(number) or self._block.latest()
@@ -160,7 +160,7 @@ class WriteSubscriptions:
         return messages
 
     def _begins(self, event: Event) -> bool:
-        """Return whether the events before this one show that it is the first of its command."""
+        """Return whether the previous events prove that this is the first event of its command."""
         for number in range(event.number - 1, 0, -1):
             before = self._block.events.read(number)
             if before is None:
@@ -185,7 +185,7 @@ class WriteSubscriptions:
         self._show(channel, event, messages)
 
     def _rest(self) -> list[Message]:
-        """Return the messages of channels that the command, now complete, has written in part."""
+        """Return the messages of channels that the finished command has written only in part."""
         messages: list[Message] = []
         for channel, event in self._partly.items():
             self._show(channel, event, messages)

@@ -151,7 +151,7 @@ class ListenerAccess:
         Args:
             keys: The tokens and patterns.
             anonymous: Roles of clients without credentials.
-            takes_tokens: Whether clients may send tokens to this address; on plain text they must
+            takes_tokens: Whether clients may send tokens to this address. In plain text they must
                 not.
 
         """
@@ -186,15 +186,15 @@ class ListenerAccess:
         if not self._takes_tokens:
             raise DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
-                "this address is plain text, which others can read, and accepts no tokens: use the address with TLS, "
+                "this address is plain text, which others can read, so it accepts no tokens: use the address with TLS, "
                 "and have this token replaced, because others may know it now",
             )
         secret = self.keys.secret(shown)
         if secret is None:
             raise DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
-                "the token is not in [[grpc.token]]: send authorization: Bearer TOKEN with one that is; after a "
-                "change of its file, run shmio-supervisor reload",
+                "the token is not in [[grpc.token]]: send authorization: Bearer TOKEN with a token that is; after a "
+                "change of a token's file, run shmio-supervisor reload",
             )
         return secret
 
@@ -211,7 +211,7 @@ class ListenerAccess:
             return DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
                 f"{call} needs the role {needed}, and this address {gives} without a token: send "
-                "authorization: Bearer TOKEN with one of [[grpc.token]]",
+                "authorization: Bearer TOKEN with a token of [[grpc.token]]",
             )
         elif shown.names:
             who, roles, where = f"the certificate of {shown.names[0]!r}", self.anonymous, "[[grpc.client]]"
@@ -219,7 +219,7 @@ class ListenerAccess:
             who, roles, where = "this address", self.anonymous, "the roles of the address in [[grpc.address]]"
         return DeniedError(
             grpc.StatusCode.PERMISSION_DENIED,
-            f"{call} needs the role {needed}; {who} has {_listed(roles)}: add it to {where}",
+            f"{call} needs the role {needed}; {who} has {_listed(roles)}: add the role to {where}",
         )
 
 
@@ -240,9 +240,10 @@ def holder_of(
 
 
 def client_of(peer: str, token: str | None) -> str:
-    """Return the unit that limits apply to.
+    """Return a name for the client, which determines what counts towards its limits.
 
-    This is the token, or without a token the host. On this host it is the connection.
+    It is the client's token. A client without a token is known by its host, and a client on this
+    host by its connection.
     """
     if token is not None:
         return f"token {token}"

@@ -25,9 +25,9 @@ from shmio.layout.topic import shorten
 from shmio.logs import fields
 
 TURN_S: Final = 10.0
-"""Period for which log lines are counted."""
+"""Length of the period for which log lines are counted, in s."""
 LINES: Final = 10
-"""Maximum number of log lines in ``TURN_S``; one further line reports how many were left out."""
+"""Maximum number of log lines in ``TURN_S``. One more line reports how many were left out."""
 
 log = logging.getLogger("shmio.grpc")
 
@@ -41,7 +41,7 @@ class Refusals:
         Args:
             what: The beginning of each log line.
             about: The log field that names what was refused.
-            turn_s: Period for which log lines are counted.
+            turn_s: Length of the period for which log lines are counted, in s.
 
         """
         self.count = 0
@@ -61,7 +61,7 @@ class Refusals:
 
     def _end_turn(self) -> None:
         if self._in_turn > LINES:
-            log.warning("%s: %d more in %g s", self._what, self._in_turn - LINES, self._turn_s)
+            log.warning("%s: %d more times in %g s", self._what, self._in_turn - LINES, self._turn_s)
         self._in_turn = 0
 
 
@@ -82,7 +82,7 @@ class CallLimits:
     reserve: int = 1024
     share: int = 64
     message_s: float = 10.0
-    """Time within which the client must send the request of a call with a single request, in s."""
+    """Time limit for the client to send the request of a call that has a single request, in s."""
 
 
 class _Call:
@@ -123,7 +123,7 @@ class OpenCalls:
         return len(self._open)
 
     def enter(self, method: str, access: ListenerAccess, context: Context) -> _Call:
-        """Admit a call; :meth:`leave` it when it has ended.
+        """Admit a call. When the call has ended, :meth:`leave` removes it.
 
         Raises:
             DeniedError: The call is refused.
@@ -150,7 +150,7 @@ class OpenCalls:
             del self._by_client[call.client]
 
     async def message(self, call: _Call, context: Context) -> Any:
-        """Return a call's single message, or EOF; end the call if no message comes in time."""
+        """Return a call's single message, or EOF. End the call if no message comes in time."""
         loop = asyncio.get_running_loop()
         self._silent[call] = due_s = loop.time() + self.limits.message_s
         if self._timer is None:  # one timer for all calls, because nearly every message is there at once
@@ -168,7 +168,7 @@ class OpenCalls:
                 self._timer = loop.call_at(due_s, self._end_silent)
                 return
             del self._silent[call]
-            limit = f"no message came within {self.limits.message_s:g} s"
+            limit = f"the client sent no message within {self.limits.message_s:g} s"
             call.end(DeniedError(grpc.StatusCode.DEADLINE_EXCEEDED, f"{call.method}: {limit}"))
 
     def review(self) -> int:
@@ -200,7 +200,7 @@ class OpenCalls:
 class CallGuard(grpc.aio.ServerInterceptor):
     """Checks every call at one listening address.
 
-    It presents every call to gRPC as one with a stream of requests. So it can check and count a
+    To gRPC, it declares every call as a call with a stream of requests. So it can check and count a
     call before the first message arrives. An invalid message then ends the call with a status, and
     leaves no traceback in the log.
     """
@@ -258,7 +258,7 @@ class CallGuard(grpc.aio.ServerInterceptor):
         """Return the decoded single message of a call."""
         data = await self._calls.message(call, context)
         if data is grpc.aio.EOF:
-            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{call.method}: the call has no message")
+            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{call.method}: the client sent no message")
         return await _parsed(call.method, decode, data, context)
 
 
@@ -288,7 +288,7 @@ cygrpc: Any = import_module("grpc._cython.cygrpc")
 AioServer: Any = import_module("grpc.aio._server").Server
 
 WORKERS: Final = 8
-"""Number of calls of unknown names that are refused concurrently."""
+"""Number of calls with unknown names that are refused concurrently."""
 
 _NEEDED: Final[Mapping[str, str]] = {
     "AioServer": "_make_request_call_future _request_call add_registered_method_handlers is_running shutdown",
@@ -323,7 +323,7 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
     """A gRPC core that passes only calls of registered methods to its serving task."""
 
     def start_workers(self) -> None:
-        """Start the workers that refuse calls of unknown names."""
+        """Start the workers that refuse calls with unknown names."""
         self._taking = asyncio.Lock()  # only one worker at a time waits for a call
         self.refused = 0
         self._workers = [asyncio.create_task(self._refuse()) for _ in range(WORKERS)]
@@ -373,7 +373,7 @@ class CoreServer(AioServer):  # type: ignore[misc]
 
     @property
     def refused(self) -> int:
-        """Number of calls of unknown names since the start."""
+        """Number of calls with unknown names since the start."""
         return int(self._server.refused)
 
     async def start(self) -> None:
@@ -383,6 +383,6 @@ class CoreServer(AioServer):  # type: ignore[misc]
 
 
 def _kept(request: asyncio.Task[Any]) -> asyncio.Future[Any]:
-    """Shield a request for a call from cancellation, because the core writes to its memory."""
+    """Shield the wait for a call from cancellation, because the core writes to its memory."""
     request.add_done_callback(lambda done: done.cancelled() or done.exception())  # else asyncio may log the error
     return asyncio.shield(request)

@@ -1,4 +1,4 @@
-"""Lists the clients that are connected, even those without an open call.
+"""Lists the connected clients, including those without an open call.
 
 gRPC reports the end of a call to the server, but not the end of a connection. So this module reads
 the kernel's tables of connections.

@@ -30,7 +30,7 @@ class Health(health_pb2_grpc.HealthServicer):
         self._over = False
 
     def set(self, service: str, *, serving: bool) -> None:
-        """Set the status of a service; without effect after :meth:`end`."""
+        """Set the status of a service. After :meth:`end`, this has no effect."""
         if not self._over:
             self._serving[service] = serving
             for changed in self._watchers.get(service, ()):

@@ -1,4 +1,4 @@
-"""Limits what clients use up: file descriptors, memory, and the time of the event loop."""
+"""Limits what clients can consume: file descriptors, memory, and the time of the event loop."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ By default each thread has its own arena, and no other thread uses the free memo
 FLOOD_CALLS: Final = 1000
 """Number of refused calls that count as a flood, after which free memory is returned to the kernel."""
 EVERY_S: Final = 5.0
-"""Interval at which free memory is returned."""
+"""Interval at which free memory is returned to the kernel, in s."""
 AFTER_S: Final = 60.0
-"""Time after a flood during which free memory is still returned."""
+"""Time after a flood during which free memory is still returned, in s."""
 
 
 def limit_arenas() -> None:
@@ -97,7 +97,7 @@ class Trimmer:
 # ---- the event loop's time -------------------------------------------------------------------------------
 
 HELD_S: Final = 0.005
-"""Longest time for which the work of one request may block the event loop."""
+"""Longest time for which the work of one request may block the event loop, in s."""
 
 T = TypeVar("T")
 

@@ -23,9 +23,9 @@ from shmio.errors import EndpointError
 
 MAX_REQUEST_BYTES = 1 << 20
 GRACE_S: Final = 0.2
-"""Time in which open calls may end by themselves when the endpoint stops."""
+"""Time that open calls have to end by themselves when the endpoint stops, in s."""
 STOP_S: Final = 2.5
-"""Maximum duration of a stop; well below the time after which the supervisor kills the process."""
+"""Maximum duration of a stop, in s. After a longer time, the supervisor kills the process."""
 
 log = logging.getLogger("shmio.grpc")
 
@@ -75,7 +75,7 @@ class Server:
 
     @property
     def unknown(self) -> int:
-        """Number of calls of unknown names since the start; all were refused."""
+        """Number of calls with unknown names since the start. All were refused."""
         return sum(server.refused for server in self._servers)
 
     async def start(self, listeners: Sequence[Listener], tls: Tls | None = None, gid: int | None = None) -> list[int]:
@@ -95,7 +95,11 @@ class Server:
         wanted = self.calls.limits.connections
         connections = room(wanted)
         if connections < wanted:
-            log.warning("at most %d connections, not %d: the hard limit of open files is too low", connections, wanted)
+            log.warning(
+                "the endpoint serves at most %d connections, not %d: the hard limit of open files is too low",
+                connections,
+                wanted,
+            )
         self.shortage = shortage(connections, wanted)
         self._connections = max(1, connections // len(listeners))
         ports = []
@@ -118,7 +122,7 @@ class Server:
         self._health.end()
         ends = [asyncio.create_task(server.stop(GRACE_S)) for server in self._servers]
         if ends and (await asyncio.wait(ends, timeout=STOP_S))[1]:
-            log.warning("some calls did not end within %g s; they end with the process", STOP_S)
+            log.warning("some calls did not end within %g s; they will end with the process", STOP_S)
         for file in self._files.values():
             file.remove()
 

@@ -1,6 +1,6 @@
 """Injections of SimlogAPI clients.
 
-By shadow topics, clients read the values that an injection diverts, and give other values instead.
+By an injection's shadow topics, clients read the values that it diverts, and give other values.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ MAX_INJECTIONS: Final = 64
 MAX_PATH: Final = 1024
 """Maximum length of a shadow topic's path, or of a prefix, in characters."""
 LOOK_S: Final = 0.25
-"""Interval of the checks for disconnected clients, whose injections are to end within a second."""
+"""Interval of the checks for disconnected clients, in s. Their injections end within a second."""
 UNSEEN_S: Final = 10.0
-"""How long an injection without a stream lasts if the kernel does not list its client's connection."""
+"""How long an injection without a stream lasts, in s, if the kernel does not list its client."""
 
 _MARKS: Final = frozenset(mark.value for mark in TimeTopic)
 _SCHEME: Final = re.compile(r"^[^/:]*://")
@@ -47,11 +47,11 @@ _SCHEME: Final = re.compile(r"^[^/:]*://")
 log = logging.getLogger("shmio.grpc")
 
 Leave = Callable[[], None]
-"""Ends a subscription."""
+"""Function that ends a subscription."""
 
 
 class _Tap:
-    """The listeners to one direction of an injection; a value is encoded once for all of them."""
+    """The listeners to one direction of an injection. A value is encoded once for all of them."""
 
     def __init__(self) -> None:
         self._channels: dict[str, tuple[Encode, set[Listener]]] = {}
@@ -83,9 +83,9 @@ class Injection(InjectionFollower):
     """An injection over the registers of ``shape``, from laying to lifting.
 
     ``shape`` has the registers that ``target`` names in the layout of ``feed``. The *originals* of
-    an injection are the values that it diverts. Over ``/out`` these come from the source or from
-    inner layers, over ``/in`` from writers. Its *given values* are those that its clients send
-    instead. Use it only in the event loop's thread.
+    an injection are the values that it diverts. Over ``/out``, the source or inner injections
+    deliver them; over ``/in``, writers do. The *given values* are those that the injection's
+    clients send instead. Use it only in the event loop's thread.
     """
 
     def __init__(self, target: Topic, shape: Shape, feed: Feed, name: str) -> None:
@@ -103,9 +103,9 @@ class Injection(InjectionFollower):
         self.feed = feed
         self.inward = target.direction == "in"
         self.over = ""
-        """Why the injection has ended; empty while it lasts."""
+        """Reason why the injection has ended; empty while it lasts."""
         self.ends: dict[object, Callable[[], object]] = {}
-        """Functions to call at the end of the injection, by the object that added them."""
+        """Functions to call when the injection ends, by the object that added them."""
         frame = feed.block.latest()
         self._base = InjectionBase(feed.block, frame.image if frame else b"")
         self._given_image = bytearray(self._base.given)
@@ -149,7 +149,7 @@ class Injection(InjectionFollower):
         """Lift the injection.
 
         Args:
-            reason: Why; becomes :attr:`over`.
+            reason: Why the injection is lifted. It becomes :attr:`over`.
 
         """
         if not self.over:
@@ -218,13 +218,13 @@ class Injection(InjectionFollower):
             self._given.show(ShownImage(now.number, now.clock_ns, bytes(self._given_image)))
 
     def given_values(self, wire: str, encode: Encode, lane: EventLane) -> Leave:
-        """Listen to the values given from now on; return the function that ends this."""
+        """Listen to values given from now on. Return the function that ends the subscription."""
         return self._given.listen(wire, encode, lane)
 
     # ---- originals ---------------------------------------------------------------------------
 
     def originals(self, wire: str, encode: Encode, outbox: Outbox, path: str, finish: Finish = bytes) -> Leave:
-        """Listen to the originals; return the function that ends this.
+        """Listen to the originals. Return the function that ends the subscription.
 
         Over ``/out`` the listener first gets the present value.
 
@@ -251,7 +251,7 @@ class Injection(InjectionFollower):
         return partial(self.feed.leave, subject, lane)
 
     def present(self) -> ShownImage | None:
-        """Return the present original of ``/out``.
+        """Return the present original of an injection over ``/out``.
 
         Returns:
             The original, or None if it is not good, or if the injection is over ``/in``.
@@ -291,7 +291,7 @@ class Injection(InjectionFollower):
         self._finish(f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it")
 
     def fail(self, reason: str) -> None:
-        """Fail the listeners to originals, because events were missed."""
+        """End the listeners to originals with an error, because events were missed."""
         self._diverted.fail(reason)
 
 
@@ -324,7 +324,7 @@ class _Client:
 
 
 class Shadows:
-    """All shadow topics and their injections. An injection that nobody holds any more is lifted."""
+    """All shadow topics and their injections. When no client holds an injection, it is lifted."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -391,7 +391,7 @@ class Shadows:
         return injection
 
     def hold(self, injection: Injection, stream: object) -> None:
-        """Let a stream hold an injection, instead of the clients without a stream."""
+        """Make a stream the holder of an injection, in place of the clients without a stream."""
         holders = self._holders.get(injection, set())
         holders.difference_update([holder for holder in holders if isinstance(holder, _Client)])
         holders.add(stream)
@@ -402,7 +402,7 @@ class Shadows:
         if holder in holders:
             holders.remove(holder)
             if not holders:
-                injection.end("no client uses it any more")
+                injection.end("no client uses the injection any more")
 
     def move(self, sources: Collection[str]) -> None:
         """End the injections on sources whose blocks a reload has replaced."""
@@ -411,7 +411,7 @@ class Shadows:
                 injection.end(RETIRED)
 
     def _joined(self, target: Topic, kinds: Mapping[str, ShadowKind]) -> Injection | None:
-        """Return the injection that has these topics already, or None.
+        """Return the injection that already has these shadow topics, or None.
 
         Raises:
             ValueRangeError: A topic is the target itself.
@@ -422,7 +422,7 @@ class Shadows:
         for path, kind in kinds.items():
             name = self._topics.name(path)
             if name == str(target):
-                raise ValueRangeError(f"{shorten(path)} is the target: a shadow needs another path")
+                raise ValueRangeError(f"{shorten(path)} is the target of the injection: a shadow needs another path")
             shadow = self._named.get(name)
             if name in _MARKS or (shadow and (shadow.injection.target != target or shadow.kind is not kind)):
                 use = f"the shadow of {shadow.injection.target}" if shadow else "served by shmio"
@@ -436,7 +436,7 @@ class Shadows:
         self._named = {name: shadow for name, shadow in self._named.items() if shadow.injection is not injection}
 
     async def _look(self) -> None:
-        """Release the injections of clients without a stream that have disconnected."""
+        """Release the injections of disconnected clients that had no stream."""
         while clients := self._clients():
             await asyncio.sleep(LOOK_S)
             there = await asyncio.to_thread(connected)
@@ -463,7 +463,9 @@ def shadow_path(path: str) -> str:
 
     """
     if not path.strip("/") or len(path) > MAX_PATH or not path.isprintable():
-        raise ValueRangeError(f"the path of a shadow has 1 to {MAX_PATH} printable characters, not {shorten(path)!r}")
+        raise ValueRangeError(
+            f"the path of a shadow must have 1 to {MAX_PATH} printable characters, not {shorten(path)!r}"
+        )
     return path
 
 
@@ -477,7 +479,9 @@ def shadow_paths(prefix: str, target: Topic) -> tuple[str, str]:
 
     """
     if len(prefix) > MAX_PATH or not prefix.isprintable():
-        raise ValueRangeError(f"shadowPathPrefix has at most {MAX_PATH} printable characters, not {shorten(prefix)!r}")
+        raise ValueRangeError(
+            f"shadowPathPrefix must have at most {MAX_PATH} printable characters, not {shorten(prefix)!r}"
+        )
     names = [encode_segment(name) for name in _SCHEME.sub("", prefix).split("/") if name]
     base = "/".join([*names, encode_segment(str(replace(target, direction=target.direction or "out")))])
     return f"SIMLOG://{base}/in", f"SIMLOG://{base}/out"

@@ -31,8 +31,8 @@ There are several because one of gRPC's threads may pass on a message late.
 class ReceiveBarrier:
     """Waits until the handlers have all messages that gRPC has received so far.
 
-    Received messages pass through a queue to the event loop. The barrier appends an operation to
-    this queue that ends at once: it watches the state of an unused channel.
+    Received messages pass through a queue to the event loop. To wait, the barrier appends an
+    operation to this queue that ends at once: it watches the state of an unused channel.
     """
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class ReceiveBarrier:
 
 
 SETTLE_S: Final = 5.0
-"""Longest time for which a step waits for a client's earlier values while the client sends more."""
+"""Longest time for which a step waits for a client's values while the client sends more, in s."""
 MAX_VALUES: Final = 256
 """Maximum number of registers in one structure: as many as a source writes in one cycle."""
 LARGE_ELEMENTS: Final = 1024
@@ -62,7 +62,7 @@ LARGE_ELEMENTS: Final = 1024
 class _Destination(NamedTuple):
     """The receiver of a value.
 
-    ``send`` sends the value. ``ready`` is True if that would not have to wait.
+    ``send`` sends the value. ``ready`` returns whether ``send`` could do so without waiting.
     """
 
     send: Callable[[Done, Callable[[], None]], Coroutine[None, None, None]]
@@ -80,7 +80,7 @@ class Request(NamedTuple):
 
 
 Parse = Callable[[bytes], Request]
-"""Parses a message, or raises DecodeError if it is not valid."""
+"""Function that parses a message, and raises DecodeError if the message is not valid."""
 
 
 class _PublishCall:
@@ -146,8 +146,8 @@ async def _read(request: Request, found: Shape) -> Mapping[str, object]:
 class Publisher:
     """Serves Publish and Write.
 
-    An invalid message of a stream is counted, logged and skipped, and the stream continues. In the
-    end each message is counted: as ``published`` if the device has the value, otherwise as
+    An invalid message of a stream is counted, logged and skipped, and the stream continues. Each
+    message is finally counted as ``published`` if the device has the value, otherwise as
     ``refused``.
     """
 
@@ -166,7 +166,7 @@ class Publisher:
         return self._refusals.count
 
     async def publish(self, messages: AsyncIterator[bytes], parse: Parse, peer: str) -> Empty:
-        """Write the values of a stream in order; return when all of them have ended.
+        """Write the values of a stream in order. Return when all outcomes are known.
 
         Values that were received are written even if the client disconnects.
         """
@@ -193,7 +193,7 @@ class Publisher:
             path = request.path
             destination = await self._resolve(request)
         except DecodeError:
-            self._refusals.add(f"{len(message)} bytes are not a PubRequest", path, peer)
+            self._refusals.add(f"{len(message)} bytes are not a valid PubRequest", path, peer)
             value.end()
             return
         except ShmioError as error:
@@ -227,9 +227,9 @@ class Publisher:
                     await self._arrivals.handled()
 
     async def write(self, request: Request, peer: str) -> tuple[EventKind, str]:
-        """Write one value; return when its source has accepted it.
+        """Write one value. Return when its source has accepted it.
 
-        If the device later does not take an accepted value, the log says so.
+        If the device later does not take the accepted value, a log line says so.
 
         Returns:
             ``(ACCEPTED, "")``, or the outcome and its reason if the source did not accept the
@@ -267,7 +267,7 @@ class Publisher:
         return await answer
 
     async def _resolve(self, request: Request) -> _Destination:
-        """Find the receiver of a request's value; raises what :meth:`write` raises."""
+        """Find the receiver of a request's value. It raises the errors of :meth:`write`."""
         if shadow := self._shadows.find(request.path):
             if shadow.kind is ShadowKind.ORIGINALS:
                 raise CommandError(
@@ -279,11 +279,11 @@ class Publisher:
         topic = self._topics.topic(request.path)
         found = shape(self._topics.layout(topic), topic)
         if topic.direction == "out":
-            raise CommandError(f"{shorten(request.path)}: an output of a source cannot be published to; use /in")
+            raise CommandError(f"{shorten(request.path)}: clients cannot publish to an output of a source; use /in")
         values = await _read(request, found)
         if len(values) > MAX_VALUES:
             raise ValueRangeError(
-                f"{shorten(request.path)}: {len(values)} registers are too many at once, at most {MAX_VALUES}"
+                f"{shorten(request.path)}: {len(values)} registers are too many for one value, at most {MAX_VALUES}"
             )
         commands = self._topics.feed(topic.source).commands
         return _Destination(partial(commands.send, values), commands.ready(values))

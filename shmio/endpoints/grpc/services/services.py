@@ -69,7 +69,10 @@ class Services:
 
     @property
     def counters(self) -> tuple[int, int, int, int]:
-        """Numbers of open streams, and of messages dropped for slow clients, published and refused."""
+        """Numbers of open streams, dropped messages, published values and refused values.
+
+        The endpoint drops messages for clients that are too slow.
+        """
         streams = len(self._outboxes) + self._shmio_v1.subscribe_calls.streams
         return streams, self._outboxes.dropped, self._publisher.published, self._publisher.refused
 

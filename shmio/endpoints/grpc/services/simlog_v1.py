@@ -1,7 +1,8 @@
 """SimlogAPI version 1, package ``simulation.server``: the calls, and values as ROSMessages.
 
-A register is a text; a structure of a known type has its own message type. Serialised fields may be
-concatenated: constant fields are encoded once, and the time once for each frame.
+The value of a register is sent as a text. A structure of a known type has its own message type.
+Serialised fields may be concatenated, so constant fields are encoded once, and the time once for
+each frame.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def message_type(found: Shape) -> str:
 def encoder(found: Shape, layout: Layout) -> Encode:
     """Return a function that encodes an image as a ROSMessage.
 
-    It returns None for invalid bytes, and if the source calls a register bad.
+    The function returns None for invalid bytes, and if the source reports a register as bad.
 
     Raises:
         ValueRangeError: The topic is a structure without a message type.
@@ -178,7 +179,7 @@ def _present(message: Any) -> Any:
 def _converter(name: str, register: Register) -> Callable[[Any], Any]:
     """Return the function that converts a register's value to a field's value.
 
-    It converts an invalid text to an empty one.
+    The function converts an invalid text to an empty text.
     """
     if wire_type(register) == "string":
         return lambda value: value or ""
@@ -189,7 +190,7 @@ def _converter(name: str, register: Register) -> Callable[[Any], Any]:
 
 
 def _values(message: Any, members: Found) -> Iterator[tuple[str, object]]:
-    """Yield the values of a message by register path; an absent inner message yields none."""
+    """Yield the values of a message by register path. An absent inner message has no values."""
     for name, member in members.items():
         value = getattr(message, name)
         if isinstance(member, Register):
@@ -199,13 +200,13 @@ def _values(message: Any, members: Found) -> Iterator[tuple[str, object]]:
                 yield from _values(value, member)
         else:
             if len(value) > len(member):
-                raise ValueRangeError(f"{name}: expected at most {len(member)}, found {len(value)}")
+                raise ValueRangeError(f"{name}: expected at most {len(member)} values, found {len(value)}")
             for place, element in enumerate(member):
                 yield from _values(value[place] if place < len(value) else wire.JointTrajectoryPoint(), element)
 
 
 def _filled(values: Sequence[object], register: Register) -> list[object]:
-    """Return a value for each element of an array; a missing one is the type's default."""
+    """Return a value for each element of an array. Missing values become the type's default."""
     if len(values) > register.count:
         raise ValueRangeError(f"{register.path}: expected at most {register.count} elements, found {len(values)}")
     default = scalar_literal(default_text(register.element), register.element)
@@ -249,11 +250,11 @@ class InjectCalls:
         return shadow.injection
 
     async def inject(self, request: wire.InjectRequest, context: Context) -> AsyncIterator[bytes]:
-        """Lay or join an injection while the stream is open, and stream its originals.
+        """Lay or join an injection that lasts while the stream is open, and stream its originals.
 
-        Over ``/in`` the originals are the writes, which no longer reach the source. Over ``/out``,
-        or without suffix, they are the source's values, beginning with the present one. Values
-        published to the shadow topic replace the originals.
+        Over ``/in``, the originals are the written values, which no longer reach the source. Over
+        ``/out``, or without suffix, they are the source's values, beginning with the present value.
+        Values that clients publish to the shadow topic replace the originals.
 
         Statuses:
             NOT_FOUND: There is no such target.
@@ -359,10 +360,10 @@ class SimlogV1:
         return Empty()
 
     async def step(self, _: wire.StepRequest, context: Context) -> wire.StepResponse:
-        """Make a step; answer when all streams have it.
+        """Make a step. Answer when all streams have its values.
 
-        Values received from this client before are written first. The code of the answer is 0, or
-        -1 if the step failed; then the log says why.
+        Values that this client published before are written first. The code of the answer is 0, or
+        -1 if the step failed. A log line then says why.
         """
         try:
             await self._stepper.step(peer=context.peer())
@@ -386,7 +387,7 @@ class SimlogV1:
         return wire.TopicDescriptor(path=request.path, msgType=message_type(found))
 
     async def subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:
-        """Stream a topic's current value, if it is good, and its changes; for ``/in``, the writes.
+        """Stream a topic's current value, if it is good, and its changes; for ``/in``, its writes.
 
         Nothing is sent while the quality is bad. When the quality recovers, the value is sent
         again. For a slow client the newest value replaces those that wait. A slow client's stream
@@ -451,7 +452,7 @@ class SimlogV1:
                 outbox.end()
 
     async def _find_again(self, topic: Topic, context: Context) -> Shape:
-        """Return the registers of a stream's topic after a reload.
+        """Return the registers that a stream's topic names after a reload.
 
         Statuses:
             NOT_FOUND: The topic no longer exists.
@@ -477,7 +478,7 @@ class SimlogV1:
         return found
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
-        """Write the values of a stream in order; answer when all of them have ended."""
+        """Write the values of a stream in order. Answer when all outcomes are known."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
     async def _time_topic(self, path: str, context: Context) -> TimeTopic | None:
@@ -507,7 +508,7 @@ def _parse(message: bytes) -> Request:
 def _time_message(time_topic: TimeTopic, moment: Moment) -> bytes:
     """Encode a value of a time topic.
 
-    The simulation time is in the time stamp; its value is empty.
+    The simulation time is sent as the time stamp, with an empty value.
     """
     value = str(moment.number) if time_topic is TimeTopic.STEP else ""
     return wire.ROSMessage(type=_TIME_TOPIC_TYPES[time_topic], value=value).SerializeToString() + time_stamp(*moment)

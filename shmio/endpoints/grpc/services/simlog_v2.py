@@ -48,7 +48,7 @@ MAX_ALL_TOPICS: Final = 100_000
 MAX_NAME: Final = 256
 """Maximum length of a subscriber's name and uuid, in characters."""
 PATIENCE_S: Final = 1.0
-"""How long Subscribe waits for its subscriber, because the two calls may arrive in any order."""
+"""Time in s that Subscribe waits for CreateSubscriber, because the calls may come in any order."""
 MAX_ELEMENTS: Final = 1 << 16
 """Maximum number of numbers, bits and texts in one value."""
 MAX_MEMBERS: Final = 4096
@@ -56,7 +56,7 @@ MAX_MEMBERS: Final = 4096
 MAX_LEVELS: Final = 24
 """Maximum nesting of structures.
 
-Messages nest three times as deep, and protobuf's readers stop at 100 levels.
+Each level of structures needs three levels of messages, and protobuf's readers stop at 100 levels.
 """
 
 _DOUBLE: Final = struct.Struct("<Bd")
@@ -109,7 +109,7 @@ def subject(found: Shape, layout: Layout) -> Subject:
 def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessage | None]:
     """Return a function that encodes an image as a message.
 
-    It returns None for invalid bytes, and if the source calls a register bad.
+    The function returns None for invalid bytes, and if the source reports a register as bad.
 
     Raises:
         ValueRangeError: The topic is too large or nested too deeply for a message.
@@ -162,17 +162,17 @@ def repeated(messages: Iterable[bytes]) -> bytes:
 
 
 def to_wire(value: Value) -> WireValue:
-    """Convert a decoded value: numbers become doubles, a missing value becomes null."""
+    """Convert a decoded value. Numbers become doubles, and a missing value becomes null."""
     found = WireValue()
     _put(value, found)
     return found
 
 
 def from_wire(value: WireValue, found: Shape) -> dict[str, object]:
-    """Convert a client's value to values by register path; a structure may lack members.
+    """Convert a client's value to values by register path. A structure may lack members.
 
-    For a register that is not a text, a text is parsed as in version 1. So a 64-bit number keeps
-    all its digits.
+    If a client sends a text for a register of another type, the text is parsed as in version 1. So
+    a 64-bit number keeps all its digits.
 
     Raises:
         ValueRangeError: The value does not fit the topic.
@@ -240,7 +240,7 @@ def _whole(register: Register, layout: Layout) -> Callable[[bytes], bytes | None
 def _numbers(register: Register, kind: np.dtype[Any]) -> Callable[[bytes], bytes]:
     """Return a function that encodes an array of numbers as a Value.
 
-    It is a hundred times as fast as encoding each number by itself.
+    This is a hundred times as fast as encoding each number by itself.
     """
     one = ListValue(values=[WireValue(number_value=0)]).SerializeToString()  # ends in its double
     size = register.count * len(one)
@@ -286,7 +286,7 @@ def _members(
 
     """
     if not levels:
-        raise ValueRangeError(f"{shorten(parts[0][1].path)}: more than {MAX_LEVELS} nested structures")
+        raise ValueRangeError(f"{shorten(parts[0][1].path)}: structures are nested in more than {MAX_LEVELS} levels")
     groups: dict[str, list[tuple[list[str], Register]]] = {}
     for (name, *rest), register in parts:
         groups.setdefault(decode_segment(name), []).append((rest, register))
@@ -367,7 +367,7 @@ class Subscriber:
         return len(self._subscriptions)
 
     def add(self, path: str) -> None:
-        """Subscribe to a topic, unless that is done already.
+        """Subscribe to a topic, unless the subscriber already has it.
 
         Raises:
             PathError: There is no such topic.
@@ -399,7 +399,7 @@ class Subscriber:
                 try:
                     self._join(subscription)
                 except ShmioError as error:
-                    log.info("a subscribed topic is gone: %s", error, extra=fields(topic=shorten(path)))
+                    log.info("a subscribed topic no longer exists: %s", error, extra=fields(topic=shorten(path)))
 
     def close(self) -> None:
         """Unsubscribe from all topics."""
@@ -408,9 +408,9 @@ class Subscriber:
             self._leave(subscription)
 
     def _join_shadow(self, path: str, shadow: Shadow, finish: Finish) -> Callable[[], None]:
-        """Listen to a shadow topic; return the function that ends this.
+        """Listen to a shadow topic. Return the function that ends the subscription.
 
-        A listener to originals holds the injection.
+        While a stream listens to the originals, it holds the injection.
         """
         injection, key = shadow.injection, object()
         to_message = encoder(injection.shape, injection.feed.block.layout)
@@ -421,7 +421,7 @@ class Subscriber:
             leave = injection.given_values("v2", to_message, EventLane(self.outbox, shorten(path), finish))
 
         def over() -> None:
-            log.info("a subscribed topic is gone: %s", injection.over, extra=fields(topic=shorten(path)))
+            log.info("a subscribed topic no longer exists: %s", injection.over, extra=fields(topic=shorten(path)))
             self._leave(self._subscriptions.pop(path))
 
         def leave_it() -> None:
@@ -462,19 +462,19 @@ class Subscribers:
     def enter(self, uuid: str, name: str, outbox: Outbox, holder: object) -> Subscriber:
         """Add a subscriber whose stream opens.
 
-        If the same holder has a stream with this uuid, that one ends: a broken connection may have
-        left it.
+        If the same client already has a stream with this uuid, the old stream ends, because a broken
+        connection may have left it open.
 
         Raises:
             ValueRangeError: The uuid is missing or too long.
-            ConflictError: Another holder has the uuid.
+            ConflictError: Another client has the uuid.
             EndpointError: There are too many subscribers.
 
         """
         if not uuid:
-            raise ValueRangeError("uuid: this field is needed, because Subscribe uses it to name the stream")
+            raise ValueRangeError("uuid: this field is needed, because Subscribe names the stream by it")
         if max(len(uuid), len(name)) > MAX_NAME:
-            raise ValueRangeError(f"name and uuid have at most {MAX_NAME} characters")
+            raise ValueRangeError(f"name and uuid must have at most {MAX_NAME} characters")
         before = self._open.get(uuid)
         if before is not None and before.holder != holder:
             raise ConflictError(f"uuid {shorten(uuid)!r} belongs to another client: choose a random one")
@@ -486,7 +486,9 @@ class Subscribers:
             before.outbox.end()
             log.info("subscriber %s connected again; its earlier stream ends", shorten(name), extra=fields(uuid=uuid))
         elif len(self._open) >= MAX_SUBSCRIBERS:
-            raise EndpointError(f"there are {MAX_SUBSCRIBERS} subscribers already; one stream serves many topics")
+            raise EndpointError(
+                f"there are {MAX_SUBSCRIBERS} subscribers already, the maximum: one stream serves many topics"
+            )
         subscriber = self._open[uuid] = Subscriber(self._topics, self._shadows, self._time_topics, name, outbox, holder)
         self._arrived.set()
         self._arrived = asyncio.Event()
@@ -499,10 +501,10 @@ class Subscribers:
             del self._open[uuid]
 
     async def subscribe(self, uuid: str, path: str, holder: object) -> None:
-        """Add a topic to a subscriber's stream; wait up to ``PATIENCE_S`` for the stream to open.
+        """Add a topic to a subscriber's stream. Wait up to ``PATIENCE_S`` for the stream to open.
 
         Raises:
-            PathError: There is no such topic, or the holder has no such subscriber.
+            PathError: There is no such topic, or the client has no such subscriber.
             ValueRangeError: The topic is too large for a message.
             EndpointError: There are too many subscriptions.
 
@@ -514,7 +516,7 @@ class Subscribers:
         subscriber = self._open.get(uuid)
         if subscriber is None or subscriber.holder != holder:
             raise PathError(
-                f"subscriberUUID {shorten(uuid)!r}: no such subscriber; keep the stream of CreateSubscriber open"
+                f"subscriberUUID {shorten(uuid)!r}: there is no such subscriber; keep CreateSubscriber's stream open"
             )
         if len(subscriber) >= MAX_TOPICS or sum(map(len, self._open.values())) >= MAX_ALL_TOPICS:
             raise EndpointError(
@@ -546,7 +548,7 @@ class SimlogV2:
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """Return the handlers of the service's calls.
 
-        Streams and Read serialise their messages themselves.
+        The handlers of streams and of Read return serialised messages.
         """
         unary = grpc.unary_unary_rpc_method_handler
         empty = Empty.SerializeToString
@@ -629,10 +631,10 @@ class SimlogV2:
         return Empty()
 
     async def inject(self, request: wire.InjectRequest, context: Context) -> wire.InjectResponse:
-        """Lay an injection over a topic; return the paths for its values and for its originals.
+        """Lay an injection over a topic. Return the paths for its given values and its originals.
 
         The injection lasts while a subscriber has ``shadowPathOut``. Before the first subscriber,
-        it lasts while this call's connection does.
+        it lasts as long as the connection of this call.
 
         Statuses:
             NOT_FOUND: There is no such topic.
@@ -651,11 +653,11 @@ class SimlogV2:
         return wire.InjectResponse(shadowPathIn=path_in, shadowPathOut=path_out)
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
-        """Write the values of a stream in order; answer when all of them have ended."""
+        """Write the values of a stream in order. Answer when all outcomes are known."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
     async def write(self, request: wire.PubRequest, context: Context) -> Empty:
-        """Write one value; answer when its source has accepted it.
+        """Write one value. Answer when its source has accepted it.
 
         Statuses:
             NOT_FOUND: There is no such topic.
@@ -674,9 +676,9 @@ class SimlogV2:
         return Empty()
 
     async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
-        """Return the values of topics, in order; those of one source come from one frame.
+        """Return the values of topics, in order. The values of one source come from one frame.
 
-        A value is NULL while its quality is bad.
+        While the quality of a value is bad, NULL is returned for it.
 
         Statuses:
             NOT_FOUND: There is no such topic.
@@ -708,7 +710,7 @@ class SimlogV2:
         return wire.INOUT if await commands.writable(found.registers) else wire.OUT
 
     async def _read(self, paths: Iterable[str]) -> list[bytes]:
-        """Return serialised messages, which are made in time slices.
+        """Return serialised messages. They are made in time slices, so that other tasks can run.
 
         Raises:
             PathError: There is no such topic.
@@ -723,7 +725,7 @@ class SimlogV2:
             members, elements = members + len(found.registers), elements + found.elements
             if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
                 raise ValueRangeError(
-                    f"{shorten(path)}: too much for one Read: at most {MAX_MEMBERS} registers with "
+                    f"{shorten(path)}: this is too much for one Read: at most {MAX_MEMBERS} registers with "
                     f"{MAX_ELEMENTS} elements are allowed"
                 )
             wanted.append((path, shadow or topic.source, found))
@@ -747,7 +749,7 @@ class SimlogV2:
 
 
 def _holder(context: Context) -> object:
-    """Return the owner of the uuids that a call names."""
+    """Return the client that owns the uuids of a call."""
     return holder_of(context.peer(), context.invocation_metadata() or (), context.auth_context())
 
 

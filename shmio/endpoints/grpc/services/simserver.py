@@ -46,7 +46,7 @@ class SimServer:
         return calls
 
     async def step(self, request: wire.StepRequest, context: Context) -> wire.SimStatus:
-        """Make a step; answer when all streams have taken it.
+        """Make a step. Answer when all streams have taken its values.
 
         Statuses:
             INVALID_ARGUMENT: The step is out of range.
@@ -68,7 +68,7 @@ class SimServer:
         return await self._answer(self._stepper.play(_ns(request.deltaTime)), context)
 
     async def stop(self, _: Empty, context: Context) -> wire.SimStatus:
-        """Stop playing. Until the next step, the state of time is not alive."""
+        """Stop playing. Until the next step, the status has ``alive = False``."""
         return await self._answer(self._stepper.pause(end=True), context)
 
     async def pause(self, _: Empty, context: Context) -> wire.SimStatus:

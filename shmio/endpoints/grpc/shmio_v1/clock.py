@@ -19,7 +19,7 @@ from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_ANSWERS: Final = 1024
-"""Maximum number of answers that wait for the client; beyond that, the next step waits too."""
+"""Maximum number of answers that wait for the client. If there are more, the next step waits."""
 
 STEPS: Final = wire.StepsResponse.DESCRIPTOR.fields_by_name["steps"].number
 
@@ -106,7 +106,7 @@ class TimeCalls:
         }
 
     async def step(self, request: wire.StepRequest, context: Context) -> wire.Clock:
-        """Make one step; answer when every stream has its changes.
+        """Make one step. Answer when every stream has its changes.
 
         Statuses:
             INVALID_ARGUMENT: The step is out of range.
@@ -134,7 +134,7 @@ class TimeCalls:
             await refuse(context, error)
 
     async def set_step_size(self, request: wire.SetStepSizeRequest, context: Context) -> wire.Clock:
-        """Set the size of steps whose request names none.
+        """Set the step size: the length of steps whose request names no length.
 
         Statuses:
             INVALID_ARGUMENT: The step size is out of range.
@@ -151,7 +151,7 @@ class TimeCalls:
         """
         rate = request.rate or 1.0
         if not 1e-3 <= rate <= 1e3 or math.isnan(rate):
-            await refuse(context, ValueRangeError(f"rate: {rate} is not from 0.001 to 1000"))
+            await refuse(context, ValueRangeError(f"rate: {rate} is not a number from 0.001 to 1000"))
         return await self._do(self._stepper.play(request.dt_ns or None, rate), context)
 
     async def pause(self, _: wire.PauseRequest, context: Context) -> wire.Clock:

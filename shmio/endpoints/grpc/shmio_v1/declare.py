@@ -32,7 +32,7 @@ MAX_MATCHES: Final = 10_000_000
 So many comparisons take a few seconds.
 """
 SEED_BITS: Final = 53
-"""Number of bits of a random seed; few enough for any JSON reader."""
+"""Number of bits of a random seed. Every JSON reader reads integers of this size exactly."""
 
 _DECLARED, _HAPPENINGS = (
     wire.DeclareResponse.DESCRIPTOR.fields_by_name[name].number for name in ("declared", "happenings")
@@ -82,10 +82,10 @@ class DeclareCall:
         self._abandoned = False
         self._lifting: asyncio.Task[None] | None = None
         self.over = ""
-        """Why the call has to end before its injections; otherwise empty."""
+        """Reason why the call has to end before its injections; otherwise empty."""
 
     async def open(self) -> bytes:
-        """Lay all injections or none; return the first message.
+        """Lay all injections or none, and return the first message.
 
         Raises:
             ConfigError: A declaration does not fit the sources.
@@ -107,7 +107,7 @@ class DeclareCall:
                 declaration = program.declaration
                 member = DeclaredInjection(self, program.source, feeds[program.source].commands)
                 if self._abandoned:
-                    raise CommandError("the client is gone")
+                    raise CommandError("the client has disconnected")
                 try:
                     member.number = await command_client.declare(member.commands, declaration, member, keep=self._keep)
                 except CommandError as error:
@@ -123,14 +123,14 @@ class DeclareCall:
         return field(_DECLARED, declared.SerializeToString()) + self._waiting.all()
 
     def abandon(self) -> None:
-        """Stop laying injections, because the client is gone.
+        """Stop laying injections, because the client has disconnected.
 
-        Unless all are laid, those that are laid will be lifted.
+        Injections that :meth:`open` has laid are lifted, unless it has already laid all.
         """
         self._abandoned = True
 
     async def close(self) -> None:
-        """Lift the injections, except those to keep; retry until the sources have done so."""
+        """Lift the injections, unless they are to be kept. Retry until the sources have done so."""
         if self._lifting is not None:
             await self._lifting
         elif not self._keep:
@@ -165,8 +165,8 @@ class DeclareCall:
     def end(self, reason: str) -> None:
         """End the call, because its record has a gap.
 
-        The injections are lifted at once, except those to keep: a client that does not read would
-        delay the end of the stream.
+        Unless they are to be kept, the injections are lifted at once. They do not wait for the end
+        of the stream, which a client that does not read would delay.
         """
         self.over = self.over or reason
         if self._laid and not self._keep and self._lifting is None:
@@ -231,7 +231,7 @@ class DeclaredInjection(InjectionFollower):
         )
 
     def lifted(self, reason: str) -> None:
-        """Record the end of the injection, unless an event has reported it."""
+        """Record the end of the injection, unless an event has already reported it."""
         if not self.gone:
             self.gone = True
             now_ns = self.commands.block.clock.read().present_ns

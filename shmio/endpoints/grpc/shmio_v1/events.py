@@ -29,7 +29,7 @@ MAX_SOURCES: Final = 256
 BATCH_EVENTS: Final = 32
 """Maximum number of events that are explained before the event loop serves the streams again."""
 BATCH_S: Final = 0.005
-"""Time after which a batch ends early, because one event may be about thousands of registers."""
+"""Time in s after which a batch ends early; one event may be about thousands of registers."""
 LOG_BYTES: Final = 8 << 20
 """Maximum size of a block's events that wait for clients.
 
@@ -45,7 +45,7 @@ _MISSED: Final = wire.Event.DESCRIPTOR.fields_by_name["missed"].number
 class EventLog:
     """The latest events of one block as messages, for all calls that follow the block.
 
-    When the log is full, it drops the oldest events. A call that has not read them by then misses
+    When the log is full, it drops the oldest events. A call that has not read these misses
     them. Use it only in the event loop's thread.
     """
 
@@ -140,7 +140,7 @@ class EventLogs:
         self._logs: dict[int, EventLog] = {}  # by the block's section
 
     def join(self, block: Block, wake: Callback, *, after: int) -> EventLog:
-        """Return the log of a block; the first call to join starts it.
+        """Return the log of a block. The first call of this method for a block starts its log.
 
         Args:
             block: The block to follow.
@@ -173,7 +173,7 @@ class _Place:
         Args:
             log: The log.
             after: Number of the last event that the call does not want.
-            missed: Number of events that the call missed before.
+            missed: Number of events that the call has missed already.
 
         """
         self.log = log
@@ -213,7 +213,9 @@ class EventsCall:
 
         """
         if len(sources) > MAX_SOURCES:
-            raise ValueRangeError(f"{len(sources)} sources, at most {MAX_SOURCES} are allowed: name none to follow all")
+            raise ValueRangeError(
+                f"{len(sources)} sources are named, at most {MAX_SOURCES} are allowed: name none to follow all"
+            )
         for source in sources:
             if source not in feeds:
                 raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(feeds)}")
@@ -273,7 +275,7 @@ class EventsCall:
                 await self._wake.wait()
 
     def _batch(self) -> bytes:
-        """Return the events that are waiting, up to a limit; the sources take turns."""
+        """Return waiting events up to a limit, from all sources in turn."""
         parts: list[bytes] = []
         size, waiting = 0, deque(self._places)
         while waiting and size < MESSAGE_BYTES:
@@ -337,7 +339,9 @@ class EventCalls:
         call = None
         try:
             if len(self._open) >= MAX_CALLS:
-                raise EndpointError(f"{MAX_CALLS} calls of Events are open, the maximum: one takes many sources")
+                raise EndpointError(
+                    f"{MAX_CALLS} calls of Events are open, the maximum: one call can follow many sources"
+                )
             call = EventsCall(self._feeds, self._logs, self._instance, request.sources)
             self._open.add(call)
             async for message in call.messages():

@@ -65,7 +65,9 @@ def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
         raise ValueRangeError("no pattern and no range is given: name the registers to inject into")
     for name, given in (("patterns", len(lay.patterns)), ("ranges", len(lay.ranges))):
         if given > MAX_PATTERNS:
-            raise ValueRangeError(f"{given} {name}, at most {MAX_PATTERNS} are allowed: use stars or structures")
+            raise ValueRangeError(
+                f"{given} {name} are given, at most {MAX_PATTERNS} are allowed: use stars or structures"
+            )
     found = tuple(dict.fromkeys(topics.topic(pattern) for pattern in lay.patterns))
     places = {SourceDirection(topic.source, topic.direction == "in") for topic in found}
     if len({place.source for place in places}) > 1:
@@ -107,7 +109,7 @@ class ByteRanges:
                     f"from byte {one.offset} on"
                 )
             if one.mask > 0xFF:
-                raise ValueRangeError(f"ranges: the mask {one.mask} is larger than a byte")
+                raise ValueRangeError(f"ranges: the mask {one.mask} has more than 8 bits")
             span, mask = slice(one.offset, one.offset + one.size), one.mask or 0xFF
             self._spans.append((span, mask))
             self._bits[span] |= mask
@@ -148,7 +150,7 @@ class ByteRanges:
 
 
 def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
-    """Convert a client's raw bytes to writes.
+    """Convert raw bytes from a client to writes.
 
     Args:
         pieces: The raw bytes.
@@ -197,7 +199,7 @@ class InjectCall(InjectionFollower):
         self._wake_ups = wake_ups
         self._lay = lay
         self.over = ""
-        """Why the call has to end: another client lifted the injection, or this one does not read.
+        """Why the call has to end: another client lifted the injection, or the client does not read.
 
         Empty if the call need not end.
         """
@@ -226,7 +228,7 @@ class InjectCall(InjectionFollower):
         return self._target.place.inward
 
     async def open(self) -> bytes:
-        """Lay the injection; return the first message.
+        """Lay the injection, and return the first message.
 
         Raises:
             PathError: There is no such register.
@@ -243,7 +245,7 @@ class InjectCall(InjectionFollower):
         self._base = InjectionBase(view.block)
         self._commands = self._selections.commands(self.source)
         if self._commands.block is not view.block:
-            raise CommandError(f"{self.source}: a reload changed it concurrently; try again")
+            raise CommandError(f"{self.source}: a reload changed this source concurrently; try again")
         lay = self._lay
         self._base.number = await command_client.lay(
             self._commands,
@@ -264,11 +266,11 @@ class InjectCall(InjectionFollower):
 
     @property
     def _originals(self) -> bool:
-        """True if the call sends originals, and makes them of frames."""
+        """True if the call sends originals, and takes them from frames."""
         return not (self._inward or self._lay.quiet)
 
     async def close(self) -> None:
-        """Lift the injection, unless it is to be kept; retry until the source has done so."""
+        """Lift the injection, unless it is to be kept. Retry until the source has done so."""
         for task in self._giving:
             task.cancel()
         if self._timer is not None:
@@ -310,8 +312,8 @@ class InjectCall(InjectionFollower):
     async def take(self, requests: AsyncIterator[wire.InjectRequest]) -> None:
         """Send the client's values in order.
 
-        If a message has a sequence number, an error in it is answered. Otherwise the error ends the
-        stream.
+        If a message has a sequence number, the call answers an error in it. Otherwise the error
+        ends the stream.
 
         Raises:
             ValueRangeError: A message gives no values.
@@ -319,7 +321,7 @@ class InjectCall(InjectionFollower):
         """
         async for request in requests:
             if request.WhichOneof("what") != "shadow":
-                raise ValueRangeError("an injection is laid by the first message, all others give values")
+                raise ValueRangeError("the first message lays an injection, all others must give values")
             await self._room.acquire()
             task = asyncio.get_running_loop().create_task(self._give(request.shadow))
             self._giving.add(task)
@@ -401,7 +403,7 @@ class InjectCall(InjectionFollower):
         return head(self._view.number, frame, whole=before is None) + body + statuses.field
 
     def divert(self, diverted: CommandWrites) -> None:
-        """Handle diverted values: over ``/in`` writes, over ``/out`` values of inner layers."""
+        """Handle diverted values: over ``/in`` of writers, over ``/out`` of inner injections."""
         self._base.divert(diverted.writes)
         if not self._inward:
             self.restack()
@@ -422,7 +424,8 @@ class InjectCall(InjectionFollower):
     def _give_up(self, reason: str) -> None:
         """Lift the injection at once.
 
-        A client that does not read would delay the end of the stream, and so the lift.
+        The lift does not wait for the end of the stream, which a client that does not read would
+        delay.
         """
         self.over = self.over or reason
         if self._base.number and not (self._lay.keep or self._lifted):
@@ -453,9 +456,9 @@ class InjectCall(InjectionFollower):
 def _check(lay: wire.Lay) -> None:
     """Raise ValueRangeError if options are not valid or exclude each other."""
     if len(lay.name.encode()) > MAX_NAME_BYTES:
-        raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes")
+        raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes are allowed")
     if lay.lifetime_ms > MAX_LIFETIME_MS:
-        raise ValueRangeError(f"lifetime_ms: at most {MAX_LIFETIME_MS}, a day")
+        raise ValueRangeError(f"lifetime_ms: at most {MAX_LIFETIME_MS} (a day) is allowed")
     if lay.keep and lay.lifetime_ms:
         raise ValueRangeError("keep and lifetime_ms exclude each other: a kept injection stays until somebody lifts it")
 
@@ -490,7 +493,7 @@ class InjectionCalls:
     async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
         """Lay an injection that ends with the stream, unless the client asks to keep it.
 
-        The call streams the originals to the client, which streams other values back.
+        The call streams the originals to the client. The client streams other values to the call.
 
         Statuses:
             NOT_FOUND: There is no such register.
@@ -541,7 +544,7 @@ class InjectionCalls:
                 self._open.add(injection)
                 return injection
             break
-        raise ValueRangeError("the first message of Inject lays an injection, all others give values")
+        raise ValueRangeError("the first message of Inject must lay an injection, all others give values")
 
     def _check_room(self) -> None:
         """Raise EndpointError if there are too many calls."""
@@ -559,9 +562,8 @@ class InjectionCalls:
     async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
         """Lay declared injections, all or none.
 
-        They end with the stream, unless the client asks to keep them.
-
-        The call streams a record of their events.
+        The injections end with the stream, unless the client asks to keep them. The call streams a
+        record of their events.
 
         Statuses:
             INVALID_ARGUMENT: A declaration is not valid; the message names the key.
@@ -623,7 +625,7 @@ class InjectionCalls:
             await refuse(context, error)
 
     async def lift_all(self, request: wire.LiftAllRequest, context: Context) -> wire.LiftResponse:
-        """Lift all injections concurrently. If one could not be lifted, the answer says why.
+        """Lift all injections concurrently. The answer says why an injection was not lifted.
 
         Statuses:
             NOT_FOUND: There is no such source.

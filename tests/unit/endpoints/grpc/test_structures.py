@@ -171,7 +171,7 @@ def test_fields_missing_in_the_message_keep_their_value_and_short_lists_are_fill
                 "known/JointTrajectory",
                 joint_trajectory=wire.JointTrajectory(points=[wire.JointTrajectoryPoint()] * 3),
             ),
-            "points: expected at most 2, found 3",
+            "points: expected at most 2 values, found 3",
         ),
         (request("partly", point=wire.Point(x=1)), "cell/partly/z is not writable"),
         (request("other", point=wire.Point(x=1)), "other: version 1 has no message for this structure"),

@@ -163,11 +163,11 @@ def test_a_call_that_sends_no_message_is_ended(segment: Segment) -> None:
         silent: Any = served.channel.stream_unary(GET)(timeout=TIMEOUT_S)
         assert await refusal(silent) == (
             grpc.StatusCode.DEADLINE_EXCEEDED,
-            f"{GET}: no message came within 0.05 s",
+            f"{GET}: the client sent no message within 0.05 s",
         )
         closed: Any = served.channel.stream_unary(GET)(timeout=TIMEOUT_S)
         await closed.done_writing()
-        assert await refusal(closed) == (grpc.StatusCode.INVALID_ARGUMENT, f"{GET}: the call has no message")
+        assert await refusal(closed) == (grpc.StatusCode.INVALID_ARGUMENT, f"{GET}: the client sent no message")
         await until_calls(served, 0)
 
     serve(segment, test, CallLimits(message_s=0.05))
@@ -224,7 +224,7 @@ def test_refusals_beyond_a_few_lines_are_logged_as_a_count(caplog: pytest.LogCap
         async with asyncio.timeout(20):
             while len(caplog.records) <= LINES:  # noqa: ASYNC110  waits for a log line
                 await asyncio.sleep(0)
-        assert caplog.records[-1].getMessage() == f"publish refused: {2 * LINES} more in 0.01 s"
+        assert caplog.records[-1].getMessage() == f"publish refused: {2 * LINES} more times in 0.01 s"
         refusals.add("once more", "cell/a", "ipv4:127.0.0.1:5")
         assert caplog.records[-1].getMessage() == "publish refused: once more"
 

@@ -120,7 +120,7 @@ def test_the_shadow_is_a_topic_while_the_injection_lasts(segment: Segment) -> No
         originals.cancel()
         status, text = await refusal(watching.read())
         assert status is Status.NOT_FOUND
-        assert text == f"CELL://{SHADOW}: no client uses it any more"
+        assert text == f"CELL://{SHADOW}: no client uses the injection any more"
         assert await code(served.stub.GetTopic(shadow)) is Status.NOT_FOUND
         await lifted(served)
 

@@ -292,7 +292,7 @@ def test_publish_skips_undecodable_bytes_and_ends_with_its_connection(
         await counts(served, 4, 2)
 
     with_plant(segment, test)
-    assert caplog.text.count("bytes are not a PubRequest") == 2
+    assert caplog.text.count("bytes are not a valid PubRequest") == 2
 
 
 def test_all_values_of_a_read_are_of_one_frame(segment: Segment) -> None:

@@ -346,7 +346,7 @@ def test_invalid_ranges_are_refused(segment: Segment) -> None:
             ([(0, 0)], "at least one byte"),
             ([(600, 29)], "within the block of"),
             ([(1 << 31, 1 << 31)], "within the block of"),
-            ([(0, 1, 0x100)], "larger than a byte"),
+            ([(0, 1, 0x100)], "has more than 8 bits"),
             ([(0, 1)] * 300, "at most 256 are allowed"),
         ):
             with pytest.raises(ValueRangeError, match=message):
