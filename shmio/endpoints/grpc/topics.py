@@ -50,7 +50,7 @@ class Topics:
         topic = self._parse(path)
         if topic.source not in self._feeds:
             if self._time_topic(topic):
-                raise PathError(f"{shorten(path)}: it can only be subscribed to")
+                raise PathError(f"{shorten(path)}: clients can only subscribe to this topic")
             raise PathError(
                 f"{shorten(path)}: {topic.source} is reserved; only SIMLOG://step, model/clock and existing shadows "
                 "are available"
@@ -70,7 +70,7 @@ class Topics:
         return _TIME_TOPICS.get(f"{topic.source}/{topic.path}") if topic.direction != "in" else None
 
     def name(self, path: str) -> str:
-        """Return the canonical form of a path, whether or not it names a topic."""
+        """Return the canonical form of a path. The path need not name an existing topic."""
         try:
             return str(self._parse(path))
         except PathError:

@@ -1,4 +1,4 @@
-"""Wakes the event loop when a block has new frames or events, and reads these in batches."""
+"""Wakes the event loop when a block has new frames or events, and reads them in batches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ log = logging.getLogger("shmio.grpc")
 Callback = Callable[[], object]
 
 REST_S: Final = 0.005
-"""Pause between wake-ups while all listeners are patient."""
+"""Pause between wake-ups while all listeners are patient, in s."""
 
 
 class WakeUp:
@@ -103,7 +103,7 @@ class WakeUps:
         Args:
             block: The block.
             ring: The listener.
-            patient: The listener can wait while all other listeners :meth:`rest`.
+            patient: Whether the listener can wait. If all listeners can, the wake-ups pause.
 
         """
         wake_up = self._wake_ups.get(block.section)
@@ -167,14 +167,14 @@ class BatchReader:
         passes: Callable[[], bool] | None = None,
         patient: bool = False,
     ) -> None:
-        """Prepare to read; :meth:`start` starts.
+        """Prepare to read. :meth:`start` starts reading.
 
         Args:
             block: The block to read.
             wake_ups: Wakes this reader.
             read: Reads a batch, and returns whether more is waiting.
-            passes: Returns whether to read nothing now. Then the reader is patient until
-                :meth:`resume`. None: it reads at each wake-up.
+            passes: Returns whether to read nothing now. If it returns True, the reader is patient
+                until :meth:`resume`. None: the reader reads at each wake-up.
             patient: See :meth:`WakeUps.join`.
 
         """
@@ -221,7 +221,7 @@ class BatchReader:
             self._loop.call_soon(self._look_again)
 
     def resume(self) -> None:
-        """End the patience of the reader: it reads at each wake-up again."""
+        """Make the reader read at each wake-up again, because it is no longer patient."""
         self._wake_ups.resume(self._block, self.look)
 
     def _look_again(self) -> None:

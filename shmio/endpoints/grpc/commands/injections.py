@@ -119,7 +119,7 @@ class InjectionFollowers:
 
 
 class InjectionBase:
-    """The image that an injection replaces: the source's image with the inner injections applied."""
+    """The image that an injection replaces: the source's image with inner injections applied."""
 
     def __init__(self, block: Block, image: bytes = b"") -> None:
         """Begin without inner injections.

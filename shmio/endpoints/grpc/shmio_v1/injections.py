@@ -199,7 +199,7 @@ class InjectCall(InjectionFollower):
         self._wake_ups = wake_ups
         self._lay = lay
         self.over = ""
-        """Why the call has to end: another client lifted the injection, or the client does not read.
+        """Why the call has to end: another client lifted the injection, or this one does not read.
 
         Empty if the call need not end.
         """

@@ -35,13 +35,13 @@ class ReplayCalls:
     async def replay(self, request: wire.ReplayRequest, context: Context) -> wire.ReplayResponse:
         """Control the replays, or return their status.
 
-        Calls are carried out one at a time. A search ends when its call ends.
+        The endpoint carries out one call at a time. The end of a call also ends its search.
 
         Statuses:
             INVALID_ARGUMENT: The speed or a time is not valid.
             NOT_FOUND: There is no such source or register.
-            FAILED_PRECONDITION: Nothing is replayed, the search finds nothing, or a source does not
-                answer.
+            FAILED_PRECONDITION: No source replays a recording, the search finds nothing, or a source
+                does not answer.
         """
         try:
             wanted = _wanted(request)

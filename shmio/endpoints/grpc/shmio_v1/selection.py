@@ -28,13 +28,13 @@ MAX_MATCHES: Final = 1_000_000
 So many comparisons take a few seconds.
 """
 MAX_ALL_ELEMENTS: Final = 1 << 22
-"""Maximum number of elements of all clients together; equal patterns count once."""
+"""Maximum number of elements of all clients together. Equal patterns count once."""
 KEPT: Final = 16
 """Number of unused views that are cached, for clients that read repeatedly."""
 
 
 class SourceDirection(NamedTuple):
-    """The values of a source; with ``inward``, the writes to it."""
+    """The values of a source, or with ``inward`` the writes to the source."""
 
     source: str
     inward: bool = False
@@ -73,7 +73,7 @@ class Selections:
             )
         if len(patterns) > MAX_PATTERNS:
             raise ValueRangeError(
-                f"{len(patterns)} patterns, at most {MAX_PATTERNS} are allowed: use stars or structures"
+                f"{len(patterns)} patterns are given, at most {MAX_PATTERNS} are allowed: use stars or structures"
             )
         wanted: dict[SourceDirection, dict[Topic, None]] = {}
         for pattern in patterns:
@@ -113,7 +113,7 @@ class Selections:
         return views
 
     async def registers(self, wanted: TopicsBySource) -> Selection:
-        """Return the view of a single source; without topics, the view has no registers."""
+        """Return the view of a single source. Without topics, the view has no registers."""
         ((place, topics),) = wanted.items()
         if not topics:
             block = self._topics.feed(place.source).block
@@ -129,7 +129,7 @@ class Selections:
         Args:
             place: The source and direction.
             topics: The topics; empty for raw frames.
-            budget: What the call may still use.
+            budget: How much the call may still request.
 
         """
         block = self._topics.feed(place.source).block
@@ -188,13 +188,13 @@ class _Budget:
         """Count the comparisons of a star pattern.
 
         Raises:
-            ValueRangeError: There are too many.
+            ValueRangeError: There are too many comparisons.
 
         """
         self.matches -= registers
         if self.matches < 0:
             raise ValueRangeError(
-                f"patterns with stars need more than {MAX_MATCHES} comparisons: use fewer of them, or name structures"
+                f"the patterns with stars need more than {MAX_MATCHES} comparisons: use fewer stars, or name structures"
             )
 
 

@@ -78,7 +78,7 @@ class ShmioV1:
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """Return the handlers of the service's calls.
 
-        Most calls serialise their messages themselves.
+        Most handlers return serialised messages.
         """
         unary, streaming = grpc.unary_unary_rpc_method_handler, grpc.unary_stream_rpc_method_handler
         calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
@@ -111,7 +111,7 @@ class ShmioV1:
         return _status(self._segment)
 
     async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
-        """Return the present values; those of one source come from one frame.
+        """Return the present values. The values of one source come from one frame.
 
         Statuses:
             NOT_FOUND: There is no such register.

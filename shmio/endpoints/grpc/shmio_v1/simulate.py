@@ -1,4 +1,4 @@
-"""The call Simulate: a model in a remote program computes a source, step by step."""
+"""The call Simulate: a model in a remote program computes a source's values, step by step."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 
 class OutputEncoder:
-    """Encodes the outputs of a model into an image of the block; caches lookups of slots and paths."""
+    """Encodes the outputs of a model into an image of the block. It caches lookups."""
 
     def __init__(self, selection: Selection) -> None:
         self._selection = selection
@@ -56,9 +56,11 @@ class OutputEncoder:
             most = columns.sizes[column]
             slots = np.fromiter(part.slots or range(most), np.int64)
             if len(slots) != len(part.values):
-                raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
+                raise ValueRangeError(f"{name}: {len(part.values)} values are given for {len(slots)} slots")
             if len(slots) > max(1, most):  # otherwise one message could delay all clients
-                raise ValueRangeError(f"{name}: {len(slots)} values, the table has {most}: give each once")
+                raise ValueRangeError(
+                    f"{name}: {len(slots)} values are given, but the table has {most}: give each value once"
+                )
             if len(wrong := np.flatnonzero(slots >= most)):
                 raise ValueRangeError(f"{name}: the table has no slot {slots[wrong[0]]}")
             left = np.arange(len(slots))
@@ -76,10 +78,12 @@ class OutputEncoder:
 
         """
         if len(assignments) > (most := self._selection.elements):
-            raise ValueRangeError(f"assignments: {len(assignments)} values, the table has {most}: give each once")
+            raise ValueRangeError(
+                f"assignments: {len(assignments)} values are given, but the table has {most}: give each value once"
+            )
         if len(assignments) > MAX_VALUES:  # because each is encoded by itself
             raise ValueRangeError(
-                f"assignments: {len(assignments)} values, at most {MAX_VALUES} are allowed by path: give them by slots"
+                f"assignments: {len(assignments)} values are given by path, at most {MAX_VALUES} are allowed: use slots"
             )
         order = self._selection.block.layout.byte_order
         async for assignment in time_sliced(assignments):
@@ -152,7 +156,7 @@ class SimulateCalls:
             NOT_FOUND: There is no such source.
             FAILED_PRECONDITION: The source does not accept models.
             ALREADY_EXISTS: Another model has joined the source.
-            INVALID_ARGUMENT: The client does not join, or answers a step that is not pending.
+            INVALID_ARGUMENT: The first message does not join, or a message answers no pending step.
             UNAVAILABLE: A reload has changed the source.
         """
         taking: asyncio.Task[None] | None = None
@@ -179,7 +183,7 @@ class SimulateCalls:
             await refuse(context, simulation.failure)
 
     async def _joining(self, requests: AsyncIterator[wire.SimulateRequest], peer: str) -> SimulateCall:
-        """Read the first message.
+        """Read the first message, and return its call.
 
         Raises:
             PathError: There is no such source.
@@ -192,13 +196,13 @@ class SimulateCalls:
             if request.WhichOneof("what") == "join":
                 block, name = self._block(request.join.source), request.join.name or peer
                 if len(name.encode()) > MAX_NAME_BYTES:
-                    raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes")
+                    raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes are allowed")
                 if before := self._open.get(block.section):
                     raise ConflictError(_taken(block, before.name, before.peer))
                 simulation = self._open[block.section] = SimulateCall(block, self._segment, printable(name), peer)
                 return simulation
             break
-        raise ValueRangeError("the first message of Simulate joins, all others answer steps")
+        raise ValueRangeError("the first message of Simulate must join a source, all others answer steps")
 
     def _block(self, source: str) -> Block:
         if source not in self._feeds:
@@ -232,18 +236,18 @@ class SimulateCalls:
         for simulation in self._open.values():
             if simulation.block.retired:
                 source = simulation.block.source
-                simulation.end(SegmentError(f"{source} was changed or removed by a reload: join again"))
+                simulation.end(SegmentError(f"{source}: a reload changed or removed this source: join again"))
 
 
 class SimulateCall:
-    """A Simulate call: a model that computes a source."""
+    """A Simulate call, whose client is the model of a source."""
 
     def __init__(self, block: Block, segment: Segment, name: str, peer: str) -> None:
         self.block = block
         self.name = name
         self.peer = peer
         self.failure: ShmioError | None = None
-        """The error that ended the call; None: there is none to report."""
+        """The error that ended the call; None if no error ended it."""
         self._segment = segment
         self._joined = False
         self._over = False
@@ -258,14 +262,14 @@ class SimulateCall:
     @property
     def _link(self) -> ModelChannel:
         if self.block.model_channel is None:
-            raise SegmentError(f"{self.block.source}: its block has no link to a model")
+            raise SegmentError(f"{self.block.source}: the source's block has no link to a model")
         return self.block.model_channel
 
     async def join(self) -> bytes:
-        """Join the model channel of the source; return the first message.
+        """Join the model channel of the source, and return the first message.
 
         Raises:
-            ConflictError: Another model has joined.
+            ConflictError: Another model has joined the source.
             ValueRangeError: The source has too many registers or elements.
 
         """
@@ -322,7 +326,7 @@ class SimulateCall:
         """Return the step that the source waits for.
 
         Returns:
-            The step, or None if there is none, or if the model has it already.
+            The step; None if there is none, or if the model already has it.
 
         """
         link = self._link
@@ -332,7 +336,7 @@ class SimulateCall:
         return ask if ask.until_ns > time.monotonic_ns() else None
 
     def _work(self, ask: ModelRequest) -> bytes:
-        """Return a serialised ``Do``: at first with all inputs, later with the changed ones."""
+        """Return a serialised ``Do``. The first has all inputs; the others have changed inputs."""
         before, now = self._given, self._inputs.columns.decode(ask.commanded)
         self._given = now
         work = wire.Do(
@@ -355,7 +359,7 @@ class SimulateCall:
         """
         async for request in requests:
             if request.WhichOneof("what") != "done":
-                raise ValueRangeError("a model joins once, by the first message; all others answer steps")
+                raise ValueRangeError("only the first message joins a source; all others must answer steps")
             await self._take(request.done)
         self.end()
 
@@ -369,7 +373,7 @@ class SimulateCall:
         ask = self._asked
         if ask is None or done.step != ask.step:
             asked = "no step is pending" if ask is None else f"step {ask.step} is pending"
-            raise ValueRangeError(f"an answer to step {done.step}, but {asked}")
+            raise ValueRangeError(f"the model answered step {done.step}, but {asked}")
         self._refused = ""
         image = bytearray(ask.shown if self._image is None else self._image)
         failure = " ".join(done.failure.split()) if done.HasField("failure") else None

@@ -41,7 +41,7 @@ BATCH_BYTES: Final = 1 << 18
 BATCH_UPDATES: Final = 256
 """Maximum number of updates in one message.
 
-So many take some milliseconds to make. Then other tasks run.
+It takes some milliseconds to make that many. Then other tasks run.
 """
 MAX_RATE_HZ: Final = 1e6
 
@@ -53,7 +53,9 @@ TABLES, UPDATES, ENDED, STEP = (
 def check(request: wire.SubscribeRequest) -> None:
     """Raise ValueRangeError if options are not valid or exclude each other."""
     if request.mode not in wire.Mode.values() or request.format not in wire.Format.values():
-        raise ValueRangeError(f"mode {request.mode}, format {request.format}: this version supports 0 and 1 for each")
+        raise ValueRangeError(
+            f"mode {request.mode}, format {request.format}: this version supports only 0 and 1 for each"
+        )
     for name, value, most in (
         ("max_rate_hz", request.max_rate_hz, MAX_RATE_HZ),
         ("deadband", request.deadband, math.inf),
@@ -63,25 +65,25 @@ def check(request: wire.SubscribeRequest) -> None:
                 f"{name}: {value} is not a number from 0 on{'' if math.isinf(most) else f', at most {most:g}'}"
             )
     if request.mode == wire.MODE_EVERY_FRAME and (request.max_rate_hz or request.deadband):
-        raise ValueRangeError("max_rate_hz and deadband are only for the mode LATEST")
+        raise ValueRangeError("max_rate_hz and deadband are allowed only in the mode LATEST")
     if request.format == wire.FORMAT_FRAMES and request.deadband:
-        raise ValueRangeError("deadband is for the format VALUES")
+        raise ValueRangeError("deadband is allowed only with the format VALUES")
 
 
 class BlockUpdates(Protocol):
-    """Makes the updates of one block for one subscriber; the ring in shared memory is the queue."""
+    """Makes the updates of one block for one subscriber. The ring in shared memory is the queue."""
 
     view: View
     follower: FrameFollower
     due_s: float
-    """Time of the next possible update, by the event loop's clock; infinite: it needs a new frame."""
+    """Event loop's time of the next possible update, in s; infinite: at the next new frame."""
 
     def next(self, now_s: float) -> bytes | None:
-        """Return the next serialised ``Update``, or None."""
+        """Return the next serialised ``Update``, or None if there is none yet."""
 
 
 class EveryFrame:
-    """Makes an update of every frame from the present one on; counts frames that were overwritten."""
+    """Makes an update of every frame from the present frame on. Counts overwritten frames."""
 
     due_s = math.inf
 
@@ -103,7 +105,7 @@ class EveryFrame:
 
 
 class LatestFrame:
-    """Makes updates of the newest frame if it has changes, at most one per interval."""
+    """Makes updates of the newest frame if it has changes, at most one update per interval."""
 
     def __init__(self, view: View, interval_s: float, deadband: float) -> None:
         self.view = view
@@ -116,7 +118,7 @@ class LatestFrame:
         self._sent: Frame | None = None  # that of the last update; only if registers have statuses
 
     def next(self, now_s: float) -> bytes | None:
-        """Return the changes of the newest frame, or an update that reports the last one as stale."""
+        """Return the changes of the newest frame, or an update that reports it as stale."""
         follower = self.follower
         shown = follower.frame
         if shown is not None and not follower.behind:
@@ -154,7 +156,7 @@ class LatestFrame:
 
 
 def _stale_update(view: View, follower: FrameFollower) -> bytes | None:
-    """Return an update if the last frame has become stale since, or None."""
+    """Return an update if the last frame has become stale since it was sent, otherwise None."""
     frame = follower.frame
     if frame is None or not follower.became_stale():
         return None
@@ -166,7 +168,7 @@ def _state(frame: Frame) -> tuple[object, ...]:
 
 
 class WriteFollower:
-    """Follows the writes to a table for one subscriber, in a queue that drops none."""
+    """Follows the writes to a table for one subscriber. Its queue drops no write."""
 
     def __init__(self, writes: WriteUpdates, commands: CommandClient, ring: Callable[[], None]) -> None:
         """Begin to follow the writes.
@@ -178,7 +180,7 @@ class WriteFollower:
 
         """
         self.failure = ""
-        """Why writes are missing; empty if none are."""
+        """Reason why writes are missing; empty if none are missing."""
         self._writes = writes
         self._commands = commands
         self._ring = ring
@@ -191,11 +193,11 @@ class WriteFollower:
 
     @property
     def waits(self) -> bool:
-        """True if an update waits."""
+        """True if an update waits in the queue."""
         return bool(self._waiting)
 
     def next(self) -> bytes | None:
-        """Return the next serialised ``Update``, or None."""
+        """Return the next serialised ``Update``, or None if there is none yet."""
         return self._waiting.pop() if self._waiting else None
 
     def accept(self, event: Event) -> None:
@@ -206,7 +208,7 @@ class WriteFollower:
             self._ring()
 
     def fail(self, reason: str) -> None:
-        """Fail because writes are missing: discard the queue, and stop following."""
+        """Discard the queue and stop following, because writes are missing."""
         self.failure = self.failure or reason
         self._waiting = SendQueue()
         self.leave()
@@ -248,7 +250,7 @@ class SubscribeCall:
         self._clock = asyncio.get_running_loop().time
 
     async def open(self) -> bytes:
-        """Start following all blocks; return the tables.
+        """Start following all blocks, and return the tables.
 
         Raises:
             PathError: There is no such register.
@@ -270,7 +272,7 @@ class SubscribeCall:
     def give_up(self) -> None:
         """End a call that is too slow for the steps.
 
-        It leaves its blocks now. The stream ends when the client reads.
+        The call stops following its blocks now. The stream ends when the client reads.
         """
         self.late = True
         self.close()
@@ -289,7 +291,7 @@ class SubscribeCall:
         """Queue the marker of a step, which is sent after the changes of the step.
 
         Returns:
-            A future that is done when the marker was sent or the call has ended. Before
+            A future that is done when the marker has been sent or the call has ended. Until
             :meth:`open` has returned, which takes seconds for a large layout, it is done at once.
 
         """
@@ -331,7 +333,7 @@ class SubscribeCall:
         raise EndpointError("the client did not read a step in time: it is too slow for the rate of steps")
 
     def _batch(self) -> tuple[bytes, bool]:
-        """Return the updates that are waiting, up to a limit, and whether these are all.
+        """Return waiting updates up to a limit, and whether no more updates wait.
 
         Writes come first. Then the blocks take turns.
         """
@@ -383,9 +385,9 @@ class SubscribeCall:
             handle.cancel()
 
     async def _go_over(self, place: SourceDirection) -> bytes:
-        """Follow the new block of a source, or report that the source has none.
+        """Follow the new block of a source, or report that a reload has removed the source.
 
-        Call this when all updates of the old block were sent.
+        Call this when all updates of the old block have been sent.
         """
         self._leave(place)
         try:
@@ -425,12 +427,12 @@ def _set(sent: asyncio.Future[None]) -> None:
 
 
 class SubscribeCalls:
-    """Serves the call Subscribe; passes steps and reloads on to all open calls."""
+    """Serves the call Subscribe, and passes steps and reloads on to all open calls."""
 
     def __init__(
         self, selections: Selections, wake_ups: WakeUps, timeline: Timeline, open_streams: OpenStreams
     ) -> None:
-        """Create the call.
+        """Create the handler of the call.
 
         Args:
             selections: Makes and caches the views of all clients.
@@ -466,13 +468,15 @@ class SubscribeCalls:
 
         Statuses:
             NOT_FOUND: There is no such register.
-            INVALID_ARGUMENT: There are too many registers, or options are not valid.
+            INVALID_ARGUMENT: There are too many registers, or an option is not valid.
             RESOURCE_EXHAUSTED: There are too many streams, all clients together use too many
                 registers, or the client is too slow for the steps or the writes.
         """
         try:
             if len(self._open) >= MAX_STREAMS:
-                raise EndpointError(f"{MAX_STREAMS} calls of Subscribe are open, the maximum: one takes many patterns")
+                raise EndpointError(
+                    f"{MAX_STREAMS} calls of Subscribe are open, the maximum: one call can have many patterns"
+                )
             subscription = SubscribeCall(self._selections, self._wake_ups, self._virtual_time, request)
         except ShmioError as error:
             await refuse(context, error)

@@ -1,4 +1,4 @@
-"""Tables of registers: make updates of a block's frames and writes, packed by type.
+"""Tables of registers, which make updates from a block's frames and writes, packed by type.
 
 A table of registers is a view of a block; raw frames are the other kind of view. Numpy packs an
 image into one array for each type, and compares two images. All subscribers to a table share its
@@ -109,8 +109,8 @@ class _SingleElement:
 class _SingleValues(NamedTuple):
     """Values of the elements that are decoded one by one.
 
-    ``invalid`` has the indices of the elements without a valid value, ``places`` those of their
-    registers.
+    ``invalid`` has the indices of the elements without a valid value. ``places`` has the indices of
+    these elements' registers.
     """
 
     numbers: Mapping[Column, Mapping[int, Any]]
@@ -176,7 +176,7 @@ class Columns:
 
     @cached_property
     def _starts(self) -> Mapping[Column, tuple[list[int], list[int]]]:
-        """For each column, the first slots of its registers in ascending order, and their indices."""
+        """For each column: the ascending first slots of its registers, and the registers' indices."""
         found: dict[Column, tuple[list[int], list[int]]] = {column: ([], []) for column in Column}
         for place, (column, slot) in sorted(enumerate(self.places), key=lambda pair: pair[1][1]):
             found[column][0].append(slot)
@@ -208,7 +208,7 @@ class Columns:
         """Encode values at valid slots into an image.
 
         Returns:
-            Indices into ``slots`` of the values that were not encoded: they do not fit, or they
+            Indices into ``slots`` of the values that were not encoded, because they do not fit or
             need their own encoder.
 
         """
@@ -267,10 +267,10 @@ class Columns:
 
 
 def pack(new: DecodedImage, old: DecodedImage | None = None, deadband: float = 0.0) -> bytes:
-    """Serialise as ``Values`` the elements whose bits differ from ``old``, or all without ``old``.
+    """Serialise as ``Values`` the elements whose bits differ from ``old``.
 
-    Numbers that differ by no more than ``deadband`` are left out. The result is empty if nothing
-    differs.
+    Without ``old``, serialise all elements. Numbers that differ by no more than ``deadband`` are
+    left out. The result is empty if nothing differs.
     """
     parts = []
     for column, values in new.arrays.items():
@@ -319,7 +319,7 @@ def merge(new: DecodedImage, old: DecodedImage, deadband: float) -> DecodedImage
 
 
 def _differing(column: Column, old: Array, new: Array, deadband: float) -> Array:
-    """Return the slots whose bits differ: so NaN equals NaN, and 0.0 differs from -0.0."""
+    """Return the slots whose bits differ. By bits, NaN equals NaN, and 0.0 differs from -0.0."""
     differs = old.view(_BITS[column]) != new.view(_BITS[column])
     if deadband and column is not Column.BOOL:
         with np.errstate(invalid="ignore", over="ignore"):
@@ -356,13 +356,13 @@ class UpdateMessage(NamedTuple):
     changed: bool
     """True if there are other changes than those of source times.
 
-    A receiver of the newest values gets these with the next update: there would be one for each
-    frame otherwise.
+    A receiver of the newest values gets new source times only with the next other change. Otherwise
+    it would get an update for each frame.
     """
 
     @property
     def whole(self) -> bytes:
-        """Both parts."""
+        """The whole message: both parts."""
         return self.head + self.body
 
 
@@ -401,11 +401,11 @@ class WriteUpdates:
         self._update = b""
 
     def of(self, event: Event) -> bytes:
-        """Return the serialised ``Update`` of an accepted write, or nothing if the table lacks it.
+        """Return the serialised ``Update`` of an accepted write.
 
-        If an element is written in part, the rest of its value comes from the frame before the
-        command. If the command's next event completes the element, only the update of that event
-        has it.
+        It is empty if the write changes no register of the table. If a command writes only a part
+        of an element, the rest of its value comes from the frame before the command. If the
+        command's next event completes the element, only the update of that event has the element.
         """
         if event.number != self._event:
             self._event, self._update = event.number, self._make(event)
@@ -432,9 +432,9 @@ class WriteUpdates:
 
 
 class Selection:
-    """A table of registers of one block; makes updates of frames, once for all subscribers.
+    """A table of registers of one block. It makes updates of frames, once for all subscribers.
 
-    After it was created, use it only in the event loop's thread.
+    After its creation, use it only in the event loop's thread.
     """
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], *, inward: bool = False) -> None:
@@ -444,7 +444,7 @@ class Selection:
             number: Number of the table.
             block: The block of the registers.
             registers: The registers of the table.
-            inward: The table is for writes to the registers.
+            inward: Whether the table is for writes to the registers.
 
         """
         self.number = number
@@ -488,15 +488,15 @@ class Selection:
         return found
 
     def update(self, frame: Frame, before: Frame | None = None, sent: Frame | None = None) -> UpdateMessage:
-        """Return an ``Update`` with the changes since ``before``, or with everything. It is cached.
+        """Return an ``Update`` with the changes since ``before``, or with all values.
 
-        Its quality is the one that the frame was published with.
+        The update is cached. It has the quality with which the frame was published.
 
         Args:
             frame: The new frame.
-            before: The last frame that was compared; None: the update has everything.
-            sent: The frame of the last update that was sent, whose source times the receiver has;
-                default: ``before``.
+            before: The last frame that was compared; None: the update has all values.
+            sent: The frame of the last update that was sent; default: ``before``. The receiver has
+                the source times of this frame.
 
         """
         if before is not None and not before.source_ns:
@@ -554,9 +554,9 @@ class Selection:
         return UpdateMessage(head(self.number, frame, whole=before is None), b"".join(parts), changed)
 
     def statuses(self, frame: Frame, sent: Frame | None) -> StatusChanges:
-        """Return the statuses of a frame that differ from those of the last frame that was sent.
+        """Return the statuses of a frame that differ from those of the frame ``sent``.
 
-        Without such a frame, return all.
+        If ``sent`` is None, return all statuses.
         """
         area = self.block.statuses
         if area is None:
@@ -592,7 +592,7 @@ class Selection:
     def injected(self, frame: Frame) -> Array:
         """Return the indices of the registers that an injection over ``/out`` covers.
 
-        The result is cached for each event.
+        The result is cached, because it changes only with an event.
         """
         if frame.effective is None:
             return _NO_PLACES
@@ -615,7 +615,7 @@ class Selection:
 
     @cached_property
     def _extents(self) -> tuple[Array, ...]:
-        """For each register, its first byte, the byte after its last, and the mask of a single bit."""
+        """For each register: its first byte, the byte after its last, the mask of a single bit."""
         starts = [register.offset for register in self.registers]
         stops = [register.offset + register.size for register in self.registers]
         masks = [0 if register.bit is None or register.dims else 1 << register.bit for register in self.registers]

@@ -48,19 +48,19 @@ class WriteCalls:
         return {"Write": grpc.unary_unary_rpc_method_handler(self.write, request, response)}
 
     async def write(self, request: wire.WriteRequest, context: Context) -> wire.WriteResponse:
-        """Write registers of one source, all or none; return the outcome of each.
+        """Write registers of one source, all or none, and return the outcome of each.
 
-        After an error status nothing was sent.
+        If the call ends with an error status, nothing was sent.
 
         Statuses:
             NOT_FOUND: There is no such register.
-            INVALID_ARGUMENT: A value does not fit, there are too many values, or they are for
+            INVALID_ARGUMENT: A value does not fit, there are too many values, or the values are for
                 several sources.
             FAILED_PRECONDITION: A register is not writable, or the source does not answer.
         """
         try:
             if request.timeout_ms > MAX_TIMEOUT_MS:
-                raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS}, a day")
+                raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS} (a day) is allowed")
             source, values = await assigned(request.values, self._topics)
             timeout_s = request.timeout_ms / 1000 or None
             commands = self._topics.feed(source).commands
@@ -83,14 +83,14 @@ async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, obj
 
     Raises:
         PathError: There is no such register.
-        ValueRangeError: A value does not fit, there are none or too many, or they are for several
-            sources.
+        ValueRangeError: A value does not fit, there are no values or too many, or the values are
+            for several sources.
         CommandError: A path ends in ``/out``.
 
     """
     if len(assignments) > MAX_VALUES:  # checked before any value is read
         raise ValueRangeError(
-            f"{len(assignments)} values, at most {MAX_VALUES} are allowed: write whole arrays, or fewer at once"
+            f"{len(assignments)} values are given, at most {MAX_VALUES} are allowed: write whole arrays or fewer values"
         )
     values: dict[str, object] = {}
     sources: dict[str, None] = {}
@@ -100,7 +100,7 @@ async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, obj
         if topic.direction == "out":
             raise CommandError(f"{shorten(assignment.path)}: an output of a source cannot be written; leave out /out")
         if register.path in values:
-            raise ValueRangeError(f"{shorten(assignment.path)}: given twice")
+            raise ValueRangeError(f"{shorten(assignment.path)}: this path is given twice")
         values[register.path] = plain(assignment.value, register)
         sources[topic.source] = None
     if not values:
@@ -136,9 +136,9 @@ def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
         part = getattr(values, name)
         slots = part.slots or range(selection.columns.sizes[column])
         if len(slots) != len(part.values):
-            raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
+            raise ValueRangeError(f"{name}: {len(part.values)} values are given for {len(slots)} slots")
         if len(found) + len(slots) > MAX_VALUES:
-            raise ValueRangeError(f"more than {MAX_VALUES} values: send fewer at once")
+            raise ValueRangeError(f"more than {MAX_VALUES} values are given: send fewer at once")
         for slot, value in zip(slots, part.values, strict=True):
             found[_path(selection, column, slot)] = value
     return found

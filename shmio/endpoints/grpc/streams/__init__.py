@@ -1,1 +1,1 @@
-"""From a block's frames to clients' streams: feeds, conflation, and back-pressure."""
+"""The way from a block's frames to clients' streams: feeds, conflation, and back-pressure."""

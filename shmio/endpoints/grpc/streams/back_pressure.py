@@ -1,4 +1,4 @@
-"""Back-pressure: limits what waits for clients, and skips frames if all clients are busy."""
+"""Back-pressure: limits the messages that wait for clients, and skips frames if all are busy."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from typing import Final, Protocol
 from shmio.segment import Block, FrameFollower
 
 WINDOW_S: Final = 0.25
-"""Period for which a client's lost values are compared with the values offered to it."""
+"""Period for which a client's lost values are compared with those offered to it, in s."""
 BEHIND_S: Final = 5.0
-"""A client that is far behind gets another chance at the next multiple of this time.
+"""A client that is far behind gets another chance at the next multiple of this time, in s.
 
 The values that it loses while it is behind do not show how fast it could be. All clients get their
-chance at the same time, because a frame that is read for one of them is available to all.
+chance at the same time, because a frame that is read for one client is available to all.
 """
 PART: Final = 3
-"""A client that loses more than one in this many values is far behind."""
+"""A client that loses more than one value in this number of values is far behind."""
 LATE_S: Final = 0.002
-"""A value for a client that is far behind is dropped after this time, if there is a newer one."""
+"""Time in s after which a newer value replaces a waiting value, if the client is far behind."""
 
 
 class LossMonitor:
-    """Decides by the values that a client loses whether the client is far behind.
+    """Decides whether a client is far behind, by the number of values that it loses.
 
-    Times are in s, of any clock.
+    Times are in s, by any clock.
     """
 
     def __init__(self) -> None:
         self.behind = False
-        """True if the client is far behind: if values were queued, they would only reach it later."""
+        """True if the client is far behind. Queued values would only reach it later."""
         self._offered = 0
         self._lost = 0
         self._until_s = 0.0
 
     def offer(self, now_s: float) -> None:
-        """Count one value for the client; at the end of a period, decide again."""
+        """Count one value offered to the client. At the end of a period, decide again."""
         if now_s >= self._until_s:
             self.behind = not self.behind and PART * self._lost > self._offered
             self._offered = self._lost = 0
@@ -45,19 +45,19 @@ class LossMonitor:
         self._offered += 1
 
     def lose(self, count: int) -> None:
-        """Count values that were dropped because there were newer ones."""
+        """Count values that were dropped because newer values replaced them."""
         self._lost += count
 
     def skip(self, count: int) -> None:
-        """Count values that were never queued, as offered and as lost."""
+        """Count values that were never queued. They count as offered and as lost."""
         self._offered += count
         self._lost += count
 
 
 BOUND_BYTES: Final = 8 << 20
-"""Maximum size of the values, and of the events, that wait in one stream."""
+"""Maximum size of the values that wait in one stream, in bytes, and the same for its events."""
 TOTAL_BYTES: Final = 256 << 20
-"""Maximum size of all messages that wait in all streams; beyond it, each stream has an equal share."""
+"""Maximum size of all waiting messages, in bytes. Above it, each stream has an equal share."""
 
 
 class TotalBacklog:
@@ -68,7 +68,7 @@ class TotalBacklog:
         self.streams = 0
 
     def over(self, size: int) -> bool:
-        """Return whether the total is too large and a stream of ``size`` bytes exceeds its share."""
+        """Return whether the total is too large, and a stream's ``size`` bytes exceed its share."""
         return self.size > TOTAL_BYTES and size > TOTAL_BYTES // max(1, self.streams)
 
 
@@ -104,14 +104,14 @@ class Backlog:
 CATCH_UP_FRAMES: Final = 48
 """A feed that is further behind than this, or has no listeners, skips to the newest frame.
 
-The limit is a number of frames: an outbox has room for so many. Frames for which the clients are
-too slow wait in the ring. The MQTT bridge has a time limit instead, because it falls behind only if
-it is delayed itself.
+The limit is a number of frames, because an outbox has room for that many. Frames that are too fast
+for the clients wait in the ring. The MQTT bridge has a time limit instead, because it falls behind
+only if it is delayed itself.
 """
 FEW_FRAMES: Final = 8
-"""Number of new frames that a client far behind gets at once, so that it need not wait for more."""
+"""Number of new frames that a client far behind gets at once, before it has to wait for more."""
 LOOK_S: Final = 0.02
-"""Longest time between two reads while all clients are busy; the quality may have turned bad."""
+"""Longest time between two reads while all clients are busy, in s. The quality may turn bad."""
 
 
 class Stream(Protocol):
@@ -122,14 +122,14 @@ class Stream(Protocol):
 
     @property
     def busy(self) -> bool:
-        """True if messages wait, or if the client has not taken the last one yet."""
+        """True if messages wait, or if the client has not taken the last message yet."""
 
     @property
     def behind(self) -> bool:
         """True if the client loses so many values that it is far behind."""
 
     def skip(self, frames: int, topics: int) -> None:
-        """Count frames that were not delivered to ``topics`` topics of a slow client."""
+        """Count frames of ``topics`` topics that were not delivered to a slow client."""
 
 
 class BackPressure:
@@ -169,8 +169,8 @@ class BackPressure:
     def passes(self) -> bool:
         """Return whether the feed should read nothing now, because all streams are busy.
 
-        A busy stream calls ``refill`` later. When the last read was more than ``LOOK_S`` ago, the
-        answer is False.
+        A busy stream calls ``refill`` later. If the last read was more than ``LOOK_S`` ago, return
+        False.
         """
         if not self._streams:
             return False

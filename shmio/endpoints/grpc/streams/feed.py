@@ -42,7 +42,7 @@ class VirtualTime:
     def __init__(self) -> None:
         self.on = False
         self.look: Callable[[], object] = lambda: None
-        """Adopts the steps that other programs have made; the timeline sets this function."""
+        """Function that adopts the steps that other programs have made. The timeline sets it."""
         self.moment = Moment(0, 0)
 
 
@@ -69,11 +69,11 @@ class Listener(Protocol):
         """Queue a message of a step, which must not be dropped."""
 
     def lose(self) -> None:
-        """Drop the messages that were not sent yet, because the quality has turned bad."""
+        """Drop the messages that have not been sent yet, because the quality has turned bad."""
 
 
 class _Channel:
-    """A subject that has listeners: encodes its value, and knows who gets it."""
+    """A subject with its listeners. It encodes the subject's value once for all of them."""
 
     def __init__(self, subject: Subject, slot: int, statuses: StatusArea | None) -> None:
         """Create a channel without listeners.
@@ -95,7 +95,7 @@ class _Channel:
 
 
 class _ChannelTable(NamedTuple):
-    """All channels of a block, and the scan that finds the changed ones."""
+    """All channels of a block, and the scan that finds those whose bytes have changed."""
 
     slots: tuple[_Channel | None, ...]
     scan: ChangeScan
@@ -104,7 +104,7 @@ class _ChannelTable(NamedTuple):
 
     @classmethod
     def of(cls, channels: Collection[_Channel], slots: int) -> _ChannelTable:
-        """Build the table of these channels; ``slots`` is its length, and some slots may be free."""
+        """Build the table of these channels. It has ``slots`` slots, some of which may be free."""
         places: list[_Channel | None] = [None] * slots
         for channel in channels:
             places[channel.slot] = channel
@@ -120,8 +120,8 @@ class Feed:
     """Delivers the changes of one block's registers to listeners, while the quality is good.
 
     After bad quality, the feed delivers every register again. In virtual time, the feed of a block
-    on the instance's clock is *held*: only :meth:`step` delivers. Use it only in the event loop's
-    thread.
+    on the instance's clock is *held*: only :meth:`step` delivers values. Use it only in the event
+    loop's thread.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class Feed:
     def release(self) -> None:
         """Deliver every frame again.
 
-        The newest one comes first, as it may be newer than the last step.
+        The newest frame comes first, because it may be newer than the last step.
         """
         if not self._held:
             return
@@ -235,9 +235,9 @@ class Feed:
         self._settle()
 
     def step(self) -> None:
-        """Deliver the changes of a step: where the newest frame differs from the last delivery.
+        """Deliver the changes of a step, which are the differences since the last delivery.
 
-        They are in the order of the block's registers.
+        They come in the order of the block's registers.
 
         Raises:
             SegmentError: No frame can be read.
@@ -263,7 +263,7 @@ class Feed:
                 listener.keep(message)
 
     def _adopt(self, frame: Frame | None) -> None:
-        """Deliver the first good image, if no step was delivered yet."""
+        """Deliver the first good image, if no step has been delivered yet."""
         if self._held and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
             self._shown = DeliveredImage(*self._virtual_time.moment, frame.image, frame.raw)
             self._settle()
@@ -287,14 +287,14 @@ class Feed:
         self._owed.clear()
 
     def _turn_bad(self, frame: int) -> None:
-        """Drop the listeners' values from before ``frame``: from that frame on, the quality is bad."""
+        """Drop listeners' values from before ``frame``, because the quality is bad from it on."""
         self._shown = None
         for channel in self._channels.values():
             self._lose(channel, frame)
         self._tell(good=False)
 
     def _lose(self, channel: _Channel, frame: int) -> None:
-        """Drop the values from before ``frame`` that wait in a channel's streams: they are no longer valid."""
+        """Drop values from before ``frame`` in a channel's streams. They are no longer valid."""
         for listener in channel.listeners:
             if listener.since < frame:
                 listener.lose()
@@ -310,14 +310,14 @@ class Feed:
         return not self._held and self._back_pressure.passes()
 
     def _refill(self) -> None:
-        """Continue to read, because a busy stream can take more again."""
+        """Continue to read, because a stream that was busy can take more values."""
         if self._reader.alive:
             self._reader.read()
             if not self._back_pressure.passes():
                 self._reader.resume()
 
     def _read(self) -> bool:
-        """Read a few new frames; if there are none, check the age of the last one."""
+        """Read a few new frames. If there are none, check the age of the last frame."""
         follower = self._follower
         if not self._held:  # a held feed delivers only steps
             self._back_pressure.skip(follower)
@@ -335,9 +335,9 @@ class Feed:
         return True
 
     def _take(self, frame: Frame) -> None:
-        """Deliver a good frame.
+        """Deliver a frame if it is good.
 
-        Turn bad if the frame is not good, or if the one before was stale.
+        Turn bad if the frame is not good, or if the previous frame was stale.
         """
         change = self._follower.take(frame)
         bad = self._follower.quality is Quality.BAD
@@ -362,7 +362,7 @@ class Feed:
     def _show(self, shown: Frame | DeliveredImage | None, frame: Frame) -> None:
         """Deliver the changes since ``shown`` to the listeners that do not have this frame yet.
 
-        If ``shown`` is None, deliver everything.
+        If ``shown`` is None, deliver all values.
         """
         for channel in self._changes(shown, frame):
             message = channel.encode(frame)
@@ -378,7 +378,7 @@ class Feed:
             self._settle()
 
     def _changes(self, shown: Frame | DeliveredImage | None, frame: Frame) -> list[_Channel]:
-        """Return the channels whose bytes have changed since ``shown``; if that is None, all."""
+        """Return the channels whose bytes have changed since ``shown``; None: all channels."""
         slots, scan, apart = self._table
         if shown is None:
             return [channel for channel in slots if channel]
@@ -394,9 +394,9 @@ class Feed:
         return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame
 
     def _stamp(self, event: Event) -> tuple[int, int]:
-        """Return the number and time of an event.
+        """Return the number and the time to report for an event.
 
-        These are those of its frame, or in virtual time those of the last step.
+        They are those of the event's frame, or in virtual time those of the last step.
         """
         return self._virtual_time.moment if self._held else Moment(event.frame, event.clock_ns)
 
@@ -492,7 +492,7 @@ class Feeds(Mapping[str, Feed]):
             block.layout.members(""), block.layout.by_path
 
     def _prune(self) -> None:
-        """Forget the feeds that are over, and release their parts of the segment."""
+        """Forget the feeds that have ended, and release their parts of the segment."""
         over = [feed for feed in self._ended if feed.over]
         self._ended_messages += sum(feed.messages for feed in over)
         self._ended = [feed for feed in self._ended if feed not in over]

@@ -1,4 +1,4 @@
-"""The queues of clients' streams: states may be conflated, events may not.
+"""The queues of clients' streams. They may conflate states, but not events.
 
 simlog.v1, simlog.v2 and simserver use :class:`Outbox`. shmio.v1 uses :class:`SendQueue`, and
 conflates in :class:`shmio.endpoints.grpc.shmio_v1.subscribe.LatestFrame`.
@@ -20,15 +20,15 @@ from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.segment.events import EVENT_SLOTS
 
 TOPIC_BOUND: Final = 64
-"""Maximum number of one topic's waiting values: more than a feed delivers while it catches up."""
+"""Maximum number of one topic's waiting values. A feed that catches up delivers fewer."""
 STATE_BOUND: Final = 4096
-"""Number of a stream's waiting values from which on a new value replaces all of its topic."""
+"""Number of waiting values above which a new value replaces all waiting values of its topic."""
 EVENT_BOUND: Final = 2 * EVENT_SLOTS
-"""Maximum number of a stream's waiting events: twice as many as catching up can deliver at once."""
+"""Maximum number of a stream's waiting events, twice as many as one catch-up can deliver."""
 STEP_BOUND: Final = 16_384
-"""Maximum number of values of one step that wait in a stream. None of them may be dropped."""
+"""Maximum number of values of one step that wait in a stream. No value of a step is dropped."""
 STEP_BOUND_BYTES: Final = 64 << 20
-"""Maximum size of these values, in bytes."""
+"""Maximum size of the values of one step that wait in a stream, in bytes."""
 
 Finish = Callable[[Any], bytes]
 
@@ -46,7 +46,7 @@ class Outbox:
         self.failure = ""
         """Why the outbox failed; empty if it has not failed."""
         self.on_failure: Callable[[], object] | None = None
-        """Called on failure; if the client does not read, the stream itself may wait for ever."""
+        """Called on failure. The stream itself may wait for ever if its client does not read."""
         self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # messages with their time in s
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
@@ -61,7 +61,7 @@ class Outbox:
 
     @property
     def busy(self) -> bool:
-        """True if messages wait, or if the client has not taken the last one yet."""
+        """True if messages wait, or if the client has not taken the last message yet."""
         return bool(self._waiting) or not self._asked
 
     @property
@@ -70,7 +70,7 @@ class Outbox:
         return self.losses.behind
 
     def skip(self, frames: int, topics: int) -> None:
-        """Count frames that were not delivered to ``topics`` topics of this slow client."""
+        """Count frames of ``topics`` topics that were not delivered to this slow client."""
         self.dropped += frames
         self.losses.skip(frames * topics)
 
@@ -120,7 +120,7 @@ class Outbox:
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """End at once: drop the messages that wait, and those that are added later."""
+        """End at once. Drop the messages that wait, and the messages that are added later."""
         failed, self.failure = self.failure, self.failure or reason
         self.clear()
         self.end()
@@ -129,7 +129,7 @@ class Outbox:
             asyncio.get_running_loop().call_soon(self.on_failure)  # later, as the caller may iterate over listeners
 
     def owe(self) -> None:
-        """Make :meth:`taken` wait for all messages that were added so far."""
+        """Make :meth:`taken` wait for all messages that have been added so far."""
         self._owed = self._next
 
     @property
@@ -147,15 +147,15 @@ class Outbox:
                 self._told = None
 
     def _tell(self) -> None:
-        """Wake :meth:`taken` if there is nothing left to wait for."""
+        """Wake :meth:`taken` if the client has taken all messages that it waits for."""
         if self._told is not None and not self._told.done() and not self.owing:
             self._told.set_result(None)
 
     async def pop(self) -> bytes | None:
-        """Wait for the oldest message, and return it; return None after :meth:`end`.
+        """Wait for the oldest message, and return it. After :meth:`end`, return None.
 
-        You may call it again after None. Each call means that the client has taken the message
-        before, as far as flow control shows.
+        You may call it again after None. Each call means that the client has taken the previous
+        message, as far as flow control shows.
         """
         waiting = self._waiting
         self._taken = next(iter(waiting)) if waiting else self._next
@@ -225,9 +225,10 @@ class _Lane:
 
 
 class StateLane(_Lane):
-    """A lane for states: has every change while the client keeps up, otherwise the newest value.
+    """A lane for states. While the client is too slow, it has only the newest value.
 
-    The outbox counts the values that are left out. The lane is a listener of a feed.
+    While the client keeps up, it has every change. The outbox counts the values that are left out.
+    The lane is a listener of a feed.
     """
 
     def __init__(self, outbox: Outbox, finish: Finish = bytes) -> None:
@@ -243,7 +244,7 @@ class StateLane(_Lane):
         self.since = 0
 
     def deliver(self, message: Sized, at_s: float | None = None) -> None:
-        """Add a message, which replaces the topic's messages that are too many or too old."""
+        """Add a message. It replaces waiting messages that are too many or too old."""
         waits = len(self._numbers)  # 0 if the client keeps up
         outbox, numbers, now_s = self._outbox, self._numbers, time.monotonic()
         at_s = now_s if at_s is None else at_s
@@ -261,13 +262,13 @@ class StateLane(_Lane):
         self.drop()
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
-        """Listen to the values of a feed's source; return the function that ends this."""
+        """Listen to a feed's values. Return the function that ends the subscription."""
         feed.listen(subject, self)
         return partial(feed.leave, subject, self)
 
 
 class EventLane(_Lane):
-    """A lane for events. None replaces another: if one has no room, the outbox fails.
+    """A lane for events. No event replaces another. If there is no room for one, the outbox fails.
 
     The lane is a listener of write subscriptions.
     """
@@ -285,7 +286,7 @@ class EventLane(_Lane):
         self._path = path
 
     def deliver(self, message: Sized) -> None:
-        """Add a message; without room for it, fail."""
+        """Add a message. If there is no room for it, the outbox fails."""
         if self.load.full(message, EVENT_BOUND):
             self.fail(f"{self.load.count} messages are waiting: the client reads too slowly")
         self._add(message)
@@ -295,7 +296,7 @@ class EventLane(_Lane):
         self._outbox.fail(f"{self._path}: {reason}")
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
-        """Listen to the writes to a feed's source; return the function that ends this."""
+        """Listen to the writes to a source. Return the function that ends the subscription."""
         write_subscriptions = feed.commands.write_subscriptions
         write_subscriptions.listen(subject, self)
         return partial(write_subscriptions.leave, subject, self)
@@ -309,7 +310,7 @@ class OpenStreams:
 
     def __init__(self) -> None:
         self.changed: Callable[[], object] = lambda: None
-        """Called when the first stream opens, before it gets values, and when the last one closes."""
+        """Called when the first stream opens, before it gets values, and when the last closes."""
         self._count = 0
 
     def __bool__(self) -> bool:

@@ -20,7 +20,7 @@ from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
 
 BRIEF_NS: Final = 500_000
-"""Time for which the event loop itself waits for the sources to answer.
+"""Time for which the event loop itself waits for the sources to answer, in ns.
 
 A wake-up by another thread takes about as long.
 """
@@ -38,7 +38,7 @@ class StepDriver:
     async def step(self, dt_ns: int | None) -> Step:
         """Make one step. Cancelling aborts it.
 
-        It raises what :meth:`Coordinator.step` raises.
+        It raises the errors of :meth:`Coordinator.step`.
         """
         until_ns = time.monotonic_ns() + BRIEF_NS
         with closing(self._coordinator.stepping(dt_ns)) as stepping:
@@ -95,7 +95,7 @@ def _brief(wait: StepWait, rest_ns: int) -> bool:
 
 
 LATE_S: Final = 0.5
-"""Maximum delay that playing catches up with; it does not catch up with the rest."""
+"""Maximum delay that playing makes up for, in s. The rest of a longer delay is lost."""
 
 log = logging.getLogger("shmio.grpc")
 
@@ -104,7 +104,7 @@ class Player:
     """Makes steps at a multiple of real time. Use it only in the event loop's thread."""
 
     def __init__(self, make: Callable[[int | None], Awaitable[object]], step_size_ns: Callable[[], int]) -> None:
-        """Prepare to play; :meth:`begin` starts.
+        """Prepare to play. :meth:`begin` starts playing.
 
         Args:
             make: Makes one step of the given size in ns, or of the step size if that is None. A
@@ -169,7 +169,7 @@ class Player:
 
 
 REST_S: Final = 1.0
-"""Without a step for this long, control of time is released, so that other programs can take it."""
+"""Time in s without a step after which the endpoint gives up control of time for other programs."""
 
 _Result = TypeVar("_Result")
 
@@ -215,7 +215,7 @@ class Stepper:
         self._player = Player(self._make, lambda: segment.clock.read().step_size_ns)
         self._tasks: set[asyncio.Task[Any]] = set()
         self.timeline = Timeline(segment, slot, virtual_time, feeds, outboxes, open_streams, lambda: self._player.dt_ns)
-        """The state of time, whichever program moves it."""
+        """The state of time. It does not matter which program moves time."""
 
     async def start(self, predecessor: int = 0) -> None:
         """Start following time.
@@ -223,7 +223,7 @@ class Stepper:
         Resume playing if the previous process of this endpoint was playing.
 
         Args:
-            predecessor: Process id of that process; 0: there was none.
+            predecessor: Process id of the previous process; 0: there was none.
 
         """
         self.timeline.start()
@@ -232,15 +232,15 @@ class Stepper:
             try:
                 await self.play(state.dt_ns or None, state.rate)
             except TimeError as error:
-                log.info("time is played by another program: %s", str(error))
+                log.info("another program plays time: %s", str(error))
 
     @property
     def alive(self) -> bool:
-        """True if time is followed and :attr:`Player.alive` is True."""
+        """True if this process follows time and :attr:`Player.alive` is True."""
         return self.timeline.alive and self._player.alive
 
     async def set_step_size(self, dt_ns: int) -> None:
-        """Set the size of steps whose request names none. This takes control of time.
+        """Take control of time, and set the length of steps whose request names no length.
 
         Raises:
             ValueRangeError: The step size is out of range.
@@ -251,11 +251,11 @@ class Stepper:
         await self._do(self._change(partial(self._coordinator.set_step_size, dt_ns)))
 
     async def step(self, dt_ns: int | None = None, peer: str = "") -> Step:
-        """Make a step; return when all streams have taken the marker of the step.
+        """Make a step. Return when all streams have taken the marker of the step.
 
-        Values that were received earlier on the peer's Publish streams reach their sources before
-        the step. A step that has begun is completed even if its client disconnects. A step that
-        still waits is cancelled.
+        Values that came earlier on the peer's Publish streams reach their sources before the step.
+        A step that has begun is completed even if its client disconnects. A step that still waits
+        is then cancelled.
 
         Args:
             dt_ns: Size in ns; None: the step size.
@@ -275,7 +275,7 @@ class Stepper:
                 task.cancel()
 
     async def play(self, dt_ns: int | None = None, rate: float = 1.0) -> TimeStatus:
-        """Play at ``rate`` times real time in steps of ``dt_ns``; return the state of time.
+        """Play at ``rate`` times real time in steps of ``dt_ns``. Return the state of time.
 
         Raises:
             TimeError: Another program controls time.
@@ -288,7 +288,7 @@ class Stepper:
         """Stop playing, and return the state of time.
 
         Args:
-            end: Report time as not alive until the next step.
+            end: Whether to report ``alive = False`` until the next step.
 
         Raises:
             TimeError: Another program controls time.
@@ -297,7 +297,7 @@ class Stepper:
         return await self._do(self._end_play(end))
 
     async def release(self) -> TimeStatus:
-        """Return to real time.
+        """Let time run as real time again.
 
         Raises:
             TimeError: Another program controls time, or the instance has no real time.
@@ -345,14 +345,14 @@ class Stepper:
             return step
 
     async def _change(self, call: Callable[[], None], *, end: bool = False) -> None:
-        """Change how time moves, by a call of the coordinator."""
+        """Change how time moves, by calling a method of the coordinator."""
         async with self._moved():
             call()
             self.timeline.ended = end
 
     @asynccontextmanager
     async def _moved(self) -> AsyncIterator[None]:
-        """Control time, with exclusive access among this endpoint's clients."""
+        """Take control of time. Meanwhile, no other client of this endpoint can move it."""
         async with self._turn:
             self._moving, self.timeline.steered = asyncio.current_task(), True
             try:

@@ -18,10 +18,10 @@ from shmio.model.clock import Clock
 from shmio.segment import ProcessSlot, Segment
 
 PATIENCE_S: Final = 3.0
-"""Time for clients to take the values of a step, and as much again to take its marker.
+"""Time limit in s for clients to take the values of a step, and again to take its marker.
 
-Clients of shmio.v1 follow after the others. The total is less than the time-out of a step. If only
-one stream is open, it has this time once, for values and marker together.
+Clients of shmio.v1 get a step after the other clients. The total is less than the time-out of a
+step. If only one stream is open, it has this time once, for values and marker together.
 """
 
 log = logging.getLogger("shmio.grpc")
@@ -30,7 +30,8 @@ log = logging.getLogger("shmio.grpc")
 class TimeStatus(NamedTuple):
     """The state of the instance's time.
 
-    ``dt_ns`` is the size of the step that the status reports, otherwise the present step size.
+    ``dt_ns`` is the length of the step that the status reports. If it reports no step, ``dt_ns`` is
+    the present step size.
     ``alive`` is False after a client has called ``stop`` of SimServerAPI, until the next step.
     """
 
@@ -78,7 +79,7 @@ class TimeTopics:
     def listen(self, topic: TimeTopic, encode: Encode, listener: Listener) -> Callable[[], None]:
         """Add a listener, and return the function that removes it.
 
-        The simulation time is sent at once, a step's number only after that step.
+        The simulation time is sent at once. The number of a step is sent after that step.
         """
         listeners = self._listeners.setdefault((topic, encode), {})
         listeners[listener] = None
@@ -140,19 +141,19 @@ class StepReceiver(Protocol):
         """Number of the service's open streams."""
 
     async def deliver(self, step: Step) -> None:
-        """Send the changes of a step, then its marker; wait until all streams have both."""
+        """Send the changes of a step, then its marker. Wait until all streams have both."""
 
     def release(self) -> None:
         """Send values without waiting for steps, because time is real again."""
 
 
 class _Delivery:
-    """Delivers steps in order to all streams, whichever program has made them.
+    """Delivers steps in order to all streams. It does not matter which program makes the steps.
 
     First come the writes before the step. Then come the changed values of all blocks on the
-    instance's clock, in the segment's order. When all streams have taken these, they get the step's
-    marker. The delivery ends when they have taken the marker. A single stream is in order anyway,
-    so its marker need not wait for the values. Use it only in the event loop's thread.
+    instance's clock, in the segment's order. When all streams have taken these values, they get the
+    step's marker. The delivery ends when all streams have taken the marker. If only one stream is
+    open, its marker need not wait for the values. Use it only in the event loop's thread.
     """
 
     def __init__(self, virtual_time: VirtualTime, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
@@ -163,7 +164,7 @@ class _Delivery:
         self.receivers: list[StepReceiver] = []
 
     def begin(self, moment: Moment) -> None:
-        """Switch to virtual time; the step ``moment`` counts as delivered."""
+        """Switch to virtual time. The step ``moment`` counts as delivered."""
         self._virtual_time.on = True
         self._virtual_time.moment = moment
         for feed in self._feeds.values():
@@ -176,14 +177,14 @@ class _Delivery:
             try:
                 feed.release()
             except SegmentError as error:
-                log.warning("on the return to real time: %s", str(error))
+                log.warning("on the return to real time, values were not sent: %s", str(error))
         for receiver in self.receivers:
             receiver.release()
 
     async def deliver(self, step: Step, mark: Callable[[], None]) -> bool:
-        """Deliver a step; return False if it was delivered already.
+        """Deliver a step. Return False if it had already been delivered.
 
-        The stream of a client that does not read fails after ``PATIENCE_S``.
+        If a client does not read for ``PATIENCE_S``, its stream fails.
 
         Args:
             step: The step.
@@ -249,10 +250,10 @@ class Timeline:
         Args:
             segment: The instance's shared memory.
             slot: This process's entry in the process table.
-            virtual_time: The state that this object updates, and the feeds read.
+            virtual_time: The state of virtual time. This object updates it, and the feeds read it.
             feeds: The feeds of all sources, by name.
             outboxes: The outboxes of all streams.
-            open_streams: Counts the open streams; while there are none, no step waits for this
+            open_streams: Counts the open streams. While no stream is open, no step waits for this
                 process.
             play_dt_ns: Returns the size of the steps that this process plays, in ns; None: the step
                 size.
@@ -261,11 +262,11 @@ class Timeline:
         self.time_topics = TimeTopics(virtual_time, self._now, lambda: self._clock.read().step_size_ns / 1e9)
         """Sends step numbers and simulation time to subscribers."""
         self.virtual_time = virtual_time
-        """The state of virtual time, with the step that was delivered last."""
+        """The state of virtual time, with the last delivered step."""
         self.steered = False
         """True while this process moves time, and delivers its own steps."""
         self.ended = False
-        """True after a client has called ``stop`` of SimServerAPI; the next step resets this."""
+        """True after a client has called ``stop`` of SimServerAPI, until the next step."""
         self._clock = segment.clock
         self._slot = slot
         self._open_streams = open_streams
@@ -304,19 +305,19 @@ class Timeline:
 
     @property
     def alive(self) -> bool:
-        """True while time is followed."""
+        """True while this object follows time."""
         return self._page is not None
 
     def own(self, owns: bool) -> None:
         """Note whether this process controls time.
 
-        Its own writes to the clock page need no wake-up.
+        If it does, its own writes to the clock page need no wake-up.
         """
         if self._page is not None:
             (self._page.mute if owns else self._page.unmute)()
 
     def add_receiver(self, receiver: StepReceiver) -> None:
-        """Deliver each step to ``receiver``, too."""
+        """Deliver each step also to ``receiver``."""
         self._delivery.receivers.append(receiver)
 
     def watch(self, watcher: Callable[[TimeStatus], None]) -> None:
@@ -329,7 +330,7 @@ class Timeline:
         return self._status(self.look())
 
     async def deliver(self, step: Step) -> None:
-        """Deliver a step's values and marker to all streams, unless that was done already."""
+        """Deliver a step's values and marker to all streams, unless that has been done already."""
         if await self._delivery.deliver(step, partial(self._mark, step)):
             self._delivered = step.number
             if self._awaited:
@@ -338,8 +339,7 @@ class Timeline:
     def look(self) -> Clock:
         """Read the clock page, and act on changes.
 
-        This is also called periodically, because the death of a program that plays causes no
-        wake-up.
+        It is also called periodically, because no wake-up tells that a playing program has died.
         """
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
@@ -366,7 +366,7 @@ class Timeline:
         self._tell(self._status(state), state)
 
     def _attend(self) -> None:
-        """Let steps wait for this process while it has open streams."""
+        """Make steps wait for this process while it has open streams, and only then."""
         if self._open_streams:
             self.look()  # delivers the steps so far; the next step will wait for this process
             self._awaited = True
@@ -397,7 +397,7 @@ class Timeline:
 def _before(state: Clock) -> Moment:
     """Return the moment that counts as delivered when this process first sees that time is virtual.
 
-    On a busy machine the first step may have ended before, and still has to be delivered.
+    On a busy machine, the first step may have ended by then, and still has to be delivered.
     """
     first = bool(state.dt_ns) and state.step == state.done
     return Moment(state.done - first, state.present_ns - first * state.dt_ns)

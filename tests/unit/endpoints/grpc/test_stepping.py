@@ -154,7 +154,7 @@ def test_the_topics_for_time_have_a_type_but_cannot_be_read(instance: str) -> No
             info = await served.v2.GetTopicInfo(v2.TopicInfoRequest(path=path), timeout=TIMEOUT_S)
             assert info == v2.TopicInfo(path=path, type=v2.NUMBER, direction=v2.OUT, exists=True)
             status, text = await refusal(served.v2.Read(v2.ReadRequest(path=[path]), timeout=TIMEOUT_S))
-            assert (status, text) == (Status.NOT_FOUND, f"{path}: it can only be subscribed to")
+            assert (status, text) == (Status.NOT_FOUND, f"{path}: clients can only subscribe to this topic")
         stream = await served.subscriber("one", "model/clock")
         await served.time.step(sim.StepRequest(deltaTime=250), timeout=TIMEOUT_S)
         assert await messages(stream, 2) == [("model/clock", 0.0), ("model/clock", 0.25)]

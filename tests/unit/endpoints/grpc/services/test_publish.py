@@ -131,7 +131,7 @@ WRONG = [
     (wire.PubRequest(), "the path names no register"),
     (message("cell/nothing", "1"), "no such register"),
     (message("nowhere://step", "1"), "no source of this name"),
-    (message("model/clock", "1"), "it can only be subscribed to"),
+    (message("model/clock", "1"), "clients can only subscribe to this topic"),
     (message("cell/axis", "1"), "version 1 has no message for this structure"),
     (message("cell/inputs/2", "1"), "index [2] is outside [0..1]"),
     (message("cell/step/out", "1"), "use /in"),

@@ -141,8 +141,8 @@ def test_injected_registers_are_marked_and_have_their_originals(segment: Segment
         (("cell/%",), Status.NOT_FOUND, "hexadecimal"),
         (("cell/" + "a" * 20_000,), Status.NOT_FOUND, "at most"),
         (("cell/*" + "a" * 2_000,), Status.NOT_FOUND, "at most"),
-        (("SIMLOG://step",), Status.NOT_FOUND, "SIMLOG://step: it can only be subscribed to"),
-        (("cell/axis",) * 257, Status.INVALID_ARGUMENT, "257 patterns, at most 256"),
+        (("SIMLOG://step",), Status.NOT_FOUND, "SIMLOG://step: clients can only subscribe to this topic"),
+        (("cell/axis",) * 257, Status.INVALID_ARGUMENT, "257 patterns are given, at most 256"),
     ],
 )
 def test_invalid_reads_are_refused_with_the_reason(

@@ -177,12 +177,12 @@ def test_a_rejoining_model_gets_the_last_values(instance: str) -> None:
         ({"assignments": assigned(**{"axis/coumt": 1})}, "near: axis/count"),
         ({"assignments": assigned(**{"lamps/in": [True] * 10})}, "lamps/in: it is not an output"),
         ({"values": wire.Values(doubles=wire.Doubles(slots=[7], values=[1.0]))}, "doubles: the table has no slot 7"),
-        ({"values": wire.Values(doubles=wire.Doubles(values=[1.0, 2.0]))}, "doubles: 2 values for 1 slots"),
+        ({"values": wire.Values(doubles=wire.Doubles(values=[1.0, 2.0]))}, "doubles: 2 values are given for 1 slots"),
         (
             {"values": wire.Values(doubles=wire.Doubles(slots=[0, 0], values=[1, 2]))},
-            "doubles: 2 values, the table has 1",
+            "doubles: 2 values are given, but the table has 1",
         ),
-        ({"assignments": assigned(**{"axis/count": 1}) * 22}, "assignments: 22 values, the table has 21"),
+        ({"assignments": assigned(**{"axis/count": 1}) * 22}, "assignments: 22 values are given, but the table has 21"),
         ({"values": wire.Values(floats=wire.Floats(slots=[0], values=[1.0]))}, "floats: the table has no slot 0"),
     ],
 )
@@ -242,17 +242,17 @@ def test_outputs_that_come_too_late_are_shown_with_the_next_step(instance: str) 
 @pytest.mark.parametrize(
     ("requests", "code", "text"),
     [
-        ([Request(done=wire.Done(step=1))], Status.INVALID_ARGUMENT, "the first message of Simulate joins"),
-        ([Request()], Status.INVALID_ARGUMENT, "the first message of Simulate joins"),
-        ([], Status.INVALID_ARGUMENT, "the first message of Simulate joins"),
+        ([Request(done=wire.Done(step=1))], Status.INVALID_ARGUMENT, "the first message of Simulate must join"),
+        ([Request()], Status.INVALID_ARGUMENT, "the first message of Simulate must join"),
+        ([], Status.INVALID_ARGUMENT, "the first message of Simulate must join"),
         ([Request(join=wire.Join(source="nothing"))], Status.NOT_FOUND, "no source 'nothing'; there are: drive, cell"),
         ([Request(join=wire.Join(source="cell"))], Status.FAILED_PRECONDITION, "sources that a model can join: drive"),
         ([Request(join=wire.Join(source="drive", name="x" * 104))], Status.INVALID_ARGUMENT, "name: at most 103 bytes"),
-        ([Request(join=wire.Join(source="drive"))] * 2, Status.INVALID_ARGUMENT, "a model joins once"),
+        ([Request(join=wire.Join(source="drive"))] * 2, Status.INVALID_ARGUMENT, "only the first message joins"),
         (
             [Request(join=wire.Join(source="drive")), Request(done=wire.Done(step=4))],
             Status.INVALID_ARGUMENT,
-            "an answer to step 4, but no step is pending",
+            "the model answered step 4, but no step is pending",
         ),
     ],
 )
@@ -282,7 +282,7 @@ def test_an_answer_to_another_step_ends_the_stream(instance: str) -> None:
         await model.work()
         await model.done(9)
         code, text = await refusal(model.work())
-        assert (code, text) == (Status.INVALID_ARGUMENT, "an answer to step 9, but step 1 is pending")
+        assert (code, text) == (Status.INVALID_ARGUMENT, "the model answered step 9, but step 1 is pending")
         _, text = await refusal(task)
         assert "model 'raw' disconnected before it answered" in text
 
@@ -336,7 +336,7 @@ def test_a_reload_ends_a_model_which_may_join_the_new_block(instance: str) -> No
             segment.change(add=[spec("drive", 10_000_000)], retire=["drive"])
             served.service.move(["drive"])
             code, text = await refusal(model.read())
-            assert (code, text) == (Status.UNAVAILABLE, "drive was changed or removed by a reload: join again")
+            assert (code, text) == (Status.UNAVAILABLE, "drive: a reload changed or removed this source: join again")
 
     with remote_segment(instance) as segment:
         asyncio.run(run(segment))

@@ -254,9 +254,9 @@ def test_streams_of_equal_patterns_share_table_and_bytes(segment: Segment) -> No
         ({"max_rate_hz": math.nan}, "max_rate_hz"),
         ({"max_rate_hz": 1e9}, "at most 1e+06"),
         ({"deadband": math.inf}, "deadband"),
-        ({"deadband": 1.0, "mode": 1}, "only for the mode LATEST"),
-        ({"max_rate_hz": 1.0, "mode": 1}, "only for the mode LATEST"),
-        ({"deadband": 1.0, "format": 1}, "deadband is for the format VALUES"),
+        ({"deadband": 1.0, "mode": 1}, "only in the mode LATEST"),
+        ({"max_rate_hz": 1.0, "mode": 1}, "only in the mode LATEST"),
+        ({"deadband": 1.0, "format": 1}, "deadband is allowed only with the format VALUES"),
     ],
 )
 def test_invalid_options_are_refused(segment: Segment, options: dict[str, Any], message: str) -> None:
@@ -278,7 +278,7 @@ def test_the_number_of_streams_is_limited(segment: Segment, monkeypatch: pytest.
             await stream.update()
         code, text = await refusal(subscribe(served, "cell/axis").call.read())
         assert code is Status.RESOURCE_EXHAUSTED
-        assert "one takes many patterns" in text
+        assert "one call can have many patterns" in text
         open_ones[0].call.cancel()
         await streams(served, 1)
         assert (await subscribe(served, "cell/axis").update()).whole

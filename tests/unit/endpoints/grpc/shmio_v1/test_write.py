@@ -162,6 +162,6 @@ def test_missing_values_long_time_outs_and_deep_nesting_are_refused(segment: Seg
 def test_too_many_values_are_refused_before_any_is_checked(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         code, text = await refusal(write(served, {f"nothing/{number}": 1 for number in range(4097)}))
-        assert (code, text.startswith("4097 values, at most 4096")) == (Status.INVALID_ARGUMENT, True), text
+        assert (code, text.startswith("4097 values are given, at most 4096")) == (Status.INVALID_ARGUMENT, True), text
 
     with_plant(segment, test)
