@@ -329,6 +329,17 @@ class OpcUa(Section):
     client: list[Client] = []
 
 
+class Metrics(Section):
+    """``[metrics]``: the address at which Prometheus finds the figures of the instance."""
+
+    listen: Text
+    insecure: bool = False
+    certificate: Text | None = None
+    key: Text | None = None
+    hosts: Annotated[list[Text], Meta(max_length=100)] = []
+    registers: Annotated[list[Text], Meta(max_length=1000)] = []
+
+
 class Config(Section):
     """The whole configuration, with the folder that its paths are relative to."""
 
@@ -339,6 +350,7 @@ class Config(Section):
     grpc: Grpc | None = None
     mqtt: Mqtt | None = None
     opcua: OpcUa | None = None
+    metrics: Metrics | None = None
     recorder: Recorder | None = None
     replay: Replay | None = None
     folder: str = "."

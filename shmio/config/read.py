@@ -22,6 +22,7 @@ from shmio.config.model import (
     Grpc,
     Instance,
     Listening,
+    Metrics,
     Mqtt,
     MqttAccount,
     MqttTls,
@@ -38,10 +39,11 @@ from shmio.config.model import (
 )
 from shmio.config.mqtt import check_mqtt, resolve_mqtt
 from shmio.config.opcua import check_opcua, resolve_opcua
+from shmio.config.web import check_metrics, resolve_metrics
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
-SECTION_PROCESSES = frozenset({"broker", "grpc", "mqtt", "opcua", "recorder", "supervisor", "web"})
+SECTION_PROCESSES = frozenset({"broker", "grpc", "metrics", "mqtt", "opcua", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
 MAX_PROPERTIES_BYTES = 64 << 10
 MAX_DEPTH = 64
@@ -68,6 +70,7 @@ _TABLES: dict[str, type[Section]] = {
     "opcua": OpcUa,
     "opcua.account": Token,
     "opcua.client": Client,
+    "metrics": Metrics,
     "recorder": Recorder,
     "recorder.trigger": Trigger,
     "replay": Replay,
@@ -227,6 +230,8 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
         check_mqtt(config)
     with faults.catching():
         check_opcua(config)
+    with faults.catching():
+        check_metrics(config)
     if config.grpc:
         with faults.catching():
             resolve(config.grpc, config)
@@ -234,6 +239,8 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
         resolve_mqtt(config.mqtt, config)
     if config.opcua:
         resolve_opcua(config.opcua, config)
+    if config.metrics:
+        resolve_metrics(config.metrics, config)
     return Examined(config, faults, broken)
 
 

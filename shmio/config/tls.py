@@ -59,15 +59,16 @@ def client_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
     return context
 
 
-def server_context(tls: MqttTls) -> ssl.SSLContext:
-    """Return the TLS context of shmio's own broker, or raise ConfigError.
+def server_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
+    """Return the TLS context of shmio's own broker or HTTP server, or raise ConfigError.
 
-    With ``ca``, clients must present a certificate issued by it.
+    With ``ca``, clients must present a certificate issued by it. ``where`` begins the names of the
+    keys, in messages.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    _identify(context, tls, "mqtt.tls.")
+    _identify(context, tls, where)
     if tls.ca is not None:
-        _load_authority(context, tls.ca, "mqtt.tls.ca")
+        _load_authority(context, tls.ca, f"{where}ca")
         context.verify_mode = ssl.CERT_REQUIRED
     return context
 

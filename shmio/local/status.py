@@ -188,7 +188,9 @@ def complaint(kind: str, note: str) -> str:
 
     A recorder without a problem reports ``to FILE``.
     """
-    return note if kind in ("mqtt", "grpc", "opcua") or (kind == "recorder" and not note.startswith("to ")) else ""
+    return (
+        note if kind in ("mqtt", "grpc", "opcua", "web") or (kind == "recorder" and not note.startswith("to ")) else ""
+    )
 
 
 def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: str = "") -> InstanceState:

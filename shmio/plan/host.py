@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Final
 
 from shmio import realtime
-from shmio.config import Config, Mqtt, OpcUa, UnixAddress, parse_address
+from shmio.config import Config, Metrics, Mqtt, OpcUa, UnixAddress, parse_address
 from shmio.config.credentials import read_accounts, read_password, read_tokens
 from shmio.config.folder import unwritable
 from shmio.config.listening import encrypted
-from shmio.config.model import ROLES
-from shmio.config.opcua import check_library
+from shmio.config.model import ROLES, MqttTls
+from shmio.config.opcua import check_library as check_opcua_library
 from shmio.config.tls import client_context, read_tls, server_context
+from shmio.config.web import check_library as check_web_library
 from shmio.endpoints.mqtt.broker.program import choose_broker, find_mosquitto
 from shmio.errors import ConfigError
 
@@ -58,6 +59,9 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
     if config.opcua:
         with catching():
             warnings += _check_opcua(config.opcua)
+    if config.metrics:
+        with catching():
+            _check_metrics(config.metrics)
     return warnings
 
 
@@ -77,7 +81,7 @@ def _check_mqtt(mqtt: Mqtt) -> None:
 
 def _check_opcua(opcua: OpcUa) -> Iterator[str]:
     """Check the library and the files of the OPC UA endpoint; yield warnings."""
-    check_library()
+    check_opcua_library()
     from shmio.endpoints.opcua.certificates import (  # noqa: PLC0415  it needs the extra
         application_uri,
         read_certificates,
@@ -93,6 +97,13 @@ def _check_opcua(opcua: OpcUa) -> Iterator[str]:
             f"opcua.certificate: {opcua.certificate}: it has no application URI (a URI among its subject alternative "
             "names), without which many clients refuse it"
         )
+
+
+def _check_metrics(metrics: Metrics) -> None:
+    """Check the libraries and the files of the HTTP endpoint."""
+    check_web_library()
+    if metrics.certificate and metrics.key:
+        server_context(MqttTls(certificate=metrics.certificate, key=metrics.key), "metrics.")
 
 
 def _check_group(name: str | None) -> None:

@@ -294,7 +294,7 @@ def _odd_patterns(key: str, source: Source, layout: Layout, faults: Faults) -> I
 
 
 def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
-    """Yield warnings about unused ``[mqtt]`` patterns and an open broker.
+    """Yield warnings about unused patterns of endpoints and an open broker.
 
     Raises:
         ConfigError: A pattern is invalid.
@@ -349,15 +349,17 @@ def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
 
 
 def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:
-    """Yield each pattern of ``[mqtt]`` with its key, and whether it selects frames."""
-    if config.mqtt is None:
-        return
-    for index, rule in enumerate(config.mqtt.topic):
-        for pattern in rule.patterns:
-            yield f"mqtt.topic[{index}].match", pattern, rule.payload == "frames"
-    if config.mqtt.sparkplug is not None:
-        for pattern in config.mqtt.sparkplug.patterns:
-            yield "mqtt.sparkplug.match", pattern, False
+    """Yield each pattern of an endpoint with its key, and whether it selects frames."""
+    if config.mqtt is not None:
+        for index, rule in enumerate(config.mqtt.topic):
+            for pattern in rule.patterns:
+                yield f"mqtt.topic[{index}].match", pattern, rule.payload == "frames"
+        if config.mqtt.sparkplug is not None:
+            for pattern in config.mqtt.sparkplug.patterns:
+                yield "mqtt.sparkplug.match", pattern, False
+    if config.metrics is not None:
+        for index, pattern in enumerate(config.metrics.registers):
+            yield f"metrics.registers[{index}]", pattern, False
 
 
 def _near(pattern: str, layout: Layout) -> str:

@@ -14,7 +14,15 @@ from shmio.errors import ConfigError
 from shmio.layout.model import Layout
 from shmio.segment import Attributes, BlockSpec, Origin, ProcessSpec, segment_size
 
-RANKS: Final[Mapping[str, int]] = {"emulator": 0, "recorder": 0, "source": 1, "grpc": 2, "mqtt": 2, "opcua": 2}
+RANKS: Final[Mapping[str, int]] = {
+    "emulator": 0,
+    "recorder": 0,
+    "source": 1,
+    "grpc": 2,
+    "mqtt": 2,
+    "opcua": 2,
+    "web": 2,
+}
 """Order of start by kind: emulators, then sources, then endpoints.
 
 The recorder starts before the sources and stops after them, to record their last frames and events.
@@ -39,6 +47,7 @@ MODULES: Final[Mapping[str, str]] = {
     "mqtt": "shmio.endpoints.mqtt",
     "opcua": "shmio.endpoints.opcua",
     "recorder": "shmio.recorder",
+    "web": "shmio.endpoints.web",
 }
 """The module that each kind of process runs."""
 
@@ -193,6 +202,8 @@ def make_plan(
         sections += _mqtt(config.mqtt)
     if config.opcua and mode != "log":
         sections.append(("opcua", "opcua", msgspec.to_builtins(config.opcua)))
+    if config.metrics and mode != "log":
+        sections.append(("metrics", "web", msgspec.to_builtins(config.metrics) | {"folders": _folders(config)}))
     if config.recorder:
         paths = {"directory": config.path(config.recorder.directory), "config_file": config_file.resolve()}
         recorder = msgspec.to_builtins(config.recorder) | {key: str(path) for key, path in paths.items()}
@@ -220,7 +231,16 @@ def process_names(config: Config) -> list[str]:
     names += ["grpc"] if config.grpc else []
     names += [name for name, _, _ in _mqtt(config.mqtt)] if config.mqtt else []
     names += ["opcua"] if config.opcua else []
+    names += ["metrics"] if config.metrics else []
     return [*names, "recorder"] if config.recorder else names
+
+
+def _folders(config: Config) -> dict[str, str]:
+    """Return the folders in which the instance writes files, by purpose."""
+    folders = {"logs": str(config.log_dir)}
+    if config.recorder:
+        folders["recordings"] = str(config.path(config.recorder.directory))
+    return folders
 
 
 def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:

@@ -39,6 +39,7 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed"),
     "opcua": ("sessions", "items", "writes", "refused"),
     "recorder": ("frames", "events", "missed", "bytes"),
+    "web": ("requests", "refused", "connections"),
 }
 """Names of a worker's counters, at most 8, by kind of process.
 
@@ -83,7 +84,7 @@ class Activity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """A process of the instance. Its ``kind`` is source, emulator, grpc, mqtt or recorder."""
+    """A process of the instance. Its ``kind`` is source, emulator, grpc, mqtt, opcua, web or recorder."""
 
     name: str
     kind: str

@@ -1,0 +1,1 @@
+"""The HTTP endpoint: figures of the instance for Prometheus."""

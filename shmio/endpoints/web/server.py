@@ -1,0 +1,232 @@
+"""The HTTP server: bounded connections and requests, and the rules for all answers."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import socket
+import ssl
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn import Config
+from uvicorn import Server as Uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from shmio.config import Address
+from shmio.errors import EndpointError
+
+MAX_CONNECTIONS: Final = 128
+REQUEST_S: Final = 10.0
+"""Time in which a client must send its first request, or its next one, once it has begun."""
+IDLE_S: Final = 75
+"""Time after which an idle connection is closed. Prometheus keeps its own open between scrapes."""
+MAX_HEADER_BYTES: Final = 16 << 10
+BACKLOG: Final = 64
+STOP_S: Final = 1
+"""Time that answers may take to end when the server stops."""
+_HEADERS: Final = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
+    (b"cache-control", b"no-store"),
+)
+"""Headers of every answer."""
+
+
+@dataclass
+class Counters:
+    """Counts of what clients have done."""
+
+    requests: int = 0
+    refused: int = 0
+    connections: int = 0
+
+
+class _Protocol(H11Protocol):
+    """A connection that is closed if its client does not send whole requests in time."""
+
+    counters: Counters
+    _deadline: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        """Accept the connection, if there are not too many."""
+        super().connection_made(transport)
+        self.counters.connections = len(self.connections)
+        if len(self.connections) > MAX_CONNECTIONS:
+            self.counters.refused += 1
+            transport.abort()
+            return
+        self._set_deadline()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        self._clear_deadline()
+        super().connection_lost(exc)
+        self.counters.connections = len(self.connections)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes of a request; begin its deadline with the first."""
+        if self._deadline is None and (self.cycle is None or self.cycle.response_complete):
+            self._set_deadline()
+        super().data_received(data)
+        if self.cycle is not None and not self.cycle.response_complete and not self.cycle.more_body:
+            self._clear_deadline()
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request."""
+        self._clear_deadline()
+        super().on_response_complete()
+
+    def _set_deadline(self) -> None:
+        self._deadline = self.loop.call_later(REQUEST_S, self._expire)
+
+    def _clear_deadline(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+
+    def _expire(self) -> None:
+        self._deadline = None
+        self.counters.refused += 1
+        self.transport.abort()
+
+
+class _Guarded:
+    """Refuses requests for other hosts' names, and gives every answer its headers.
+
+    A foreign web page can make a browser send requests to this server under a name of the page's own (DNS
+    rebinding). Then the Host header has that name, so only names of this server are accepted.
+    """
+
+    def __init__(self, app: ASGIApp, names: frozenset[str], counters: Counters) -> None:
+        self._app, self._names, self._counters = app, names, counters
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        if scope["type"] != "http":
+            return
+        self._counters.requests += 1
+        hosts = [value for name, value in scope["headers"] if name == b"host"]
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                given = {name for name, _ in message["headers"]}
+                message["headers"] = [
+                    *message["headers"], *((name, value) for name, value in _HEADERS if name not in given)
+                ]  # fmt: skip
+            await send(message)
+
+        if len(hosts) != 1 or not self.knows(hosts[0].decode("latin-1")):
+            self._counters.refused += 1
+            text = b"this server has another name: use the address of [metrics] listen, or add the name to its hosts\n"
+            await with_headers(
+                {"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]}
+            )
+            await with_headers({"type": "http.response.body", "body": text})
+            return
+        await self._app(scope, receive, with_headers)
+
+    def knows(self, host: str) -> bool:
+        """Return whether a Host header names this server: an IP address, ``localhost``, or a configured name."""
+        name = host.rpartition(":")[0] if ":" in host and not host.endswith("]") else host
+        name = name.removeprefix("[").removesuffix("]").lower()
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return name in self._names
+        return True
+
+
+class _Server(Uvicorn):
+    """A server that leaves signals to the worker."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.ready = asyncio.Event()
+        """Set once connections are accepted."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to accept connections."""
+        await super().startup(sockets)
+        self.ready.set()
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Install no handlers."""
+        yield
+
+
+class HttpServer:
+    """Serves an application on one address. Use it only in the event loop's thread."""
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        address: Address,
+        *,
+        hosts: tuple[str, ...] = (),
+        certificate: str | None = None,
+        key: str | None = None,
+    ) -> None:
+        """Create the server; :meth:`start` begins to listen.
+
+        Args:
+            app: The application.
+            address: Where to listen.
+            hosts: Names by which clients may address the server, besides IP addresses, ``localhost`` and the name in
+                ``address``.
+            certificate: PEM file of the certificate for TLS.
+            key: PEM file of its key.
+
+        """
+        self.address = address
+        self.counters = Counters()
+        names = frozenset(name.lower() for name in ("localhost", address.host, *hosts))
+        protocol = type("Protocol", (_Protocol,), {"counters": self.counters})
+        config = Config(
+            _Guarded(app, names, self.counters),
+            http=protocol,
+            ws="none",
+            loop="none",
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            backlog=BACKLOG,
+            timeout_keep_alive=IDLE_S,
+            timeout_graceful_shutdown=STOP_S,
+            h11_max_incomplete_event_size=MAX_HEADER_BYTES,
+            ssl_certfile=certificate,
+            ssl_keyfile=key,
+            ssl_version=ssl.PROTOCOL_TLS_SERVER,
+        )
+        self._server = _Server(config)
+        self._serving: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Begin to listen. EndpointError: the address cannot be used."""
+        family = socket.AF_INET6 if ":" in self.address.host else socket.AF_INET
+        listening = socket.socket(family, socket.SOCK_STREAM)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind((self.address.host, self.address.port))
+            listening.listen(BACKLOG)
+        except OSError as error:
+            listening.close()
+            raise EndpointError(f"cannot listen on {self.address}: {error.strerror}") from None
+        self.port: int = listening.getsockname()[1]
+        self._serving = asyncio.get_running_loop().create_task(self._server.serve([listening]))
+        await self._server.ready.wait()
+
+    async def stop(self) -> None:
+        """Stop listening, and end all connections."""
+        self._server.should_exit = True
+        if self._serving is not None:
+            await self._serving
