@@ -14,6 +14,7 @@ from shmio.endpoints.web.measurements import BOUNDS_S, Histogram, SourceTiming
 from shmio.endpoints.web.metrics import usage
 from shmio.segment import EventKind, Quality, Record, Report, Segment
 from shmio.segment.processes import Activity
+from shmio.version import __version__
 from tests.unit.endpoints.harness import image
 from tests.unit.endpoints.web.harness import processes, served, spec
 
@@ -36,7 +37,7 @@ def test_figures_of_the_source_and_of_its_process(segment: Segment) -> None:
         assert {name: figures[name, labels] for name in expected} == expected
         assert 0 <= figures["shmio_source_age_seconds", labels] < 60
         assert figures["shmio_segment_bytes", frozenset()] == segment.shared.size
-        info = frozenset({("name", segment.instance), ("mode", "live"), ("version", metrics.__version__)})
+        info = frozenset({("name", segment.instance), ("mode", "live"), ("version", __version__)})
         assert figures["shmio_instance_info", info] == 1
         states = [value for (name, _), value in figures.items() if name == "shmio_instance_state"]
         assert sum(states) == 1
