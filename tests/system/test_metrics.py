@@ -1,0 +1,90 @@
+"""The figures of a running cell, read by a real Prometheus: formats, alert rules, and the queries of the dashboard."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import urllib.parse
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.config import Address
+from shmio.testing.cell import CONFIG, Cell, kill, until
+from shmio.testing.ports import reserved_port
+
+PACKAGING = Path(__file__).parents[2] / "packaging/prometheus"
+pytestmark = pytest.mark.skipif(
+    shutil.which("prometheus") is None or shutil.which("promtool") is None, reason="needs Prometheus"
+)
+
+
+def get(url: str) -> bytes:
+    with urllib.request.urlopen(url, timeout=20) as answer:
+        return bytes(answer.read())
+
+
+@contextmanager
+def prometheus(folder: Path, target: Address, address: Address) -> Iterator[str]:
+    """Run Prometheus with the packaged rules, every 200 ms."""
+    shutil.copytree(PACKAGING, folder, dirs_exist_ok=True)
+    file = folder / "prometheus.yml"
+    text = (
+        file.read_text().replace("127.0.0.1:9464", str(target)).replace("scrape_interval: 5s", "scrape_interval: 200ms")
+    )
+    file.write_text(text.replace("rule_files", "  evaluation_interval: 200ms\nrule_files"))
+    command = ["prometheus", f"--config.file={file}", f"--storage.tsdb.path={folder / 'data'}"]
+    process = subprocess.Popen(
+        [*command, f"--web.listen-address={address}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        yield f"http://{address}/api/v1"
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+def query(api: str, expression: str) -> list[Any]:
+    answer = json.loads(get(f"{api}/query?{urllib.parse.urlencode({'query': expression})}"))
+    assert answer["status"] == "success", (expression, answer)
+    return list(answer["data"]["result"])
+
+
+def test_a_cell_is_monitored(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
+    with reserved_port() as target, reserved_port() as server, reserved_port() as broker:
+        section = f'[recorder]\n[mqtt]\nlisten = "{broker}"\nbroker = "mosquitto"\n[metrics]\nlisten = "{target}"\n'
+        cell = make_cell(config=CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]') + section)
+        cell.up()
+        cell.output("shmio", "set", "Outputs/0", "3")
+        figures = get(f"http://{target}/metrics")
+        checked = subprocess.run(["promtool", "check", "metrics"], input=figures, capture_output=True, check=False)
+        assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
+        subprocess.run(["promtool", "check", "rules", PACKAGING / "alerts.yml"], check=True, capture_output=True)
+        with prometheus(tmp_path / "prometheus", target, server) as api:
+
+            def ready() -> bool:
+                try:
+                    found = query(api, 'count_over_time(shmio_source_command_seconds_count{source="cell"}[1m])')
+                except OSError:
+                    return False
+                return bool(found) and float(found[0]["value"][1]) >= 3
+
+            until(ready, "three scrapes")
+            dashboard = json.loads((PACKAGING / "grafana-dashboard.json").read_text())
+            queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+            for expression in queries:
+                text = expression.replace("$__rate_interval", "1m").replace("$instance", ".*")
+                assert query(api, text), text
+            assert query(api, "shmio_source_quality")[0]["value"][1] == "2"
+            kill(cell.processes()["plc"]["pid"])
+            until(lambda: query(api, "shmio_source_quality == 0") != [], "a bad source")
+
+            def alerts() -> set[str]:
+                return {one["labels"]["alertname"] for one in json.loads(get(f"{api}/alerts"))["data"]["alerts"]}
+
+            until(lambda: "ShmioSourceBad" in alerts(), "the alert")
