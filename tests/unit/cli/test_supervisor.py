@@ -889,6 +889,7 @@ def test_status_has_the_documented_keys_in_order(instance: str, capsys: pytest.C
         "opcua": "opcua",
         "mqtt": "mqtt",
         "recorder": "recorder",
+        "web": "metrics",
     }
     with Segment.create(instance, blocks, [ProcessSpec(name, kind) for kind, name in kinds.items()]) as segment:
         assert main(["status", "--json", "--instance", instance]) == 0
