@@ -1,8 +1,9 @@
 """Decides when a declared injection is active.
 
-It is active between two times, while a condition is true, or for some time after a condition became
-true. The testing metamodel of the University of York calls these activation at a fixed time, on a
-condition, and on a condition for a limited time.
+An injection is active between two times, while a condition is true, or for some time after a
+condition became true. The testing metamodel of the University of York calls these three cases
+activation at a fixed time, activation on a condition, and activation on a condition for a limited
+time.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ class State(StrEnum):
 class Window:
     """Limits on when, how long and how often an injection is active.
 
-    ``start_ns`` and ``end_ns`` are instance times. ``for_ns`` is the length of each activation, and
-    ``times`` the largest number of activations. None is no limit.
+    ``start_ns`` and ``end_ns`` are times of the instance's clock. ``for_ns`` is the length of each
+    activation. ``times`` is the largest number of activations. None means no limit.
     """
 
     start_ns: int = 0
@@ -38,10 +39,10 @@ class Window:
 
 @dataclass(slots=True)
 class Activation:
-    """The state of an injection's activation.
+    """Whether an injection is active, and how often it has been.
 
     ``runs`` is the number of activations so far. ``cycle`` and ``time_ns`` are the cycle and the
-    instance time at which the last activation began.
+    instance's clock at which the last activation began.
     """
 
     window: Window
@@ -56,10 +57,10 @@ class Activation:
     """
 
     def advance(self, time_ns: int, cycle: int, *, holds: bool) -> bool:
-        """Update the state for a cycle, and return whether it has changed.
+        """Update the state for a cycle, and return whether the state has changed.
 
         Args:
-            time_ns: The instance time of the cycle.
+            time_ns: The instance's clock in this cycle.
             cycle: The number of the cycle.
             holds: True if the condition is true, or there is no condition.
 
@@ -83,8 +84,9 @@ class Activation:
     def _begins(self) -> bool:
         """Return whether a waiting injection becomes active now that its condition is true.
 
-        With ``for_ns``, it becomes active only when the condition changes from false to true. A
-        restarted process does not know the previous value, so it waits for the next such change.
+        With ``for_ns``, it becomes active only in a cycle in which the condition changes from false
+        to true. A restarted process does not know the previous value of the condition. If the
+        injection was active before, the process therefore waits for the next change.
         """
         if self.window.for_ns is None:
             return True

@@ -73,15 +73,15 @@ _EDGES: Final[dict[str, Callable[[Number, Number], bool]]] = {
 
 _Stack = list[Number]
 _Seen = dict[int, Number]
-"""The last value of each edge function's argument, by the function's index in the expression."""
+"""The last argument of each edge function, by the index of the function in the expression."""
 _Step = Callable[[_Stack, Sequence[Number], _Seen], None]
 
 
 @dataclass
 class Memory:
-    """The last arguments of the edge functions (rising, falling, changed) of an expression.
+    """The last arguments of an expression's edge functions (rising, falling, changed).
 
-    It is empty at first, and after a value was unknown.
+    The memory is empty at first. An unknown value or a division by zero empties it again.
     """
 
     seen: _Seen = field(default_factory=dict)
@@ -90,7 +90,8 @@ class Memory:
 class Expression(NamedTuple):
     """A parsed condition, as a program for a stack machine.
 
-    Every operand is evaluated each time, also of ``and`` and ``or``, so that no edge is missed.
+    Each evaluation computes every operand, even if ``and`` or ``or`` does not need it. So the edge
+    functions miss no change.
     """
 
     steps: tuple[_Step, ...]
@@ -100,7 +101,7 @@ class Expression(NamedTuple):
     def holds(self, values: Sequence[Number | None], memory: Memory) -> bool:
         """Return whether the expression is true.
 
-        The result is False if a value is unknown, or after a division by zero.
+        The result is False if a value is unknown, or if the expression divides by zero.
 
         Args:
             values: The value of each reference; None if it is unknown.
@@ -124,11 +125,11 @@ def parse(text: str) -> Expression:
     """Parse a condition.
 
     Raises:
-        ConfigError: The text is invalid. The message names the character.
+        ConfigError: The text is invalid. The message gives the position of the wrong character.
 
     """
     if len(text) > MAX_LENGTH:
-        raise ConfigError(f"a condition has at most {MAX_LENGTH} characters, this one has {len(text)}")
+        raise ConfigError(f"a condition may have at most {MAX_LENGTH} characters, but this one has {len(text)}")
     return _Parser(text).whole()
 
 
@@ -146,11 +147,14 @@ class _Parser:
     def whole(self) -> Expression:
         self._either()
         if self._kind:
-            raise self._expected("and, or, or the end")
+            raise self._expected("'and', 'or' or the end of the condition")
         return Expression(tuple(self._steps), tuple(self._references))
 
     def _advance(self) -> None:
-        """Read the next token: its kind, empty at the end, and its text, keywords in lower case."""
+        """Read the next token: set its kind and its text.
+
+        At the end of the condition, the kind is empty. The text of a keyword is in lower case.
+        """
         self._start = self._at
         rest = self._text[self._at :]
         if not rest.strip():
@@ -175,7 +179,7 @@ class _Parser:
 
     def _emit(self, step: _Step) -> None:
         if len(self._steps) == MAX_NODES:
-            raise ConfigError(f"a condition has at most {MAX_NODES} parts")
+            raise ConfigError(f"the condition has more than {MAX_NODES} parts: shorten it")
         self._steps.append(step)
 
     def _chain(self, operand: Callable[[], None], operators: _Operators) -> None:

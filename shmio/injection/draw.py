@@ -1,8 +1,8 @@
 """Random numbers that depend only on a seed and their purpose.
 
-Each number is computed from counters, without state. So an extra frame or a restarted process does
-not change later numbers. The mixing function is that of SplitMix64 (Steele, Lea, Flood: "Fast
-splittable pseudorandom number generators", OOPSLA 2014).
+The generator has no state: it computes each number from counters, such as the number of the cycle.
+So an extra frame or a restarted process does not change later numbers. The mixing function is that
+of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number generators", OOPSLA 2014).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Words = npt.NDArray[np.uint64]
 Floats = npt.NDArray[np.float64]
 
 FEW: Final = 16
-"""Up to this count, plain Python is faster than numpy.
+"""Plain Python computes up to this count of numbers faster than numpy.
 
-Both compute the same numbers, except for the last bit of a gaussian number.
+Both compute the same numbers, except for the last bit of a Gaussian number.
 """
 
 _MASK: Final = (1 << 64) - 1
@@ -30,7 +30,7 @@ _FIRST, _SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 
 
 class Purpose(IntEnum):
-    """The purpose of a random number; each purpose has a separate sequence."""
+    """What a random number is used for. Each purpose has its own sequence of numbers."""
 
     CHANCE = 0
     VALUE = 1
@@ -40,16 +40,16 @@ class Purpose(IntEnum):
 class SeededRandom:
     """Generates the random numbers of one injection.
 
-    In all methods, ``run`` is the number of the activation, and ``place`` the number of the cycle
-    or write in this activation. The same arguments always give the same numbers.
+    In all methods, ``run`` is the number of the activation. ``place`` is the number of the cycle or
+    write within this activation. The same arguments always give the same numbers.
     """
 
     def __init__(self, seed: int, name: str) -> None:
-        """Create the generator; with the same seed, each ``name`` has different numbers."""
+        """Create the generator. For the same seed, different names give different numbers."""
         self._key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
 
     def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
-        """Return ``count`` random integers of 64 bits, (count,) of uint64."""
+        """Return ``count`` random 64-bit integers: an array of shape (count,) and type uint64."""
         if count <= FEW:
             return np.array(self._few(run, place, purpose, count), np.uint64)
         base = self._base(run, place, purpose)
@@ -65,7 +65,7 @@ class SeededRandom:
     def gaussian(self, run: int, place: int, count: int) -> Floats:
         """Return ``count`` normally distributed numbers of mean 0 and standard deviation 1.
 
-        The method is that of Box and Muller, 1958.
+        It uses the method of Box and Muller, 1958.
         """
         if count <= FEW:
             radii = (1 - (word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.VALUE, count))

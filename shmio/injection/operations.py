@@ -1,8 +1,8 @@
 """The operations of declared injections, as listed in docs/reference/injections.md.
 
-An operation changes images of the whole block, (size,) of uint8. A ``ValueGroup`` reads and writes
-all values of one type in an image at once. Each activation resets the state of the operation.
-Applying an operation twice in a cycle gives the same result.
+An operation changes images of a whole block: arrays of shape (size,) and type uint8. A
+``ValueGroup`` reads and writes all values of one type in an image at once. Each activation resets
+the operation's state. If an operation is applied twice in a cycle, both results are the same.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from shmio.layout.values.codec import REAL_MAX, scalar_codec
 Bytes = npt.NDArray[np.uint8]
 Values = npt.NDArray[Any]
 _MAX_ELEMENTS: Final = 4096
-"""The largest number of single values in one injection; more would slow the poll loop."""
+"""The largest number of single values in one injection. More would make the poll loop too slow."""
 MAX_DELAY_CYCLES: Final = 10_000
 MAX_DELAY_BYTES: Final = 16_000_000
 """The largest number of bytes in the images that one ``delay`` stores."""
@@ -41,24 +41,25 @@ _NUMPY: Final = {
 class ValueGroup:
     """All single values of one type in an injection's target.
 
-    ``first`` is the index of the first of these values among all values of the injection.
+    The values of all groups of an injection are numbered. ``first`` is the number of this group's
+    first value.
     """
 
     element: ElementType
     first: int
     index: npt.NDArray[np.intp]
-    """Offsets of the values' bytes in the block, (n, size); (n,) for bits."""
+    """Offsets of the values' bytes in the block: an array of shape (n, size), or (n,) for bits."""
     shifts: Bytes
-    """The number of each bit in its byte, (n,); used only for bits."""
+    """For bits only: the number of each bit in its byte, an array of shape (n,)."""
     dtype: np.dtype[Any]
-    """The numpy type of the values in the image; of kind V if they are not numbers."""
+    """The numpy type of the values in the image. Its kind is V if the values are not numbers."""
 
     def __len__(self) -> int:
         return len(self.index)
 
     @cached_property
     def limits(self) -> tuple[Any, Any]:
-        """The smallest and the largest number of the type, in the type used for calculations."""
+        """The smallest and the largest number of the type, as numbers for calculations."""
         if self.dtype.kind == "f":
             most = _REAL_LIMIT if self.dtype.itemsize == 4 else float(np.finfo(np.float64).max)
             return -most, most
@@ -66,15 +67,18 @@ class ValueGroup:
         return exact(bounds.min), exact(bounds.max)
 
     def numbers(self, image: Bytes) -> Values:
-        """Return the values, (n,) of float64.
+        """Return the values as an array of shape (n,) and type float64.
 
-        64-bit integers are returned as long doubles, because a double would lose digits.
+        For 64-bit integers, the type is long double, because a double would lose digits.
         """
         exact = np.longdouble if self.dtype.kind in "iu" and self.dtype.itemsize == 8 else np.float64
         return np.ascontiguousarray(image[self.index]).view(self.dtype)[:, 0].astype(exact)
 
     def put_numbers(self, image: Bytes, values: Values) -> None:
-        """Write numbers into an image, rounded for integers and clamped to the type's range."""
+        """Write numbers into an image.
+
+        Clamp them to the type's range, and round them for integers.
+        """
         least, most = self.limits
         if self.dtype.kind != "f":
             values = np.rint(values)
@@ -88,8 +92,8 @@ class ValueGroup:
 
         Args:
             image: The image.
-            table: The values to choose from, (k, size); bits are 0 or 1.
-            choice: The row of ``table`` for each value of the group, (n,).
+            table: The encoded values to choose from, an array of shape (k, size). A bit is 0 or 1.
+            choice: The row of ``table`` for each value of the group, an array of shape (n,).
 
         """
         if self.element.base != "BOOL":
@@ -105,14 +109,14 @@ class ValueGroup:
 
 
 _Change = Callable[[ValueGroup, Values], Values]
-"""Returns new values for the present ones."""
+"""Computes the new values of a group from the present values."""
 
 
 def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGroup]:
     """Return the single values of registers and arrays, grouped by type.
 
     Raises:
-        ValueError: There are more than _MAX_ELEMENTS.
+        ValueError: The registers have more than _MAX_ELEMENTS single values.
 
     """
     found: dict[ElementType, list[tuple[int, int]]] = {}
@@ -120,7 +124,7 @@ def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGr
     for register in registers:
         count += register.count
         if count > _MAX_ELEMENTS:
-            raise ValueError(f"more than {_MAX_ELEMENTS} single values: name fewer")
+            raise ValueError(f"the registers have more than {_MAX_ELEMENTS} single values: name fewer registers")
         element, into = register.element, found.setdefault(register.element, [])
         if element.base == "BOOL":
             into += [(register.offset + byte, bit) for byte, bit in bit_positions(register)]
@@ -138,7 +142,7 @@ def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGr
 
 
 def _number_type(element: ElementType, byte_order: ByteOrder) -> np.dtype[Any]:
-    """Return the numpy type of an element in the image; of kind V if it is not a number."""
+    """Return the numpy type of an element in the image. Its kind is V if it is not a number."""
     plain = "" if element.base == "BOOL" else scalar_codec(element, byte_order).plain
     kind = _NUMPY.get(plain, f"V{element.size}")
     return np.dtype(("<" if byte_order == "little" else ">") + kind)
@@ -150,8 +154,8 @@ def _number_type(element: ElementType, byte_order: ByteOrder) -> np.dtype[Any]:
 class OperationContext(NamedTuple):
     """Identifies the image or write to which an operation is applied.
 
-    ``run`` is the number of the activation, and ``place`` the number of the cycle or write in it.
-    ``time_ns`` is the instance time.
+    ``run`` is the number of the activation. ``place`` is the number of the cycle or write within
+    this activation. ``time_ns`` is the instance's clock.
     """
 
     run: int
@@ -161,23 +165,24 @@ class OperationContext(NamedTuple):
 
 
 class Operation(ABC):
-    """Base class of operations; an object has the state of one injection."""
+    """Base class of operations. Each object belongs to one injection, and has its state."""
 
     def begin(self) -> None:  # noqa: B027  most operations have no state
-        """Reset all state, because an activation begins."""
+        """Reset the operation's state at the start of an activation."""
 
     @abstractmethod
     def apply(self, image: Bytes, at: OperationContext) -> None:
-        """Change the image in place. The caller uses only the covered bits of the result."""
+        """Change the image in place. The caller uses only the bits that the injection covers."""
 
     def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most operations have no state
-        """Record an image that stays unchanged; called instead of :meth:`apply`.
+        """Record an image that the operation does not change.
 
-        This happens if the injection has a probability.
+        If the injection has a probability, the caller uses this instead of :meth:`apply` for the
+        images that the injection leaves unchanged.
         """
 
     def resume(self, image: Bytes) -> None:  # noqa: B027
-        """Restore the state of the previous process, which published this image last."""
+        """Restore the state from the last image that the source's previous process published."""
 
 
 class Fixed(Operation):
@@ -252,7 +257,10 @@ class RandomChoice(Operation):
     """``random`` with a list: replaces each value by a random one of the list."""
 
     def __init__(self, tables: Sequence[tuple[ValueGroup, Bytes]], draw: SeededRandom) -> None:
-        """Create the operation; ``tables`` has the values to choose from, (k, size), per group."""
+        """Create the operation.
+
+        ``tables`` has each group with the values to choose from, an array of shape (k, size).
+        """
         self._tables = tables
         self._draw = draw
 
@@ -264,17 +272,17 @@ class RandomChoice(Operation):
 
 
 class Freeze(Operation):
-    """``freeze``: shows the first values of the activation until it ends."""
+    """``freeze``: consumers see the first values of the activation until it ends."""
 
     def __init__(self) -> None:
         self._held: Bytes | None = None
 
     def begin(self) -> None:
-        """Forget the frozen values; the next image's values are frozen."""
+        """Forget the frozen values. The values of the next image will be frozen."""
         self._held = None
 
     def resume(self, image: Bytes) -> None:
-        """Freeze the values that the previous process showed last."""
+        """Freeze the values that the previous process of the source published last."""
         self._held = image.copy()
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
@@ -294,7 +302,10 @@ class Drop(Operation):
         self._passing: tuple[int, Bytes] | None = None
 
     def begin(self) -> None:
-        """Forget all values; the next ones are shown in any case, because there are none before."""
+        """Forget all values.
+
+        Readers see the next values in any case, because there are no earlier ones.
+        """
         self._held = self._passing = None
 
     def resume(self, image: Bytes) -> None:
@@ -313,15 +324,15 @@ class Drop(Operation):
         image[:] = self._held
 
     def _settle(self, cycle: int) -> None:
-        """Store the values to show if this cycle is dropped: the last image of an earlier cycle."""
+        """Store the last image of an earlier cycle, which readers see if this cycle is dropped."""
         if self._passing is not None and self._passing[0] != cycle:
             self._held, self._passing = self._passing[1], None
 
 
 class Delay(Operation):
-    """``delay`` over ``/out``: readers see the values from some time or some cycles earlier.
+    """``delay`` over ``/out``: readers see values that are some time or some cycles old.
 
-    Until the activation has lasted that long, they see its first values.
+    Until the activation has lasted that long, readers see its first values.
     """
 
     def __init__(self, size: int, delay_ns: int, cycles: int) -> None:
@@ -329,8 +340,8 @@ class Delay(Operation):
 
         Args:
             size: Size of an image in bytes.
-            delay_ns: The delay in ns; 0 if it is in cycles.
-            cycles: The delay in cycles; 0 if it is in ns.
+            delay_ns: The delay in ns; 0 if the delay is given in cycles.
+            cycles: The delay in cycles; 0 if the delay is given in ns.
 
         """
         self.delay_ns = delay_ns
@@ -353,19 +364,20 @@ class Delay(Operation):
         image[:] = self._line[0][2]
 
     def due(self, cycle: int, time_ns: int, at: OperationContext) -> bool:
-        """Return whether the delay of an image of that cycle and time is over at ``at``."""
+        """Return whether readers may see an image of this cycle and time at ``at``."""
         return at.cycle - cycle >= self.cycles if self.cycles else at.time_ns - time_ns >= self.delay_ns
 
 
 class Flip(Operation):
-    """``flip``: inverts the given bits, or one random bit of all covered bits."""
+    """``flip``: inverts given bits, or one random bit of those that the injection covers."""
 
     def __init__(self, mask: Bytes | None, cover: Bytes, draw: SeededRandom) -> None:
         """Create the operation.
 
         Args:
-            mask: The bits to invert, (size,). None: invert one random covered bit in each cycle.
-            cover: The bits that the injection covers, (size,).
+            mask: An image in which the bits to invert are set, of shape (size,). None: invert one
+                random covered bit in each cycle.
+            cover: An image in which the bits that the injection covers are set, of shape (size,).
             draw: The source of randomness.
 
         """

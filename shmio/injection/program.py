@@ -50,9 +50,10 @@ _Operate = Callable[[SeededRandom], Operation]
 
 
 class Target(NamedTuple):
-    """The registers that an injection changes: of one source, in one direction, without overlap.
+    """The registers that an injection changes.
 
-    ``cover`` is an image of the block in which their bits are set.
+    They belong to one source and one direction, and do not overlap. ``cover`` is an image of the
+    block in which their bits are set.
     """
 
     source: str
@@ -100,7 +101,7 @@ def compile_program(declaration: Declaration, layouts: Mapping[str, Layout], per
         periods_ns: The period of each source, in ns.
 
     Raises:
-        ConfigError: The declaration is invalid. The message begins with the key.
+        ConfigError: The declaration is invalid. The message begins with the wrong key.
 
     """
     texts = [declaration.target] if isinstance(declaration.target, str) else declaration.target
@@ -130,7 +131,7 @@ def compile_condition(text: str, layouts: Mapping[str, Layout]) -> Condition:
     try:
         expression = parse(text)
         if len(expression.references) > _MAX_REFERENCES:
-            raise ConfigError(f"a condition reads at most {_MAX_REFERENCES} registers")
+            raise ConfigError(f"a condition may read at most {_MAX_REFERENCES} registers")
         return Condition(expression, tuple(_read(path, layouts) for path in expression.references))
     except (ConfigError, PathError) as error:
         raise ConfigError(f"when: {error}") from None
@@ -139,7 +140,7 @@ def compile_condition(text: str, layouts: Mapping[str, Layout]) -> Condition:
 def _read(path: str, layouts: Mapping[str, Layout]) -> tuple[str, RegisterCodec]:
     source, register = single(path, layouts)
     if register.dims:
-        raise ConfigError(f"{path}: an array; a condition reads one of its elements")
+        raise ConfigError(f"{path} is an array, but a condition reads single values: name one of its elements")
     if register.type != "BOOL" and not scalar_codec(register.element).plain:
         raise ConfigError(f"{path}: {register.type} is neither a number nor a BOOL")
     return source, trusted_codec(register, layouts[source])
@@ -159,26 +160,25 @@ def _window(declaration: Declaration) -> Window:
 
 
 def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
-    """Return the target that consists of the registers which the texts name.
+    """Find the registers that texts name, as the target of an injection.
 
     A text is the path of a register or of a part of it, a pattern, a structure or a whole source.
 
     Raises:
         PathError: A text names no register, the registers are of several sources or directions,
             they overlap, or there are too many.
-
     """
     found: list[tuple[str, Direction, Register]] = []
     for text in texts:
         found += _registers(text, layouts)
         if len(found) > MAX_REGISTERS:
             raise PathError(
-                f"{text}: more than {MAX_REGISTERS} registers and elements: declare several injections for parts of it"
+                f"{text} names more than {MAX_REGISTERS} registers and elements: declare an injection for each part"
             )
     places = {(source, direction) for source, direction, _ in found}
     if len(places) != 1:
         named = ", ".join(sorted(f"{source} /{direction}" for source, direction in places))
-        raise PathError(f"an injection covers one direction of one source, but this covers {named}")
+        raise PathError(f"an injection covers one direction of one source, but this one covers {named}")
     source, direction = places.pop()
     cover = bytearray(layouts[source].size)
     registers = []
@@ -189,7 +189,7 @@ def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
         if taken == list(bits):
             continue
         if any(taken):
-            raise PathError(f"{source}/{register.path}: part of it is named twice")
+            raise PathError(f"the target names {source}/{register.path}, or a part of it, twice")
         cover[span] = bytes(there | own for there, own in zip(cover[span], bits, strict=True))
         registers.append(register)
     return Target(source, direction, tuple(registers), bytes(cover))
@@ -204,7 +204,7 @@ def single(text: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
     """
     topic = parse_topic(text, layouts, _default(layouts))
     if topic.direction == "in":
-        raise PathError(f"{text}: a condition reads outputs of a source; leave out /in")
+        raise PathError(f"{text}: a condition can only read outputs of a source; leave out /in")
     return topic.source, look_up(_layout(topic.source, text, layouts), topic)
 
 
@@ -305,7 +305,7 @@ def _random(declaration: Declaration, target: Target, layout: Layout, _period_ns
 
 
 def _table(values: list[Any], element: ElementType, layout: Layout) -> Bytes:
-    """Return the values, encoded for one type, (k, size)."""
+    """Encode the values for an element type. Return an array of shape (k, size)."""
     register = Register(element.name, element.name, (), 0, 0 if element.base == "BOOL" else None, element.size, 1)
     rows = []
     for index, value in enumerate(values):
@@ -329,7 +329,9 @@ def _delay(declaration: Declaration, _target: Target, layout: Layout, period_ns:
     held = cycles or -(-delay_ns // period_ns)
     most = min(MAX_DELAY_CYCLES, MAX_DELAY_BYTES // max(1, layout.size))
     if held > most:
-        raise ConfigError(f"{key}: {held} cycles of {layout.size} bytes, but a delay stores at most {most}")
+        raise ConfigError(
+            f"{key}: the delay is {held} cycles, but for images of {layout.size} bytes at most {most} are allowed"
+        )
     return lambda _draw: Delay(layout.size, delay_ns, cycles)
 
 
@@ -375,7 +377,7 @@ def _places(target: Target, layout: Layout) -> list[ValueGroup]:
 
 
 def _numbers(declaration: Declaration, target: Target, layout: Layout) -> list[ValueGroup]:
-    """Return the values of a target; raise ConfigError if any of them is not a number."""
+    """Return the values of a target. Raise ConfigError if any value is not a number."""
     for register in target.registers:
         if register.type == "BOOL" or not scalar_codec(register.element).plain:
             kinds = "numbers: REAL, LREAL, " + ", ".join(sorted(INTEGERS)) + ", TIME, LTIME"

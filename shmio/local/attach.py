@@ -8,8 +8,8 @@ For example::
         for view in cell.stream("cell"):
             print(view.cycle, view["Robot_800/Axs1_Pos"], view.missed)
 
-Attaching maps the segment read-only and needs nothing from the instance: no lock, no registration,
-no server. A program that also writes takes one of the process table's guest slots.
+Attaching maps the shared memory read-only. The program takes no lock, does not register, and needs
+no server. A program that also writes occupies one of the process table's guest slots.
 """
 
 from __future__ import annotations
@@ -88,16 +88,23 @@ class Attachment:
 
     @property
     def current(self) -> bool:
-        """True if the attached instance still runs. Once it has stopped, attach again."""
+        """True if the attached instance still runs.
+
+        After a restart of the instance, attach again.
+        """
         return self._segment.shared.current()
 
     def layouts(self, *sources: str) -> Mapping[str, Layout]:
-        """Return the layouts of these sources, or of all, by source. PathError: no such source."""
+        """Return the layouts of these sources (default: all), by source.
+
+        Raises:
+            PathError: There is no such source.
+        """
         self._segment.require_running()
         return Layouts({source: self.block(source) for source in sources} if sources else self._blocks())
 
     def real_sources(self) -> list[str]:
-        """Return the names of the sources that steps do not move, such as those with a device."""
+        """Return the names of the sources that steps do not affect, such as those with a device."""
         self._segment.require_running()
         return [source for source, block in self._blocks().items() if not block.attributes.stepped]
 
@@ -108,7 +115,7 @@ class Attachment:
             source: Name of the source; None if there is only one.
 
         Raises:
-            PathError: There is no such source, or there are several and none was named.
+            PathError: There is no such source, or there are several sources and you named none.
         """
         blocks = self._blocks()
         if source is None and len(blocks) == 1:
@@ -218,7 +225,7 @@ class Attachment:
         return View(block, frame)
 
     def stream(self, source: str | None = None, timeout_s: float | None = None) -> Iterator[View]:
-        """Iterate over the frames that a source publishes from now on: each once, in order.
+        """Iterate over the frames that a source publishes from now on: each frame once, in order.
 
         A view's ``missed`` counts the frames that were overwritten before they could be read.
 
@@ -245,14 +252,14 @@ class Attachment:
                 return
 
     def _successor(self, block: Block) -> Block:
-        """Return the block that replaced a retired one in a reload."""
+        """Return the block with which a reload has replaced a retired block."""
         successor = self._blocks().get(block.source)
         if successor is None:
             raise NotRunningError(f"source {block.source!r} was removed from instance {self.instance!r} by a reload")
         return successor
 
     def _next(self, block: Block, cursor: Cursor[Entry], timeout_s: float | None) -> Entry | None:
-        """Wait for a frame or an event, and check in between that the instance has not stopped."""
+        """Wait for a frame or an event. Meanwhile, check that the instance has not stopped."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             rest_s = _TURN_S if deadline_s is None else deadline_s - time.monotonic()
@@ -330,7 +337,7 @@ class Attachment:
         return self._source_writer(block).write(by_path(topics, values), timeout_s)
 
     def inject(self, *paths: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
-        """Inject values into registers of one source, by a shadow laid over them.
+        """Create a shadow: an injection that gives values to registers of one source.
 
         The attachment must be ``writable``.
 
@@ -338,9 +345,9 @@ class Attachment:
             paths: Registers, elements, structures or patterns of one source. With the suffix
                 ``/in``, the shadow takes what others write. With ``/out``, or without a suffix, it
                 replaces what consumers see. All paths must have the same direction.
-            priority: Of several shadows over a register, the one with the highest priority is
-                outermost; among equal ones, the newest.
-            keep: Whether the shadow stays when this program ends, until somebody lifts it.
+            priority: If several shadows cover a register, the shadow with the highest priority is
+                outermost. Among equal priorities, the newest is outermost.
+            keep: Whether the shadow stays when this program ends, until a program lifts it.
             name: Name of the injection in events and lists.
 
         Returns:
@@ -367,7 +374,7 @@ class Attachment:
     def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[Diversion]:
         """Iterate over the commands that write to registers of one source, from now on.
 
-        Each accepted command is yielded once its outcome is known, in order.
+        It yields each accepted command when its outcome is known. The commands are in order.
 
         Args:
             paths: Registers, structures or patterns of one source.
@@ -382,18 +389,18 @@ class Attachment:
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
     def declare(self, declarations: Iterable[Mapping[str, Any] | Declaration], *, keep: bool = False) -> Campaign:
-        """Lay declared injections, all or none. Their sources run them without this program.
+        """Create declared injections, all or none. Their sources run them without this program.
 
-        They end by themselves or when they are lifted. The attachment must be ``writable``.
-        See docs/reference/injections.md.
+        An injection ends as its declaration says, or when a program lifts it. The attachment must
+        be ``writable``. See docs/reference/injections.md.
 
         Args:
             declarations: Mappings with the keys of an ``[[injection]]`` table, or declarations.
             keep: Whether the injections continue when this program ends.
 
         Returns:
-            The laid injections. Iterate over them for their events. Leaving the ``with`` block
-            lifts them, unless ``keep`` is set.
+            The created injections. Iterate over the result to get their events. Leaving the
+            ``with`` block lifts them, unless ``keep`` is set.
 
         Raises:
             DeclarationError: A declaration is wrong.
@@ -406,9 +413,9 @@ class Attachment:
         return campaign
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all.
+        """Return the existing injections of these sources (default: all).
 
-        Within a source, the innermost comes first.
+        Among the injections of a source, the innermost comes first.
 
         Raises:
             PathError: There is no such source.
@@ -422,7 +429,7 @@ class Attachment:
         ]
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whoever laid it.
+        """Lift an injection, whichever program created it.
 
         Args:
             source: Name of the source.
@@ -440,7 +447,7 @@ class Attachment:
         self._source_writer(block).lift(number)
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources, or of all, whoever laid them.
+        """Lift all injections of these sources (default: all), whichever program created them.
 
         Returns:
             The lifted injections.
@@ -456,7 +463,7 @@ class Attachment:
         return [Lifted(block.source, one.number, one.name) for block, one in standing]
 
     def note(self, text: str, source: str | None = None) -> None:
-        """Add a note to a source's events, and so to every recording.
+        """Add a note to a source's events. Recordings contain it, too.
 
         The attachment must be ``writable``.
 
@@ -475,12 +482,12 @@ class Attachment:
     def clock(self) -> Clock:
         """State of the instance's clock: wall time, or virtual time with its last step.
 
-        You may also call it, ``clock()``, as with any :class:`shmio.Cell`.
+        You may also call it (``clock()``), as for any :class:`shmio.Cell`.
         """
         return self._segment.clock.read()
 
     def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
-        """Move time by steps, and wait until all sources on the instance clock have done them.
+        """Step time, and wait until all sources on the instance clock have done each step.
 
         The first call of this method, :meth:`pause` or :meth:`play` takes control of time: from
         then on, only steps move it. This program owns time until it detaches or calls
@@ -529,7 +536,7 @@ class Attachment:
         return self.clock
 
     def release(self) -> Clock:
-        """Return to real time, which continues from the present virtual time.
+        """Return to real time. The clock continues from the present virtual time.
 
         This program then no longer owns time. If time is real already, nothing happens.
 
@@ -559,7 +566,7 @@ class Attachment:
             return known
 
     def _end_with_this(self, following: Following[Any]) -> None:
-        """Register an iterator that :meth:`close` must end.
+        """Let :meth:`close` end an iterator, too.
 
         If another thread has just closed this attachment, end the iterator now.
         """
@@ -601,7 +608,8 @@ def attach(instance: str | None = None, *, writable: bool = False) -> Attachment
             instance can.
 
     Raises:
-        NotRunningError: The instance is not running, or you named none and several are running.
+        NotRunningError: The instance is not running. Or you named none, and none or several are
+            running.
         FormatError: Another version of shmio made the segment.
         SegmentError: The segment cannot be opened, for example because you have no permission.
     """
@@ -631,7 +639,7 @@ def _take_guest_slot(segment: Segment) -> int:
             return slot.writer
     pids = ", ".join(str(slot.report.pid) for slot in places)
     raise SegmentError(
-        f"instance {segment.instance!r} has places for {len(places)} writing programs; end one of pids {pids}"
+        f"instance {segment.instance!r} allows only {len(places)} programs that write: end one of pids {pids}"
     )
 
 
@@ -641,16 +649,17 @@ def _of_one_source(
     """Resolve paths that must all belong to one source.
 
     Args:
-        what: What the paths are for, such as "write"; used in messages.
+        what: What the paths are for, such as "write". Messages use it.
         paths: The paths.
         blocks: The instance's blocks, by source.
-        written: Whether the paths are written to, so that none may end in ``/out``.
+        written: Whether the caller writes to the paths. Then none may end in ``/out``.
 
     Returns:
         The source's block, and a topic for each path.
 
     Raises:
-        PathError: The paths belong to several sources, or to none, or one is an output.
+        PathError: The paths are not of exactly one source, or ``written`` is set and a path is an
+            output.
     """
     default = next(iter(blocks)) if len(blocks) == 1 else None
     topics = [parse_topic(path, blocks, default) for path in paths]
@@ -659,7 +668,7 @@ def _of_one_source(
             raise PathError(f"{path}: unknown source {topic.source}")
     sources = {topic.source for topic in topics}
     if len(sources) != 1:
-        raise PathError(f"one {what} is for one source, these are for {', '.join(sorted(sources)) or 'none'}")
+        raise PathError(f"one {what} must be for one source, but the paths name {', '.join(sorted(sources)) or 'none'}")
     for path, topic in zip(paths, topics, strict=True):
         if written and topic.direction == "out":
             raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
@@ -667,7 +676,7 @@ def _of_one_source(
 
 
 def _with_source(source: str, one: StandingInjection) -> Injection[Mapping[str, Any]]:
-    """Convert an injection from its segment's form to that of programs."""
+    """Convert an injection from the form in the segment to the form that programs get."""
     now, running = one.running, None
     if now is not None:
         declaration = msgspec.to_builtins(now.declaration)

@@ -14,15 +14,15 @@ from shmio.segment.block import Block
 from shmio.segment.segment import Segment
 
 MAX_PATHS: Final = 2048
-"""Maximum number of paths of an event: as many as the data of an event has bits.
+"""Maximum number of paths of an event: the number of bits in the data of an event.
 
-An injection may cover more registers.
+An injection may cover more registers. Its events then have only the first paths.
 """
 _KINDS: Final = {int(kind): EventKind(str(kind)) for kind in segment_events.EventKind}
 
 
 class EventReader:
-    """Reads a block's events in order, with their registers and values. For one thread."""
+    """Reads a block's events in order, with their registers and values. Use it from one thread."""
 
     def __init__(self, block: Block, *, after: int | None = None) -> None:
         """Start after event ``after`` (default: the newest one)."""
@@ -82,7 +82,7 @@ class EventReader:
 
 
 class Events(Following[Event]):
-    """The :class:`shmio.model.cell.Events` of a local instance."""
+    """Events of a local instance. Implements :class:`shmio.model.cell.Events`."""
 
     def __init__(self, segment: Segment, blocks: Callable[[], Mapping[str, Block]], followed: Iterable[Block]) -> None:
         """Start to follow.
@@ -111,7 +111,10 @@ class Events(Following[Event]):
         return None
 
     def _succeed(self, old: EventReader) -> Event | None:
-        """Follow the block that has replaced a retired one; if none has, return a REMOVED event."""
+        """Follow the block that has replaced a retired block.
+
+        If a reload has removed the source, return its REMOVED event.
+        """
         self._segment.require_running()
         block = self._blocks().get(old.block.source)
         if block is old.block:

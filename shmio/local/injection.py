@@ -36,9 +36,10 @@ if TYPE_CHECKING:
 _EVENTS: Final = frozenset({EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.LIFTED})
 
 Next = Callable[[Cursor[Event], float | None], Event | None]
-"""Waits at most this many seconds for a cursor's next event. None: none came in time, or none will.
+"""Waits for a cursor's next event, at most for the given time in s.
 
-Raises NotRunningError when the instance has stopped.
+It returns None if no event came in time, or if no further event can come. It raises NotRunningError
+if the instance has stopped.
 """
 
 
@@ -53,7 +54,7 @@ class Diversion:
         command: Number that the writer gave the command, as in events.
         clock_ns: Time of the instance's clock.
         utc_ns: UTC time.
-        missed: Number of events lost since the previous diversion. They may have been about further
+        missed: Number of events lost since the previous diversion. Some may have been about other
             writes.
     """
 
@@ -68,9 +69,9 @@ class Diversion:
 class Shadow:
     """An injection over registers of one source, to which this program gives values.
 
-    Until it gives some, a shadow over ``/out`` changes nothing for consumers, and with one over
-    ``/in`` nothing reaches the device. Leaving the ``with`` block lifts the shadow, unless it was
-    laid with ``keep``.
+    Before the program gives values, a shadow over ``/out`` changes nothing for consumers. A shadow
+    over ``/in`` then keeps all writes from the device. Leaving the ``with`` block lifts the shadow,
+    unless it was created with ``keep``.
     """
 
     def __init__(
@@ -83,10 +84,13 @@ class Shadow:
         *,
         keep: bool,
     ) -> None:
-        """Take the shadow's properties. ``events``: a cursor created before the shadow was laid."""
+        """Wrap an existing injection. ``events`` is a cursor that is older than the injection."""
         self.source = source_writer.block.source
         self.number = number
-        """Number of the injection, with which any program may lift it or give values to it."""
+        """Number of the injection.
+
+        With it, any program may lift the injection or give values to it.
+        """
         self.direction = direction
         self._source_writer = source_writer
         self._events = events
@@ -104,9 +108,9 @@ class Shadow:
                 three cycles if that is longer.
 
         Returns:
-            The outcome of each value, under the path that you gave: SHADOWED if consumers see it,
-            or, for ``/in``, the outcome of a write. REJECTED: the shadow does not cover the path,
-            or was lifted.
+            The outcome of each value, with the path that you gave. SHADOWED: consumers see the
+            value. For ``/in``, it is the outcome of a write to the device. REJECTED: the shadow
+            does not cover the path, or was lifted.
 
         Raises:
             PathError: A path names nothing.
@@ -118,11 +122,12 @@ class Shadow:
         return as_given(values, self._source_writer.shadow(self.number, paths, timeout_s))
 
     def diverted(self, timeout_s: float | None = None) -> Iterator[Diversion]:
-        """Iterate over what this shadow has taken since it was laid, command by command, in order.
+        """Iterate over the commands whose values this shadow has taken since its creation.
 
-        Over ``/in``, these are the writes of others; over ``/out``, the values of inner shadows.
-        The values that the source delivers are in the frames. Each diversion is yielded once, even
-        if there are two iterators. The iterator ends when the shadow is lifted.
+        A shadow over ``/in`` takes the writes of other programs. A shadow over ``/out`` takes the
+        values of inner shadows; the values that the source delivers are in the frames. If there are
+        two iterators, each diversion goes to one of them. The iterator ends when the shadow is
+        lifted.
 
         Args:
             timeout_s: The iterator also ends after this time without a diversion; None waits
@@ -147,7 +152,9 @@ class Shadow:
         return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, self._events.take_missed())
 
     def lift(self) -> None:
-        """Lift the shadow: consumers see what they would see without it.
+        """Lift the shadow.
+
+        Consumers or the device then get the values that they would get without it.
 
         Raises:
             CommandError: The shadow was lifted already, or the source does not answer.
@@ -155,7 +162,7 @@ class Shadow:
         self._source_writer.lift(self.number)
 
     def close(self) -> None:
-        """Lift the shadow, unless it was laid with ``keep`` or somebody has lifted it.
+        """Lift the shadow, unless it was created with ``keep`` or a program has lifted it.
 
         Raises:
             CommandError: The source does not answer.
@@ -175,7 +182,7 @@ class Shadow:
 def written(
     block: Block, patterns: Iterable[str], events: Cursor[Event], next_event: Next, timeout_s: float | None
 ) -> Iterator[Diversion]:
-    """Iterate over the accepted commands to registers, each once its outcome is known.
+    """Iterate over the accepted commands to registers. Yield a command when its outcome is known.
 
     Args:
         block: The source's block.
@@ -216,7 +223,7 @@ def _written(
 
 
 class _Laid(NamedTuple):
-    """A declared injection that this program has laid."""
+    """A declared injection that this program has created."""
 
     source_writer: SourceWriter
     number: int
@@ -226,7 +233,7 @@ class _Laid(NamedTuple):
         """Lift the injection.
 
         Raises:
-            CommandError: It is over, was lifted, or the source does not answer.
+            CommandError: The injection is over or was lifted, or the source does not answer.
         """
         self.source_writer.lift(self.number)
 
@@ -239,8 +246,8 @@ def compile_declarations(
     Args:
         declarations: What to compile.
         blocks: The instance's blocks, by source.
-        wanted: Called before each declaration; False cancels the compilation, which takes seconds
-            for many declarations over a large layout.
+        wanted: Called before each declaration. If it returns False, the compilation is cancelled. A
+            compilation of many declarations over a large layout takes seconds.
 
     Raises:
         ConfigError: A declaration is wrong; the message starts as ``injection[0].target: …``.
@@ -254,7 +261,7 @@ def compile_declarations(
     programs = []
     for index, declaration in enumerate(declarations):
         if not wanted():
-            raise CommandError("its program no longer waits for it")
+            raise CommandError("the compilation was cancelled: the program that requested it no longer waits")
         try:
             programs.append(compile_program(declaration, layouts, periods_ns))
         except ConfigError as error:
@@ -269,7 +276,12 @@ def _lay(
     *,
     keep: bool,
 ) -> list[_Laid]:
-    """Lay all declared injections, or none of them; ConfigError, CommandError."""
+    """Create all declared injections, or none of them.
+
+    Raises:
+        ConfigError: A declaration is wrong.
+        CommandError: A source refuses an injection, or does not answer.
+    """
     laid: list[_Laid] = []
     try:
         for program in compile_declarations(declarations, blocks):
@@ -287,7 +299,7 @@ def _lay(
 
 
 def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Declaration]:
-    """Read declarations from tables, and draw a seed for those that have none.
+    """Read declarations from tables. Draw a random seed for each declaration that has none.
 
     Raises:
         DeclarationError: A declaration is wrong.
@@ -302,11 +314,11 @@ def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Decla
 
 
 class Campaign(Following[Happening]):
-    """Declared injections that this program has laid.
+    """Declared injections that this program has created.
 
-    Iterate over it for their events: the iteration ends when all of them are lifted. It leaves out
-    events that were overwritten before they could be read. Leaving the ``with`` block lifts the
-    remaining injections, unless they were laid with ``keep``.
+    Iterate over the campaign to get their events. The iteration ends when all injections are
+    lifted. It leaves out events that were overwritten before the program read them. Leaving the
+    ``with`` block lifts the remaining injections, unless they were created with ``keep``.
     """
 
     def __init__(
@@ -318,11 +330,11 @@ class Campaign(Following[Happening]):
         *,
         keep: bool,
     ) -> None:
-        """Lay all the injections, or none.
+        """Create all the injections, or none.
 
         Args:
             segment: The instance's segment.
-            declarations: The injections to lay.
+            declarations: The injections to create.
             blocks: The instance's blocks, by source.
             source_writer: Returns the writer that sends commands to a block.
             keep: Whether the injections stay when this program ends.
@@ -375,7 +387,7 @@ class Campaign(Following[Happening]):
         )  # fmt: skip
 
     def close(self) -> None:
-        """Lift the remaining injections, unless they were laid with ``keep``."""
+        """Lift the remaining injections, unless they were created with ``keep``."""
         super().close()
         for one in () if self._keep else self._left.values():
             with suppress(CommandError):  # it is over, or somebody else has lifted it
@@ -384,10 +396,10 @@ class Campaign(Following[Happening]):
 
 
 def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
-    """Lift injections, given by writer and number. One that is lifted already is no error.
+    """Lift injections, given by writer and number. It is no error if one was lifted before.
 
     Raises:
-        CommandError: Some could not be lifted; the message gives the reasons.
+        CommandError: Some injections could not be lifted. The message gives the reasons.
     """
     asked: list[tuple[SourceWriter, PendingCommand]] = []
     chosen, reasons = list(injections), dict[str, None]()
@@ -411,7 +423,7 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
 
 
 def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, object]:
-    """Return values by the paths of their topics. ValueRangeError: two paths are the same."""
+    """Replace the paths in ``values`` by those of the topics. ValueRangeError: two are the same."""
     found: dict[str, object] = {}
     for topic, (path, value) in zip(topics, values.items(), strict=True):
         if topic.path in found:

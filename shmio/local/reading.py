@@ -40,9 +40,10 @@ class View:
 
     @property
     def section(self) -> int:
-        """Index that identifies the block.
+        """Index that identifies the block within this run of the instance.
 
-        A reload may replace a source's block. Frame numbers then start again at 1.
+        If a reload replaces a source's block, the new block has another index, and its frame
+        numbers start again at 1.
         """
         return self.block.section
 
@@ -74,7 +75,7 @@ class View:
         """
         topic = parse_topic(path, (self.source,), self.source)
         if topic.direction == "in":
-            raise PathError(f"{path}: a frame has only outputs of its source; leave out /in")
+            raise PathError(f"{path}: a frame has only the outputs of its source; leave out /in")
         return self._decode(topic.path, self.frame.image)
 
     def original(self, path: str) -> Value:
@@ -89,7 +90,7 @@ class View:
         return self._decode(parse_topic(path, (self.source,), self.source).path, self.frame.raw)
 
     def status(self, path: str) -> RegisterStatus | None:
-        """Return the status that the source gave a register; None if it gives registers none.
+        """Return the status that the source gave a register; None if the source gives no status.
 
         Args:
             path: Path of a register or element.
@@ -126,7 +127,8 @@ def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool
         block: The frame's block.
         register: The register.
         frame: The frame; None if the source has not published one yet.
-        aged: Whether to assess its quality now, by its age; otherwise it counts as at publication.
+        aged: True: assess the frame's quality now, by its age. False: use the quality that it had
+            at publication.
     """
     if frame is None:
         return Reading(block.source, register, None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
@@ -146,7 +148,7 @@ def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool
 
 
 def status_of(block: Block, register: Register, frame: Frame) -> RegisterStatus | None:
-    """Return the status that the source gave a register of a frame; None if it gives none."""
+    """Return the status that the source gave a register in a frame; None if it gives no status."""
     area = block.statuses
     return None if area is None else area.get(frame.raw, area.index(register))
 
@@ -160,5 +162,8 @@ def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:
 
 
 def holds_none(value: Value) -> bool:
-    """Return whether a value or an element of it is None: it could not be decoded."""
+    """Return whether a value, or an element of it, is None.
+
+    None stands for bytes that could not be decoded.
+    """
     return any(map(holds_none, value)) if isinstance(value, list) else value is None

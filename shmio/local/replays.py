@@ -1,6 +1,6 @@
 """Control replays from a local program. The sources of one recording always move together.
 
-This module also parses times and dates that users give.
+This module also parses the times and dates that users give.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ANSWER_S: Final = 5.0
 """Time-out for an answer that needs no search."""
 _SEARCH_S: Final = 600.0
 _TURN_NS: Final = 500_000_000
-"""Interval at which to check whether the caller has given up."""
+"""Interval at which a wait for an answer checks whether the caller has given up."""
 
 
 class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -45,11 +45,11 @@ class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
         speed: Speed relative to the instance's clock, 0.01 to 1000.
         seek: Position to go to: seconds from the start, or a date and time, which is local unless
             it has a time zone.
-        until: Position at which to pause once, given as ``seek``.
+        until: Position at which to pause once, in the same form as ``seek``.
         loop: Whether to start again at the end.
-        change: Path of a register: play to its next change, and pause there.
-        event: Kind of event: play to the next one, and pause there.
-        jump: With ``change`` or ``event``: go there at once instead of playing.
+        change: Path of a register: play until its next change, and pause there.
+        event: Kind of event: play until the next event of this kind, and pause there.
+        jump: With ``change`` or ``event``: go to that position at once instead of playing.
         sources: Only these sources, and others that replay the same recording; empty: all.
     """
 
@@ -72,11 +72,11 @@ class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
 class Replays:
     """The replays of an instance.
 
-    Several threads may use it; only one program moves them at a time.
+    Several threads may use it. Only one program at a time can move the replays.
     """
 
     def __init__(self, segment: Segment) -> None:
-        """Take the segment, which must be writable to change anything."""
+        """Create the object. ``segment`` must be writable for any method but :meth:`status`."""
         self._segment = segment
 
     def __call__(self, **wish: Unpack[Wish]) -> list[Playing]:
@@ -107,7 +107,7 @@ class Replays:
         return self.change(ReplayRequest(paused=True))
 
     def play(self, speed: float | None = None) -> list[Playing]:
-        """Resume all replays, and return their status. One that has reached its end starts again.
+        """Resume all replays, and return their status. A replay at its end starts again.
 
         Args:
             speed: Speed relative to the instance's clock, 0.01 to 1000; None: as before.
@@ -118,7 +118,11 @@ class Replays:
         return self.change(ReplayRequest(paused=False, speed=speed))
 
     def speed(self, speed: float) -> list[Playing]:
-        """Set the speed relative to the instance's clock, 0.01 to 1000. ValueRangeError."""
+        """Set the speed relative to the instance's clock, 0.01 to 1000, and return the status.
+
+        Raises:
+            ValueRangeError: The speed is out of range.
+        """
         return self.change(ReplayRequest(speed=speed))
 
     def seek(self, to: float | str) -> list[Playing]:
@@ -137,11 +141,11 @@ class Replays:
         return self.change(ReplayRequest(loop=on))
 
     def play_until(self, to: float | str) -> list[Playing]:
-        """Play to a position, given as in :meth:`seek`, and pause there."""
+        """Play until a position, in the same form as for :meth:`seek`, and pause there."""
         return self.change(ReplayRequest(paused=False, until=str(to)))
 
     def to_change(self, path: str, *, jump: bool = False) -> list[Playing]:
-        """Play to the next change of a register, and pause there.
+        """Play until the next change of a register, and pause there.
 
         Args:
             path: Path of the register.
@@ -154,14 +158,14 @@ class Replays:
         return self.change(ReplayRequest(change=path, jump=jump))
 
     def to_event(self, kind: str, *, jump: bool = False) -> list[Playing]:
-        """Play to the next event of a kind, of any source, and pause there.
+        """Play until the next event of a kind, of any source, and pause there.
 
         Args:
             kind: Kind of event, such as ``accepted`` or ``noted``, or ``any``.
             jump: Whether to go there at once, instead of playing.
 
         Raises:
-            CommandError: There is no such event any more.
+            CommandError: No such event follows in the recording.
         """
         return self.change(ReplayRequest(event=kind, jump=jump))
 
@@ -170,12 +174,12 @@ class Replays:
 
         Args:
             wanted: The request.
-            given_up: Polled during a search, which ends when it returns True.
+            given_up: Called at intervals during a search. The search ends when it returns True.
 
         Raises:
             ValueRangeError: The speed or a position is out of range.
             PathError: A source or a register does not exist.
-            CommandError: There is no replay, one refuses or does not answer, or the caller has
+            CommandError: There is no replay, a replay refuses or does not answer, or the caller has
                 given up the search.
         """
         if not self._segment.shared.writable:
@@ -207,7 +211,7 @@ class Replays:
         return found
 
     def _chosen(self, wanted: ReplayRequest) -> dict[str, PlayState]:
-        """Return the requested sources, and others that replay the same recordings."""
+        """Return the states of the requested sources and of all that replay the same recordings."""
         plays = self._plays()
         for source in wanted.sources:
             if source not in plays:
@@ -223,7 +227,11 @@ class Replays:
         return {source: play for source, play in plays.items() if _recording(play) in meant}
 
     def _register(self, path: str) -> tuple[str, str]:
-        """Split the path of a replayed register into source and path; PathError."""
+        """Split the path of a replayed register into source and path.
+
+        Raises:
+            PathError: There is no such register.
+        """
         blocks = self._blocks()
         topic = parse_topic(path, self._segment.blocks, next(iter(blocks)) if len(blocks) == 1 else None)
         if topic.source not in blocks:
@@ -233,7 +241,7 @@ class Replays:
 
     @contextmanager
     def _held(self, sources: Collection[str]) -> Iterator[dict[str, Playhead]]:
-        """Lock the playheads of sources, so that no other program moves them."""
+        """Lock the playheads of sources, so that no other program can move them."""
         blocks = self._blocks()
         heads = {source: head for source in blocks if source in sources and (head := blocks[source].playhead)}
         with ExitStack() as stack:
@@ -244,7 +252,7 @@ class Replays:
     # ---- moves -----------------------------------------------------------------------------------------------------
 
     def _go_to(self, wanted: ReplayRequest, heads: Mapping[str, Playhead], given_up: Callable[[], bool]) -> None:
-        """Pause, search ahead, and play or jump to what was found."""
+        """Pause, search for the next change or event, and play until it or jump to it."""
         self._move(heads, lambda _, clock_ns: MoveRequest(clock_ns, paused=True))
         searched = dict(heads)
         path = ""
@@ -269,7 +277,10 @@ class Replays:
             self._move(heads, lambda _, now: MoveRequest(now, paused=False, until_ns=at_ns, speed=wanted.speed))
 
     def _move(self, heads: Mapping[str, Playhead], move: Callable[[PlayState, int], MoveRequest]) -> None:
-        """Change the movement of all playheads at the same time of the clock."""
+        """Send a request to each playhead.
+
+        All of them take effect at the same time of the clock.
+        """
         clock_ns = self._segment.clock.read().time_ns  # a step under way counts: no source answers before its end
         asks: dict[str, PlayheadRequest] = {}
         for source, head in heads.items():
@@ -311,7 +322,7 @@ class Replays:
             if rest_ns <= 0:
                 raise CommandError(f"source {source} does not answer: {self._state(source)}")
             if given_up():
-                raise CommandError(f"source {source} has not answered in time")
+                raise CommandError(f"the search in source {source} was given up before it ended")
             ring.wait(seen, min(rest_ns, _TURN_NS))
 
     def _state(self, source: str) -> str:
@@ -326,7 +337,7 @@ def _recording(play: PlayState) -> tuple[int, int, int]:
 
 
 def _move_request(play: PlayState, wanted: ReplayRequest, clock_ns: int) -> MoveRequest:
-    """Convert a request to the move of one source.
+    """Convert a request of a program to the request to one playhead.
 
     Raises:
         ValueRangeError: A position is not in the recording.
@@ -350,7 +361,7 @@ def _position(play: PlayState, text: str) -> int:
         ) from None
     if not play.begin_ns <= position_ns <= play.end_ns:
         length_s = (play.end_ns - play.begin_ns) / 1e9
-        raise ValueRangeError(f"{text} is outside the played part, which is {length_s:.3f} s long")
+        raise ValueRangeError(f"{text} is outside the played range, which is {length_s:.3f} s long")
     return position_ns
 
 

@@ -1,4 +1,4 @@
-"""Status of an instance, read from its segment without the help of any process."""
+"""Read the status of an instance from its shared memory. No other process has to answer."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from shmio.segment.processes import Phase, ProcessSlot
 from shmio.segment.segment import Segment, running_instances
 
 SILENT_S = 5.0
-"""Time without a heartbeat after which a supervisor counts as stopped or hanging."""
+"""A supervisor without a heartbeat for this time is reported as not responding."""
 
 
 class ProcessStatus(msgspec.Struct, kw_only=True):
-    """Status of one process. If it is not alive, ``uptime_s`` is 0 and ``pid`` is null."""
+    """Status of one process. If the process is not alive, ``uptime_s`` is 0 and ``pid`` is null."""
 
     name: str
     kind: str
@@ -57,8 +57,8 @@ class SupervisorStatus(msgspec.Struct):
 class ClockStatus(msgspec.Struct):
     """Status of the instance's clock. ``mode`` is wall or virtual, ``step`` the last finished step.
 
-    ``note`` says which processes a step waits for, why the last step failed, or what it did not
-    move. Before the first step, it says how to return to real time.
+    ``note`` says which processes a step waits for, why the last step failed, or on which sources it
+    had no effect. Before the first step, it says how to return to real time.
     """
 
     mode: str
@@ -97,9 +97,9 @@ def read_status(instance: str, config: str | None = None, file: Path | None = No
 
     Args:
         instance: Name of the instance.
-        config: Option of the commands in the note, such as ``-c plc.toml``; empty if none is
-            needed, None if unknown.
-        file: The configuration that the instance must have been started from; None: any.
+        config: Option that the commands in the note need to name the configuration, such as ``-c
+            plc.toml``. Empty: they need none. None: unknown.
+        file: Configuration file from which the instance must have been started; None: any.
 
     Raises:
         WrongInstanceError: The instance was started from another configuration.
@@ -122,8 +122,8 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
     Args:
         segment: The segment.
         remedy: Advice for the note if the supervisor is dead.
-        asking: Kind of the calling process, if it belongs to the instance: it counts as alive,
-            because a process cannot see its own lock.
+        asking: Kind of the calling process, if it belongs to the instance; else empty. That process
+            is reported as alive, because it cannot see its own lock.
     """
     supervised = segment.supervised
     pid, state = segment.supervisor
@@ -140,9 +140,9 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
     )
     if not supervised:
         if not any(process.pid for process in processes):
-            status.note = "its supervisor died and left the segment; the next up or down clears it"
+            status.note = "its supervisor died and left the segment; the next shmio-supervisor up or down clears it"
             return status
-        status.note = f"its supervisor is dead, nothing watches the processes; {remedy}"
+        status.note = f"its supervisor is dead, so nothing watches the processes; {remedy}"
         status.state = str(InstanceState.DEGRADED)
     else:
         status.supervisor = SupervisorStatus(pid, _seconds(now_ns - segment.supervised_since_ns))
@@ -163,7 +163,7 @@ def clock_status(state: Clock) -> ClockStatus:
 
 
 def supervisor_silence(segment: Segment) -> str | None:
-    """Describe a living supervisor without a heartbeat, with the remedy; None if there is none."""
+    """Return a message if the supervisor does not respond, with the remedy; None if it responds."""
     silent_s = (time.monotonic_ns() - segment.supervisor_heartbeat_ns) / 1e9
     if silent_s < SILENT_S:
         return None
@@ -176,7 +176,7 @@ def supervisor_silence(segment: Segment) -> str | None:
 
 
 def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], note: str) -> InstanceState:
-    """Return the supervisor's state while it starts or stops; else, the state of the processes."""
+    """Return the supervisor's state while it starts or stops, else that of its processes."""
     if told not in (InstanceState.RUNNING, InstanceState.DEGRADED):
         return told
     running = [p.state == str(Phase.RUNNING) and not complaint(p.kind, p.note) for p in processes]
@@ -184,9 +184,9 @@ def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], n
 
 
 def complaint(kind: str, note: str) -> str:
-    """Return the problem that the note of a running process reports; empty if there is none.
+    """Return the note of a running process if the note reports a problem, else an empty text.
 
-    A recorder without a problem reports ``to FILE``.
+    The note ``to FILE`` of a recorder is no problem.
     """
     return (
         note if kind in ("mqtt", "grpc", "opcua", "web") or (kind == "recorder" and not note.startswith("to ")) else ""
@@ -197,8 +197,10 @@ def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: s
     """Return the state of a started instance: degraded if any part has a problem, else running.
 
     Args:
-        running: For each process, whether it runs without a :func:`complaint`.
-        qualities: Quality of each source; None: no frame yet.
+        running: For each process, whether it runs and its note reports no problem
+            (:func:`complaint`).
+        qualities: Quality of each source's newest frame; None: the source has published no frame
+            yet.
         note: Any other problem of the instance.
     """
     healthy = not note and all(running) and not any(q in (None, Quality.BAD) for q in qualities)

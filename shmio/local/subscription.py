@@ -1,6 +1,6 @@
 """Follow registers of a local instance: their present values, then each change.
 
-This module also has the base class of iterators that several blocks wake.
+This module also has :class:`Following`, the base class of iterators over several blocks.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ Item = TypeVar("Item")
 class Following(Generic[Item]):
     """Base of iterators over frames or events of several blocks.
 
-    One thread may iterate; any thread may close the iterator. Each followed block has a relay that
-    wakes it, for frames and events alike.
+    One thread may iterate, and any thread may close the iterator. For each followed block, a relay
+    wakes the iterator at each frame and each event.
     """
 
     def __init__(self, segment: Segment) -> None:
@@ -72,11 +72,15 @@ class Following(Generic[Item]):
             poll.poll(1000 * max(0.0, min(TURN_S, self._due_s - now_s)))
 
     def _take(self) -> Item | None:
-        """Return the next item if there is one. StopIteration: none will come."""
+        """Return the next item; None if there is none yet.
+
+        Raises:
+            StopIteration: No further item can come.
+        """
         raise NotImplementedError
 
     def _follow(self, block: Block) -> None:
-        """Let a block wake this iterator."""
+        """Let the frames and events of a block wake this iterator."""
         self._relays[block.section] = Relay(block.ring, f"following-{block.source}", round(TURN_S * 1e9))
 
     def _leave(self, block: Block) -> None:
@@ -113,7 +117,7 @@ def _stop(relays: dict[int, Relay]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """One frame of a source, with its readings: see :class:`shmio.model.cell.Update`."""
+    """One frame of a source with its readings. Implements :class:`shmio.model.cell.Update`."""
 
     source: str
     frame: int
@@ -130,7 +134,10 @@ class Update:
 
 
 class Subscription(Following[Update]):
-    """A :class:`shmio.model.cell.Subscription` of a local instance."""
+    """Updates of registers of a local instance.
+
+    Implements :class:`shmio.model.cell.Subscription`.
+    """
 
     def __init__(
         self,
@@ -147,7 +154,7 @@ class Subscription(Following[Update]):
             segment: The instance's segment.
             blocks: Returns the instance's present blocks, by source.
             patterns: Names of the registers to follow.
-            every_frame: Whether to give an update for each frame.
+            every_frame: Whether each frame gives an update, even if no register has changed.
             max_rate_hz: Maximum number of updates per second of each source; 0: no limit.
         """
         super().__init__(segment)
@@ -198,7 +205,10 @@ class Subscription(Following[Update]):
         self._follow(block)
 
     def _succeed(self, old: _Follower) -> Update | None:
-        """Follow the block that has replaced a retired one; if none has, return the last update."""
+        """Follow the block that has replaced a retired block.
+
+        If a reload has removed the source, return the source's last update.
+        """
         self._segment.require_running()
         self._followers.remove(old)
         self._leave(old.block)
@@ -215,22 +225,22 @@ class Subscription(Following[Update]):
 
 
 def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) -> None:
-    """Raise ValueRangeError for arguments that an endpoint would refuse, too."""
+    """Raise ValueRangeError for invalid arguments, as the endpoints do."""
     if not patterns:
         raise ValueRangeError("no pattern is given: name a path, a structure, a glob, or a source")
     if not 0 <= max_rate_hz < math.inf:
-        raise ValueRangeError(f"max_rate_hz: {max_rate_hz} is not a number from 0 on")
+        raise ValueRangeError(f"max_rate_hz must be 0 or a positive number, not {max_rate_hz}")
     if max_rate_hz and every_frame:
-        raise ValueRangeError("max_rate_hz and every_frame exclude each other")
+        raise ValueRangeError("max_rate_hz and every_frame cannot be used together: give only one of them")
 
 
 class _Follower:
-    """Follows the registers of one block, and keeps the frame of the last update."""
+    """Follows the registers of one block, and compares each frame with that of the last update."""
 
     def __init__(self, block: Block, registers: Sequence[Register], *, every_frame: bool, interval_s: float) -> None:
         self.block = block
         self.due_s = math.inf
-        """Earliest time of the next update, if ``max_rate_hz`` delays it."""
+        """Earliest time of the next update if ``max_rate_hz`` delays it: monotonic clock, in s."""
         self._registers = registers
         self._scan = ChangeScan(registers, block.statuses)
         self._frames = FrameFollower(block)
@@ -271,7 +281,7 @@ class _Follower:
         )  # fmt: skip
 
     def _next(self) -> Frame | None:
-        """Return the next frame; None: there is none, or it is not due."""
+        """Return the next frame. None: there is none yet, or ``max_rate_hz`` delays it."""
         frames = self._frames
         if self._every_frame:
             return frames.poll()

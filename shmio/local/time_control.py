@@ -1,4 +1,4 @@
-"""Control an instance's time: take over, step, play and release it."""
+"""Control an instance's time: take it over, step it, play it and release it."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from shmio.segment.segment import Segment
 MIN_STEP_NS: Final = 1_000
 MAX_STEP_NS: Final = 3_600_000_000_000
 _TURN_NS: Final = 100_000_000
-"""Polling interval of a wait for the owner of time: an owner that dies rings no doorbell."""
+"""Interval at which a wait for the owner of time checks whether that process has died."""
 MAX_RATE: Final = 1000.0
 _DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
-"""Kinds of processes whose delivery a step may wait for."""
+"""Kinds of processes that deliver steps to clients or to a recording. A step may wait for them."""
 _PATIENCE_S: Final = 2.0
-"""Time to wait until the owner gives up time.
+"""Time to wait until the owner of time gives up its ownership.
 
 The gRPC endpoint gives it up when its clients are idle.
 """
 _LATE_NS: Final = 500_000_000
-"""Maximum delay for which playing catches up."""
+"""If playing is late by more than this time, it does not catch up."""
 
 _NOBODY: Final = (
     "no source uses the instance clock, so stepping has no effect; sources with a device continue in real time"
@@ -60,10 +60,10 @@ class Step:
 
 
 class StepWait(NamedTuple):
-    """A wait within a step: until a doorbell's value is not ``seen``, at most ``rest_ns``.
+    """What a step waits for: until a doorbell's value differs from ``seen``, at most ``rest_ns``.
 
-    The doorbell is that of ``block``, which has not answered. If ``block`` is None, it is that of
-    the processes that deliver steps.
+    It is the doorbell of ``block``, whose source has not answered yet. If ``block`` is None, it is
+    the doorbell that processes ring when they have delivered a step.
     """
 
     block: Block | None
@@ -74,9 +74,9 @@ class StepWait(NamedTuple):
 class Coordinator:
     """Moves the time of one instance. Several threads may use it; one program at a time owns time.
 
-    A step begins when the clock page announces its number. Each source that uses the instance clock
-    then publishes a frame for it, and the step is ``done``. Finally, this process and others that
-    serve remote programs deliver the step to them.
+    A step begins when the coordinator writes its number to the clock page. Each source that uses
+    the instance clock then publishes a frame for the step, and the step is ``done``. Finally, this
+    process and others deliver the frames of the step to remote programs and recordings.
     """
 
     def __init__(
@@ -92,9 +92,9 @@ class Coordinator:
         Args:
             segment: The instance's segment, writable. A process that delivers steps must pass the
                 segment object with which it has locked its slot.
-            soft_s: Soft time-out of a step: from then on, the log and the clock page name the
-                process that it waits for.
-            hard_s: Hard time-out of a step: it has failed.
+            soft_s: Soft time-out of a step: after this time, the log and the clock page name the
+                processes that the step waits for.
+            hard_s: Hard time-out of a step: after this time, the step has failed.
             deliver: Called within :meth:`step` when all sources have done the step.
         """
         self._segment = segment
@@ -113,7 +113,7 @@ class Coordinator:
         """Take over time: from now on only steps move it.
 
         Args:
-            patience_s: Time to wait, in s, until an owner that does not play gives it up.
+            patience_s: Time to wait, in s, until an owner that does not play gives up time.
             steps: Whether a step follows at once. Then the clock gets no note about stopped time.
 
         Raises:
@@ -141,7 +141,7 @@ class Coordinator:
             self._ring_all()
 
     def release(self, patience_s: float = 0.0) -> None:
-        """Return to real time, which continues from the present virtual time. Nobody owns it then.
+        """Return to real time. The clock continues from the present virtual time, without an owner.
 
         Args:
             patience_s: Time to wait, in s, until an owner that does not play gives it up.
@@ -167,7 +167,7 @@ class Coordinator:
             self._ring_all()
 
     def check_release(self) -> None:
-        """Raise TimeError if time cannot be released here, whoever owns it."""
+        """Raise TimeError if this instance always runs in virtual time."""
         self._check_writable()
         if self._segment.clock.stepped:
             raise TimeError(
@@ -176,7 +176,7 @@ class Coordinator:
             )
 
     def set_step_size(self, dt_ns: int) -> None:
-        """Set the default length of a step; take over time.
+        """Take over time, and set the default length of a step.
 
         Raises:
             ValueRangeError: The length is not within 1 us and 1 h.
@@ -188,7 +188,7 @@ class Coordinator:
             self._write(self.read()._replace(step_size_ns=dt_ns))
 
     def set_playing(self, playing: bool, rate: float = 1.0) -> None:
-        """Announce whether the owner plays time, and at which rate; take over time.
+        """Take over time, and announce whether this process plays it, and at which rate.
 
         Raises:
             ValueRangeError: The rate is not above 0 and at most 1000.
@@ -201,9 +201,9 @@ class Coordinator:
             self._write(self.read()._replace(playing=playing, rate=rate))
 
     def step(self, dt_ns: int | None = None) -> Step:
-        """Move time by one step, and wait until it is done and delivered; take over time.
+        """Take over time, move it by one step, and wait until the step is done and delivered.
 
-        A failed step also uses up its number and its time.
+        Even if the step fails, its number is used, and time has moved.
 
         Args:
             dt_ns: Length of the step; None: the step size.
@@ -226,7 +226,7 @@ class Coordinator:
                     block.ring.wait(seen, rest_ns)
 
     def stepping(self, dt_ns: int | None = None) -> Generator[StepWait, None, Step]:
-        """Do a step for an event loop: yield what to wait for, and check again when resumed.
+        """Do a step without blocking: yield what to wait for, and check again when resumed.
 
         Close the generator if you do not run it to its end. Call no other method of this
         coordinator meanwhile.
@@ -290,7 +290,7 @@ class Coordinator:
             bell.wait(seen, min(rest_ns, _TURN_NS))
 
     def _frozen(self, state: Clock) -> Clock:
-        """Return a state of virtual time that continues the wall time of ``state`` from now."""
+        """Return the state for a change from wall time to virtual time at the present moment."""
         now_ns = self._segment.clock_ns(time.monotonic_ns()) + state.offset_ns
         step = max([state.step, *(self._cycle(block, state, now_ns) for block in self._participants())])
         return state._replace(mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns, resumed_ns=0, offset_ns=0)
@@ -301,7 +301,7 @@ class Coordinator:
 
     @staticmethod
     def _cycle(block: Block, state: Clock, now_ns: int) -> int:
-        """Return the present cycle of a free-running block, or a later one that it has published.
+        """Return the present cycle of a block in wall time; at least that of its newest frame.
 
         For a block that replays a recording, return 0: the recording's cycles are not steps.
         """
@@ -320,7 +320,10 @@ class Coordinator:
                 self._segment.clock.slot_bell(slot.index).ring()
 
     def _await_frames(self, number: int, participants: Sequence[Block], asked: Clock) -> Generator[StepWait, None, str]:
-        """Wait for each block's frame for a step; return a text about failures, or an empty one."""
+        """Wait until each source has done a step.
+
+        Return a text about failures; empty: none failed.
+        """
         begun_ns = time.monotonic_ns()
         waiting = list(participants)
         problems: list[str] = []
@@ -348,7 +351,10 @@ class Coordinator:
         return "; ".join(problems)
 
     def _await_delivery(self, number: int) -> Generator[StepWait, None, str]:
-        """Wait until others have delivered a step; return a text about those that have not."""
+        """Wait until other processes have delivered a step.
+
+        Return a text about those that have not.
+        """
         clock, begun_ns = self._segment.clock, time.monotonic_ns()
         rung = warned = False
         while True:
@@ -362,10 +368,10 @@ class Coordinator:
                 return ""
             names = ", ".join(f"{slot.name} (pid {slot.report.pid})" for slot in waiting)
             if passed_ns >= self._hard_ns:
-                return f"not delivered within {self._hard_ns / 1e9:g} s by {names}"
+                return f"{names} did not deliver the step within {self._hard_ns / 1e9:g} s"
             if passed_ns >= self._soft_ns and not warned:
                 warned = True
-                log.warning("step %d waits for its delivery by %s", number, names)
+                log.warning("step %d waits until %s deliver it", number, names)
             # With a time limit, because a process that dies rings no doorbell.
             yield StepWait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
 
@@ -377,7 +383,7 @@ class Coordinator:
         return last is not None and last < number and slot.alive()  # alive() ignores the lock of this process
 
     def _owner(self, pid: int) -> str:
-        """Name the owner of time, by the clock page and the process table."""
+        """Return name and pid of the owner of time, for a message."""
         names = [slot.name for slot in self._segment.processes if pid and slot.report.pid == pid and slot.alive()]
         return f"{names[0]} (pid {pid})" if names else f"another program (pid {pid})"
 
@@ -400,7 +406,7 @@ class Timekeeper:
         """Move time by one step, as :meth:`Coordinator.step` does.
 
         Raises:
-            TimeError: As for that method, or time is being played.
+            TimeError: As for :meth:`Coordinator.step`; or time is being played.
             ValueRangeError: The length is not within 1 us and 1 h.
         """
         if self._player is not None:
@@ -481,11 +487,11 @@ class Timekeeper:
 def check_step(dt_ns: float) -> None:
     """Raise ValueRangeError if a step may not have this length."""
     if not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
-        raise ValueRangeError(f"a step is from 0.001 ms to 3600000 ms (1 h), not {dt_ns / 1e6:g} ms")
+        raise ValueRangeError(f"the length of a step must be from 0.001 ms to 3600000 ms (1 h), not {dt_ns / 1e6:g} ms")
 
 
 def _step_answer(block: Block, number: int) -> str | None:
-    """Return a block's answer to a step: empty if done, the reason if failed, None if missing."""
+    """Return a source's answer to a step: empty if done, the reason if failed, None if missing."""
     if block.retired:
         return ""  # a reload has retired the block
     try:
@@ -513,12 +519,12 @@ def _describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
 
 
 def _take_over_note(participants: Sequence[Block]) -> str:
-    """Return the clock's note for the time from take-over to the first step."""
+    """Return the clock's note for the time between the take-over and the first step."""
     return _PAUSED if participants else f"{_NOBODY}{_REAL}"
 
 
 def _unmoved_note(segment: Segment, participants: Sequence[Block]) -> str:
-    """Return a text about what a step does not move, with the remedy; empty if it moves all."""
+    """Return a note about sources on which a step has no effect, with the remedy; empty: none."""
     if not participants:
         return _NOBODY if segment.clock.stepped else f"{_NOBODY}{_REAL}"
     found: dict[str, list[str]] = {"paused": [], "over": []}

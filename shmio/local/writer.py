@@ -37,10 +37,13 @@ if TYPE_CHECKING:
 
 TIMEOUT_S: Final = 2.0
 MIN_PERIODS: Final = 3
-"""By default, a command may wait for TIMEOUT_S or this number of cycles, whichever is longer."""
+"""Minimum number of cycles that a command may wait by default.
+
+If TIMEOUT_S is longer than these cycles, the command may wait for that time.
+"""
 _MODELS: Final = frozenset({"simulation", "remote"})  # connectors of sources with registers that only a model writes
 PATIENCE_S: Final = 1.0
-"""Additional time for the device's answer to arrive."""
+"""Additional time, after a command's deadline, in which the device's answer may arrive."""
 RETIRED: Final = "the source was changed or removed by a reload"
 _UNKNOWN: Final = "; it is not known whether the value was written"
 RESTARTED: Final = f"the source was restarted meanwhile{_UNKNOWN}"
@@ -49,9 +52,9 @@ SILENT: Final = f"the source gave no answer in time{_UNKNOWN}"
 
 
 class CommandSender:
-    """Sends a writer's commands to one block.
+    """Puts commands into one writer's queue of a block.
 
-    The process must have locked the slot to which the command queue belongs.
+    This process must have locked the process slot to which the queue belongs.
     """
 
     def __init__(self, block: Block, writer: int) -> None:
@@ -76,8 +79,8 @@ class CommandSender:
             writes: The items.
             deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
             kind: Kind of command.
-            injection: The injection to lift, or to give values to.
-            laid: Options of a new injection.
+            injection: Number of the injection to lift, or to give values to.
+            laid: Options of the injection to create.
 
         Returns:
             The command's number.
@@ -87,7 +90,7 @@ class CommandSender:
         """
         source = self.block.source
         if (len(writes) > 0) == (kind in EMPTY) or len(writes) > MAX_WRITES:
-            raise CommandError(f"{source}: a command has 1 to {MAX_WRITES} items, this has {len(writes)}")
+            raise CommandError(f"{source}: a command must have 1 to {MAX_WRITES} items, but this one has {len(writes)}")
         with self._turn:
             number, self._next = self._next, self._next + 1
             incarnation = self.block.incarnation
@@ -97,7 +100,7 @@ class CommandSender:
             if len(record) + 8 > queues.capacity:
                 most = queues.capacity - 8
                 raise CommandError(
-                    f"{source}: a command of {len(record)} bytes, at most {most} are allowed: write fewer at once"
+                    f"{source}: the command has {len(record)} bytes, but at most {most} are allowed: write fewer values"
                 )
             if self._pid != os.getpid():
                 raise CommandError("this process was forked from the one that attached: attach again in this process")
@@ -110,7 +113,7 @@ class CommandSender:
 
 @dataclass(slots=True)
 class PendingCommand:
-    """A command whose outcome is not known yet, with the event cursor that will find it."""
+    """A command whose outcome is not known yet. ``events`` is the cursor with which to find it."""
 
     number: int
     paths: tuple[str, ...]
@@ -141,9 +144,9 @@ class SourceWriter:
         self._sender = CommandSender(block, writer)
 
     def prepare(self) -> None:
-        """Determine which bits are writable now, instead of in the first :meth:`submit`.
+        """Determine now which bits are writable, so that the first :meth:`submit` does not have to.
 
-        This takes seconds for a large layout.
+        For a large layout, this takes seconds.
         """
         _ = self._writable
 
@@ -163,7 +166,7 @@ class SourceWriter:
         return cover(self.block.layout, self.block.attributes.writable)
 
     def submit(self, values: Mapping[str, object], timeout_s: float | None = None) -> PendingCommand:
-        """Send values as one command, without waiting. The source accepts all of them or none.
+        """Send values as one command, without waiting. The source accepts all values or none.
 
         Args:
             values: Values of registers, whole arrays or elements, by path within the block.
@@ -178,7 +181,7 @@ class SourceWriter:
         return self._send_values({path: (self._register(path), value) for path, value in values.items()}, timeout_s)
 
     def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Give values to an injection: over ``/out`` for consumers, over ``/in`` for the device.
+        """Give values to an injection. They go to consumers (``/out``) or the device (``/in``).
 
         Raises:
             PathError: There is no such register.
@@ -190,7 +193,7 @@ class SourceWriter:
         return self.outcomes(self._send_values(found, timeout_s, CommandKind.SHADOW, injection))
 
     def joined(self, values: Mapping[str, object], raw: Iterable[Write] = ()) -> list[Write]:
-        """Encode values, add ``raw`` writes, and merge adjacent writes.
+        """Encode values as writes, add the writes ``raw``, and join adjacent writes.
 
         Raises:
             PathError: There is no such register.
@@ -208,14 +211,18 @@ class SourceWriter:
         return merge(image, bits, ranges)
 
     def give(self, injection: int, writes: Sequence[Write], timeout_s: float | None = None) -> PendingCommand:
-        """Send writes made by :meth:`joined` as values of an injection. CommandError: not sent."""
+        """Send writes made by :meth:`joined` as values of an injection, without waiting.
+
+        Raises:
+            CommandError: The command could not be sent.
+        """
         return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)
 
     def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]) -> int:
-        """Lay an injection over all registers that patterns name, and return its number.
+        """Create an injection over all registers that patterns name, and return its number.
 
-        Consumers see no change until it gets values. See :func:`shmio.layout.values.write.cover`
-        for the patterns.
+        Consumers see no change until the injection gets values. See
+        :func:`shmio.layout.values.write.cover` for the patterns.
 
         Raises:
             PathError: There is no such register.
@@ -231,19 +238,24 @@ class SourceWriter:
     def lay(
         self, bits: Sequence[Write], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]
     ) -> PendingCommand:
-        """Request an injection over the bits that these writes would set, without waiting.
+        """Request an injection over the bits that are set in ``bits``, without waiting.
 
-        The injection's number is that of the returned command. CommandError: not sent.
+        The injection has the number of the returned command.
+
+        Raises:
+            CommandError: The command could not be sent.
         """
         return self._send(("",), bits, timeout_s, CommandKind.INJECT, **laid)
 
     def declare(self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False) -> int:
-        """Lay a declared injection, which the source runs by itself, and return its number.
+        """Create a declared injection, which the source runs by itself, and return its number.
 
-        It ends with this process, unless ``keep`` is set. The source checks the declaration.
+        The injection ends when this process ends, unless ``keep`` is set. The source checks the
+        declaration.
 
         Raises:
-            CommandError: The source refuses, with the reason, or does not answer.
+            CommandError: The source refuses the declaration, or does not answer. The message gives
+                the reason.
         """
         ticket = self.ask_to_declare(declaration, timeout_s, keep=keep)
         self._expect(ticket, EventKind.INJECTED)
@@ -252,9 +264,12 @@ class SourceWriter:
     def ask_to_declare(
         self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False
     ) -> PendingCommand:
-        """Request a declared injection, without waiting. CommandError: not sent.
+        """Request a declared injection, without waiting.
 
-        The injection's number is that of the returned command.
+        The injection has the number of the returned command.
+
+        Raises:
+            CommandError: The command could not be sent.
         """
         writes = [Write(0, 0, msgspec.json.encode(declaration))]
         return self._send(("",), writes, timeout_s, CommandKind.DECLARE, keep=keep, name=declaration.name)
@@ -271,19 +286,27 @@ class SourceWriter:
         except UnicodeEncodeError as error:  # from a terminal that is not UTF-8
             raise ValueRangeError(f"a note must be UTF-8 text, but character {error.start + 1} is not") from None
         if not 0 < size <= MAX_NAME_BYTES:
-            raise ValueRangeError(f"a note has 1 to {MAX_NAME_BYTES} bytes in UTF-8, this has {size}")
+            raise ValueRangeError(f"a note must have 1 to {MAX_NAME_BYTES} bytes in UTF-8, but this one has {size}")
         self._expect(self._send(("",), [], timeout_s, CommandKind.NOTE, name=text), EventKind.NOTED)
 
     def lift(self, injection: int, timeout_s: float | None = None) -> None:
-        """Lift an injection, whoever laid it. CommandError: no such injection, or no answer."""
+        """Lift an injection, whichever program created it.
+
+        Raises:
+            CommandError: There is no such injection, or the source does not answer.
+        """
         self.expect_lifted(self.ask_to_lift(injection, timeout_s))
 
     def ask_to_lift(self, injection: int, timeout_s: float | None = None) -> PendingCommand:
-        """Request that an injection be lifted, without waiting. CommandError: not sent."""
+        """Request that the source lift an injection, without waiting.
+
+        Raises:
+            CommandError: The command could not be sent.
+        """
         return self._send(("",), [], timeout_s, CommandKind.LIFT, injection)
 
     def expect_lifted(self, ticket: PendingCommand) -> None:
-        """Wait until a requested lift is done.
+        """Wait until the source has lifted an injection as requested by :meth:`ask_to_lift`.
 
         Raises:
             CommandError: The source refuses or does not answer.
@@ -344,7 +367,7 @@ class SourceWriter:
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Send values as one command, and wait for their outcomes.
 
-        Errors are those of :meth:`submit`.
+        It raises the same errors as :meth:`submit`.
         """
         return self.outcomes(self.submit(values, timeout_s))
 
@@ -362,7 +385,7 @@ class SourceWriter:
             raise CommandError(f"{self.block.source}/{register.path} is not writable; {remedy}")
 
     def _next(self, ticket: PendingCommand) -> Event | None:
-        """Return the next event about a command; None if none comes in time."""
+        """Return the next event about a command; None if no event comes in time."""
         while (rest_ns := ticket.until_ns - time.monotonic_ns()) > 0:
             event = ticket.events.next(rest_ns / 1e9)
             if event is None:

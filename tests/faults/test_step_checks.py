@@ -37,7 +37,7 @@ def test_steps_that_are_whole_or_fail_by_name_pass(found: list[str]) -> None:
     check.done(BEFORE, 8, 50 * MS, AFTER, answers(follow=kept))
     failed = AFTER._replace(done=7)
     check.failed(BEFORE, "step 8: panel: no answer within 10 s from pid 5", 50 * MS, failed)
-    check.failed(BEFORE, "step 8: not delivered within 10 s by recorder (pid 5)", 50 * MS, AFTER)
+    check.failed(BEFORE, "step 8: recorder (pid 5) did not deliver the step within 10 s", 50 * MS, AFTER)
     check.failed(BEFORE, "the time of instance 'x' is moved by another program (pid 12)", 50 * MS, BEFORE)
     for after in (BEFORE, failed, AFTER):
         check.unclear(BEFORE, 50 * MS, after)

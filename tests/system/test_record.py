@@ -123,8 +123,8 @@ def test_notes_and_process_deaths_are_recorded(make_cell: Callable[..., Cell]) -
     done = cell.run("shmio-dump", "note", "Greifer getauscht")
     assert (done.returncode, done.stderr) == (0, ""), cell.logs()
     for arguments, message in (
-        (["x" * 257], "a note has 1 to 256 bytes in UTF-8, this has 257"),
-        ([""], "a note has 1 to 256 bytes in UTF-8, this has 0"),
+        (["x" * 257], "a note must have 1 to 256 bytes in UTF-8, but this one has 257"),
+        ([""], "a note must have 1 to 256 bytes in UTF-8, but this one has 0"),
         (["Greifer \udce4b"], "a note must be UTF-8 text, but character 9 is not"),
         (["x", "--source", "press"], "no source 'press'; there are: cell"),
     ):

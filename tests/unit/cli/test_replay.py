@@ -71,7 +71,7 @@ def test_impossible_requests_are_refused_in_one_line(
     playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert replay(instance, "seek", "900") == 1
-    assert capsys.readouterr().err == "900 is outside the played part, which is 0.400 s long\n"
+    assert capsys.readouterr().err == "900 is outside the played range, which is 0.400 s long\n"
     assert replay(instance, "status", "--source", "none") == 1
     assert capsys.readouterr().err == "source 'none' plays no recording; these do: cell\n"
     assert replay(instance, "seek", "0.2") == 0

@@ -82,7 +82,7 @@ def test_a_register_named_twice_counts_once() -> None:
         (["cell/speed", "sim/a"], "one direction of one source"),
         (["cell/speed", "cell/speed/in"], "one direction of one source"),
         (["cell/word", "cell/word.%X0"], ""),
-        (["cell/word.%X0", "cell/word"], "part of it is named twice"),
+        (["cell/word.%X0", "cell/word"], "names cell/word, or a part of it, twice"),
         (["cell/speed.%X0"], "REAL has no such part"),
         (["cell/bytes.%X0"], "has no such part"),
         (["cell/word.%X16"], "WORD has bits 0 to 15"),

@@ -465,7 +465,7 @@ def test_process_that_does_not_deliver_is_named(instance: str) -> None:
             slot.report = slot.report.__class__(pid=4711)
             other.clock.deliver(slot.index, 0)
             coordinator = Coordinator(segment, soft_s=HARD_S, hard_s=HARD_S)
-            with pytest.raises(TimeError, match=r"step 1: not delivered within 0.05 s by grpc \(pid 4711\)"):
+            with pytest.raises(TimeError, match=r"step 1: grpc \(pid 4711\) did not deliver the step within 0.05 s"):
                 coordinator.step()
             assert coordinator.read().done == 1
         assert coordinator.step().number == 2, "a dead process is not waited for"

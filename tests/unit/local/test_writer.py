@@ -180,7 +180,7 @@ def test_at_most_four_guests_write_at_a_time(writer: BlockWriter, source: list[A
     try:
         for guest in guests[:4]:
             guest.write({"cell/count": 1})
-        with pytest.raises(SegmentError, match="has places for 4 writing programs; end one of pids"):
+        with pytest.raises(SegmentError, match="allows only 4 programs that write: end one of pids"):
             guests[4].write({"cell/count": 1})
         guests[0].close()
         assert guests[4].write({"cell/count": 1})[0].done

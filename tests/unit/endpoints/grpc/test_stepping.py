@@ -85,7 +85,10 @@ def test_a_step_is_50_ms_by_default_and_is_reported_in_nanoseconds(instance: str
         for wrong in (0, -1, 3_600_001):
             request = v1.StepSizeRequest(step=wrong)
             status, text = await refusal(served.stub.setStepSize(request, timeout=TIMEOUT_S))
-            assert (status, "a step is from 0.001 ms to 3600000 ms" in text) == (Status.INVALID_ARGUMENT, True)
+            assert (status, "the length of a step must be from 0.001 ms to 3600000 ms" in text) == (
+                Status.INVALID_ARGUMENT,
+                True,
+            )
 
     simulate(instance, test)
 
@@ -570,7 +573,10 @@ def test_invalid_steps_are_refused(instance: str) -> None:
             served.time.start(sim.StartRequest(deltaTime=3_600_001), timeout=TIMEOUT_S),
         ):
             status, text = await refusal(call)
-            assert (status, "a step is from 0.001 ms to 3600000 ms" in text) == (Status.INVALID_ARGUMENT, True)
+            assert (status, "the length of a step must be from 0.001 ms to 3600000 ms" in text) == (
+                Status.INVALID_ARGUMENT,
+                True,
+            )
         assert not served.segment.clock.read().playing
 
     simulate(instance, test)
