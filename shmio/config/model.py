@@ -51,11 +51,13 @@ class Source(Section):
 
     ``options`` are the connector's own keys. ``texts`` are the keys of the ``properties`` file that
     no key overrides, as text whatever their type. The connector knows the types, and checks both.
+    Once the file is read, ``layout`` also has the files of ``tags``.
     """
 
     name: Name
     connector: Text
     layout: Text | Texts | None = None
+    tags: Text | Texts | None = None
     block: Text | None = None
     type_bytes: TypeBytes = {}
     properties: Text | None = None

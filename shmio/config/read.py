@@ -218,6 +218,9 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     sound, places = _Structure(faults, folder, broken).sections(tables)
     faults.places = places
     config = convert({**sound, "folder": str(folder)}, Config)
+    for source in config.source:
+        if source.tags is not None:
+            source.layout, source.tags = [*_files(source.layout), *_files(source.tags)], None
     for fault in _name_faults(config):
         faults.add(fault)
     if not faults:  # otherwise, a reference may be to a section that was left out
@@ -242,6 +245,10 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     if config.metrics:
         resolve_metrics(config.metrics, config)
     return Examined(config, faults, broken)
+
+
+def _files(names: str | list[str] | None) -> list[str]:
+    return [names] if isinstance(names, str) else names or []
 
 
 @cache

@@ -293,3 +293,16 @@ def test_loopback_addresses(text: str, loopback: bool) -> None:
 def test_invalid_address_is_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         Address.parse(text)
+
+
+def test_tags_are_files_of_the_layout(tmp_path: Path) -> None:
+    head = '[instance]\nname = "a"\n[[source]]\nname = "line"\nconnector = "modbus"\nhost = "h"\n'
+    for keys, expected in (
+        ('tags = "a.toml"', ["a.toml"]),
+        ('layout = "b.db"\ntags = "a.csv"', ["b.db", "a.csv"]),
+        ('layout = ["b.db", "c.udt"]\ntags = ["a.csv"]', ["b.db", "c.udt", "a.csv"]),
+        ('layout = "b.db"', "b.db"),
+    ):
+        (tmp_path / "supervisor.toml").write_text(f"{head}{keys}\n")
+        source = load(tmp_path / "supervisor.toml").source[0]
+        assert (source.layout, source.tags) == (expected, None)
