@@ -31,7 +31,7 @@ HANG_MARGIN_S = 30.0  # added to the time-out: a host name lookup has no time-ou
 
 
 class _LoopHandle(NamedTuple):
-    """A loop, the function that stops it, and the time-out in s of the source's methods."""
+    """A source's loop, the function that stops it, and the time-out of the source's methods in s."""
 
     loop: SourceLoop | SteppedLoop | ReplayLoop
     stop: Callable[[], None]
@@ -39,9 +39,9 @@ class _LoopHandle(NamedTuple):
 
 
 def run(worker: Worker) -> None:
-    """Run the poll loop and the commands in two threads, and send reports from this thread.
+    """Run the poll loop and the commands in two threads, and send reports from the calling thread.
 
-    A source method that blocks therefore delays neither commands nor reports.
+    Therefore, a method of the source that blocks delays neither commands nor reports.
     """
     sys.setswitchinterval(SWITCH_S)
     part = _loop_of(worker)
@@ -140,9 +140,12 @@ def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
 
 
 def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs | None:
-    """Return a reader of the source's connected inputs; None if no input is connected.
+    """Return a reader of the values for the source's connected inputs.
 
-    The reader opens the segment a second time, because it follows reloads by itself.
+    None if no input is connected.
+
+    The reader opens the segment a second time. It must notice reloads independently of the rest of
+    this process.
     """
     own, sources = writer.block.source, segment.blocks
     topics = {path: parse_topic(topic, sources, own) for path, topic in source.connections.items()}
@@ -150,7 +153,10 @@ def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs |
 
 
 def _owner_of(segment: Segment, writer: int) -> Owner | None:
-    """Return the process that uses a command queue at present; None if no live process does."""
+    """Return the process that uses the command queue ``writer`` at present.
+
+    None if no live process does.
+    """
     segment.refresh()
     for slot in (*segment.processes, *segment.processes.guests):
         if slot.writer == writer and slot.alive():
@@ -159,7 +165,7 @@ def _owner_of(segment: Segment, writer: int) -> Owner | None:
 
 
 def _blocks(segment: Segment) -> Mapping[str, Block]:
-    """Return the present blocks of all sources."""
+    """Return the present blocks of all sources by source name."""
     segment.refresh()
     return segment.blocks
 

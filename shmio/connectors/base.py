@@ -1,6 +1,7 @@
-"""The base classes of sources: Connector reaches a device, Computed is computed, Replayed is a recording.
+"""The base classes of sources: Connector, Computed and Replayed.
 
-Each kind has its loop, which calls the hooks: ``loop``, ``models.stepped`` and ``replay.loop``.
+A Connector reads a device, a Computed source calculates its values, and a Replayed source plays a
+recording. A loop calls the methods of each: ``poll_loop``, ``models.stepped`` or ``replay.loop``.
 """
 
 from __future__ import annotations
@@ -22,23 +23,23 @@ from shmio.segment import BlockWriter, Provenance
 
 
 class Lost(Enum):
-    """The state of a write that had no answer when the connection was lost."""
+    """What is known of a write that the device had not answered when the connection was lost."""
 
     UNSENT = "unsent"
-    """Not carried out: none of its bytes was sent to the device."""
+    """The device did not carry out the write, because none of its bytes was sent."""
     UNKNOWN = "unknown"
 
 
 class WriteLostError(ConnectorError):
-    """The connection was lost before all writes had their answers."""
+    """The connection was lost before the device had answered all writes."""
 
     def __init__(self, message: str, outcomes: Sequence[str | Lost]) -> None:
         """Create the error.
 
         Args:
             message: Why the connection was lost.
-            outcomes: For each write, its result as from :meth:`Connector.write`, or what is known
-                of it.
+            outcomes: For each write, its result as :meth:`Connector.write` returns it if the device
+                has answered, or else a :class:`Lost`.
 
         """
         super().__init__(message)
@@ -48,11 +49,12 @@ class WriteLostError(ConnectorError):
 class Connector(ABC):
     """Base class for the protocol of one device.
 
-    All hooks run in one thread, and none may block longer than ``timeout_s``. After a hook has
-    raised, the loop calls :meth:`close` and later :meth:`connect` again, so that a late reply is
-    never taken for the next one. A connector that asks and waits implements :meth:`read`. One that
-    can have several cycles in flight implements :meth:`submit`, :meth:`collect` and ``depth``. The
-    text of a ConnectorError is for the operator of the cell.
+    The loop calls all methods in one thread, and none may block longer than ``timeout_s``. If a
+    method has raised an exception, the loop calls :meth:`close`, and later :meth:`connect` again. A
+    late reply is therefore never taken for the reply to a later request. A connector that sends a
+    request and waits for its reply implements :meth:`read`. A connector that can have several
+    requests in flight implements :meth:`submit`, :meth:`collect` and ``depth``. The text of a
+    ConnectorError is for the operator of the cell.
     """
 
     Options: ClassVar[type[msgspec.Struct]]
@@ -62,33 +64,39 @@ class Connector(ABC):
     """Whether :meth:`write` is implemented."""
 
     provenance: ClassVar[Provenance] = Provenance.LIVE
-    """The provenance of the values that it reads."""
+    """Where the values come from; each frame of the source states it."""
 
     register_quality: ClassVar[bool] = False
-    """Whether the device gives each register a status and a time of its own.
+    """Whether the device gives each register its own status and time.
 
-    Then the layout has a status area, and :class:`shmio.connectors.register_image.RegisterImage`
-    makes the images.
+    If it does, the layout has a status area, and the connector makes its images with
+    :class:`shmio.connectors.register_image.RegisterImage`.
     """
 
     reads_optimized: ClassVar[bool] = False
-    """Whether it can read a data block with optimized access, whose values have names but no addresses."""
+    """Whether the connector can read S7 data blocks with optimized access.
+
+    The values of these blocks have names but no addresses.
+    """
 
     path_options: ClassVar[tuple[str, ...]] = ()
-    """Those of its keys that are paths of files or folders, which are relative to the configuration."""
+    """The keys of ``Options`` whose values are paths of files or folders.
+
+    A relative path starts at the folder of the configuration.
+    """
 
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:  # noqa: ARG003  most read all layouts
-        """Return the class that reads a layout, with the same ``Options``.
+        """Return the connector class for a layout; it has the same ``Options``.
 
-        A connector that needs ``register_quality`` only for some layouts returns another class for
-        these.
+        A connector that needs ``register_quality`` for some layouts only returns another class for
+        them.
         """
         return cls
 
     @classmethod
     def browse(cls, options: Any, wanted: Wanted) -> Browsed:  # noqa: ARG003
-        """List what a device offers, without a layout. It may take long.
+        """List the values that a device offers, without a layout. This may take minutes.
 
         Args:
             options: An instance of ``Options``.
@@ -96,7 +104,7 @@ class Connector(ABC):
 
         Raises:
             ConfigError: An option is wrong, or this connector cannot browse.
-            ConnectorError: The device cannot be reached, or refuses it.
+            ConnectorError: The device cannot be reached, or it refuses to be browsed.
 
         """
         raise ConfigError("this connector cannot list what a device offers")
@@ -117,7 +125,7 @@ class Connector(ABC):
     @property
     @abstractmethod
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks, in s."""
+        """The longest time that any method may block, in s."""
 
     @abstractmethod
     def connect(self) -> None:
@@ -136,13 +144,13 @@ class Connector(ABC):
             ``layout.size`` bytes.
 
         Raises:
-            ConnectorError: There is no whole, fresh image.
+            ConnectorError: The device has not delivered a complete, fresh image.
 
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Close the connection. It may be called at any time and more than once."""
+        """Close the connection. The loop may call this at any time and more than once."""
 
     def describe(self) -> str:
         """Return what was negotiated with the device, for the log."""
@@ -150,16 +158,17 @@ class Connector(ABC):
 
     @property
     def doubt(self) -> str:
-        """Why the last image is uncertain although it was read, with the remedy.
+        """Why the image read last is uncertain, and what to do about it.
 
-        Empty if it is good.
+        Empty if the image is good.
         """
         return ""
 
     def load(self) -> Load | None:
-        """Return what a cycle asks of the device, for ``shmio-supervisor check``; None if that is not known.
+        """Return what a cycle requests from the device; None if this is not known.
 
-        It is called without a connection, and makes none.
+        ``shmio-supervisor check`` shows it. The method is called without a connection, and opens
+        none.
         """
         return None
 
@@ -167,7 +176,7 @@ class Connector(ABC):
 
     @property
     def depth(self) -> int:
-        """How many cycles may be in flight at once in this session."""
+        """How many requested images may be in flight at once on the present connection."""
         return 1
 
     def submit(self) -> None:  # noqa: B027  not every connector can
@@ -179,16 +188,16 @@ class Connector(ABC):
         """
 
     def collect(self, until_ns: int) -> bytes | None:  # noqa: ARG002  read() has its own time-out
-        """Wait for the image of the oldest submitted cycle.
+        """Wait for the image that :meth:`submit` requested first, of those not yet collected.
 
         Args:
             until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
 
         Returns:
-            The image, ``layout.size`` bytes; None if it has not come by ``until_ns``.
+            The image, ``layout.size`` bytes; None if it has not arrived by ``until_ns``.
 
         Raises:
-            ConnectorError: The answer is wrong, or has not come within the connector's own
+            ConnectorError: The answer is wrong, or has not arrived within the connector's own
                 time-out.
 
         """
@@ -199,35 +208,36 @@ class Connector(ABC):
     def write(self, writes: Sequence[Write]) -> list[str]:  # noqa: ARG002
         """Write bytes and bits to the device.
 
-        A write of a bit leaves the other bits of its byte alone. A write of bytes may be longer
-        than the protocol takes at once.
+        A write of a bit does not change the other bits of its byte. A write of bytes may be longer
+        than one request of the protocol can carry.
 
         Args:
             writes: What to write, in this order.
 
         Returns:
-            For each write "" if the device confirmed it, else why the device refused it.
+            For each write, "" if the device confirmed it, or else the reason why the device refused
+            it.
 
         Raises:
             WriteLostError: The connection was lost; the error says what is known of each write.
-            ConnectorError: Nothing is known of any write.
+            ConnectorError: It is not known whether the device carried out any of the writes.
 
         """
         raise ConnectorError("this connector cannot write")
 
 
 class Computed(ABC):
-    """Base class for a source whose registers are computed, and which follows the instance clock.
+    """Base class for a source that computes its registers, and which follows the instance clock.
 
-    All hooks run in one thread. A hook that fails raises a ShmioError with a text for the operator
-    of the cell. The next cycle tries again.
+    The loop calls all methods in one thread, except :meth:`interrupt`. A method that fails raises a
+    ShmioError, whose text is for the operator of the cell. The loop tries again in the next cycle.
     """
 
     Options: ClassVar[type[msgspec.Struct]]
-    """Its own keys of ``[[source]]``. The struct must refuse unknown keys."""
+    """The source's own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     prompt: ClassVar[bool] = False
-    """Whether written values are published at once, without waiting for a cycle."""
+    """Whether the loop publishes written values at once, without waiting for a cycle."""
 
     timeout_s: float = 1.0
     """The longest time that a step may take, in s."""
@@ -247,25 +257,25 @@ class Computed(ABC):
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """The topic that each connected input reads, by the input's path."""
+        """The topic from which each connected input gets its values, by the path of the input."""
         return {}
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The paths of the registers that may be connected."""
+        """The paths of the registers that a configuration may connect to topics of other sources."""
         return ()
 
     def connect(self, values: Mapping[str, Value], doubt: str) -> None:  # noqa: B027  not every source has inputs
-        """Take the values of connected inputs for the next :meth:`step`.
+        """Store the values of connected inputs for the next :meth:`step`.
 
         Args:
-            values: Values by path. An input without a value keeps the one it has.
-            doubt: Why values are missing; empty if none are.
+            values: Values by path. An input that is not among them keeps its present value.
+            doubt: Why some inputs have no value; empty if all have one.
 
         """
 
     def attach(self, writer: BlockWriter) -> None:  # noqa: B027  most need nothing of it
-        """Take the writing side of the block; called once, before the hooks below.
+        """Receive the object that writes the source's block; called once, before the methods below.
 
         Raises:
             SegmentError: The block does not fit the source.
@@ -278,18 +288,21 @@ class Computed(ABC):
 
     @abstractmethod
     def begin(self) -> bytes:
-        """Return the image before the first step; of a prompt source, the present image."""
+        """Return the image before the first step.
+
+        If the source is ``prompt``, its present image.
+        """
 
     def news(self) -> bool:
-        """Return whether :meth:`begin` has a new result; called between two steps."""
+        """Return whether :meth:`begin` would return a changed image; called between two steps."""
         return False
 
     def interrupt(self) -> None:  # noqa: B027  most never wait
-        """End a step that waits. Any thread may call it."""
+        """End a :meth:`step` that is waiting. Any thread may call this."""
 
     @abstractmethod
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Take bytes and bits; return for each "" or why it is refused."""
+        """Set bytes and bits; return for each write "" or the reason why the source refuses it."""
 
     @abstractmethod
     def step(self, time_ns: int, dt_ns: int) -> bytes:
@@ -306,10 +319,13 @@ class Computed(ABC):
 
 
 class Replayed(ABC):
-    """Base class for a source with the layout and frames of a recording; it follows the instance clock."""
+    """Base class for a source that plays the frames of a recording with the recording's layout.
+
+    It follows the instance clock.
+    """
 
     Options: ClassVar[type[msgspec.Struct]]
-    """Its own keys of ``[[source]]``. The struct must refuse unknown keys."""
+    """The source's own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     @abstractmethod
     def __init__(self, options: Any, name: Any) -> None:
@@ -320,6 +336,7 @@ class Replayed(ABC):
             name: The name of the source.
 
         Raises:
-            ConfigError: The recording cannot be played. The message begins with the key.
+            ConfigError: The recording cannot be played. The message begins with the configuration
+                key that is wrong.
 
         """

@@ -1,4 +1,4 @@
-"""What a device offers, for ``shmio-supervisor browse``, and which part of it is wanted."""
+"""The values that ``shmio-supervisor browse`` finds in a device, and the user's choice of them."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ class Offer:
     """A value that a device offers, or a group of values.
 
     Attributes:
-        names: The names from the top, as the device spells them.
-        type: Type of a register in a tag table; empty for a group, and for what cannot be a register.
+        names: The name of each level from the top to this value, as the device spells it.
+        type: The type that a register of this value has in a tag table; empty for a group, and for
+            a value that cannot be a register.
         columns: Other columns of the tag table: ``address``, ``unit``, ``comment``, ``writable``.
-        refused: Why a value cannot be a register; empty for a group.
+        refused: Why the value cannot be a register; empty if it can, and for a group.
 
     """
 
@@ -34,11 +35,11 @@ class Offer:
 
 @dataclass
 class Browsed:
-    """What was found.
+    """What a search in a device has found.
 
     Attributes:
-        offers: Each after the group that contains it.
-        incomplete: Why there may be more, with the remedy; empty if this is all.
+        offers: The values and groups. Each follows the group that contains it.
+        incomplete: Why the device may offer more, with the remedy; empty if these are all.
 
     """
 
@@ -47,13 +48,14 @@ class Browsed:
 
 
 class Wanted:
-    """Which part of a device to list, and the limits of the search."""
+    """Which part of a device the user wants to list, and the limits of the search."""
 
     def __init__(self, patterns: Iterable[str] = (), *, depth: int = DEFAULT_DEPTH, nodes: int = DEFAULT_NODES) -> None:
         """Create the choice.
 
         Args:
-            patterns: Paths and globs, as for registers; without any, everything is wanted.
+            patterns: Paths and globs, written like those of registers; if there are none,
+                everything is wanted.
             depth: Maximum number of levels.
             nodes: Maximum number of nodes to look at.
 
@@ -66,16 +68,16 @@ class Wanted:
 
     @property
     def everything(self) -> bool:
-        """True if there is no pattern."""
+        """True if the user has given no pattern and so wants everything."""
         return not self._globs
 
     def takes(self, names: Iterable[str]) -> bool:
-        """Return whether to list a value or group."""
+        """Return whether to list the value or group with these names."""
         path = _path(names)
         return not self._globs or (path is not None and any(glob.matches(path) for glob in self._globs))
 
     def enters(self, names: Iterable[str]) -> bool:
-        """Return whether something in a group may be wanted."""
+        """Return whether the group with these names may contain something to list."""
         path = _path(names)
         return not self._globs or (
             path is not None and any(glob.matches(path) or glob.reaches(path) for glob in self._globs)
@@ -83,7 +85,7 @@ class Wanted:
 
 
 def _path(names: Iterable[str]) -> str | None:
-    """Return the path of these names; None if there is none."""
+    """Return the path with these names as its segments; None if they cannot form a path."""
     try:
         return "/".join(encode_segment(name) for name in names)
     except PathError:

@@ -1,9 +1,9 @@
 """Accepts or rejects the commands to a source, and carries out accepted ones in the next cycle.
 
-A separate thread accepts and rejects commands, so that a slow device does not delay the decision.
-The loop's thread writes to the device before it reads, so that the next frame shows the new values.
-It combines all items accepted for a cycle into one batch, and derives the outcome of each item from
-the outcomes of the writes.
+A command consists of items, which are writes. A separate thread accepts and rejects commands, so
+that a slow device does not delay this decision. The loop's thread writes to the device before it
+reads, so that the next frame shows the new values. It writes all items accepted for a cycle in one
+batch. From the outcomes of the batch's writes, it derives the outcome of each item.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ A single command may have more items if none is waiting.
 MAX_WAITING_BLOCKS: Final = 4
 """The largest number of bytes that may wait for a cycle, as a multiple of the block's size."""
 FAR_NS: Final = 1 << 62
-"""Deadline of a write that an injection has delayed: so late that it never expires."""
+"""Deadline of a write that an injection has delayed: so late that the write never expires."""
 TELL_NS: Final = 1_000_000_000
-"""Shortest time between two reports of malformed commands from the same writer."""
+"""Shortest time in ns between two reports of malformed commands from the same writer."""
 
 _UNARMED: Final = "an injection toward a device needs `armed = true` in the source's configuration"
 _SUPERSEDED: Final = "superseded by a later write of the same cycle"
 _EXPONENTS: Final = {"REAL": b"\x7f\x80\0\0", "LREAL": b"\x7f\xf0\0\0\0\0\0\0"}
-"""The exponent bits by type, most significant byte first.
+"""The exponent bits of each type of number, most significant byte first.
 
-A number is not finite if all its exponent bits are set.
+A number is NaN or infinite if all its exponent bits are set.
 """
 
 End = tuple[EventKind, str]
@@ -58,7 +58,7 @@ log = logging.getLogger("shmio.source")
 
 
 class FiniteCheck:
-    """Refuses to write NaN and infinities to REAL and LREAL registers that are not exempt.
+    """Refuses writes of NaN and infinities to REAL and LREAL registers that are not exempt.
 
     Programs in devices seldom handle such values.
     """
@@ -81,8 +81,8 @@ class FiniteCheck:
     def refusal(self, writes: Iterable[Write]) -> str:
         """Return why these writes are refused, naming one register; empty if they are allowed.
 
-        A write of some bytes of a number is refused if it sets every exponent bit in those bytes.
-        Otherwise several such writes together could make the number non-finite.
+        A write of only some bytes of a number is refused if it sets all exponent bits in those
+        bytes. Otherwise, several such writes together could make the number NaN or infinite.
         """
         for offset, mask, data in writes:
             stop = offset + len(data)
@@ -119,7 +119,7 @@ class Item(NamedTuple):
     bits: bytes | None = None
     """Mask of the bits to send to the device; None: all bits of the write.
 
-    Injections have taken the other bits.
+    Injections have kept the other bits from the device.
     """
     data: bytes | None = None
     """The values after injections have changed them; None if they are unchanged."""
@@ -141,17 +141,17 @@ class Item(NamedTuple):
 
 
 def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
-    """Merge items into writes; if several items write a bit, the last value is written.
+    """Merge items into writes; if several items write a bit, the value of the last item is written.
 
-    Adjacent bytes become one write only within a command. If the device refuses a write, no item of
-    another command is refused with it.
+    Adjacent bytes become one write only if they belong to the same command. So if the device
+    refuses a write, this affects no other command.
 
     Args:
         items: Accepted items, oldest first.
         size: Size of the block in bytes.
 
     Returns:
-        The writes, and the indices of the items of which later items overwrite every bit.
+        The writes, and the indices of superseded items: later items overwrite all bits of these.
 
     """
     taken = bytearray(size)
@@ -192,9 +192,9 @@ def ends(
     Args:
         items: The items of the batch.
         writes: The writes from :func:`coalesce`.
-        superseded: The indices of overwritten items from :func:`coalesce`.
+        superseded: The indices of superseded items from :func:`coalesce`.
         outcomes: The outcome of each write.
-        error: Why some outcomes were lost.
+        error: Why the outcomes of some writes are not known.
 
     """
     lost = any(isinstance(outcome, Lost) for outcome in outcomes)
@@ -206,14 +206,14 @@ def ends(
         if place in superseded:  # the item that superseded it was written
             found[place] = EventKind.WRITTEN, _SUPERSEDED
         elif item.changed_by:
-            found[place] = EventKind.WRITTEN, f"after the injection {item.changed_by!r} changed its value"
+            found[place] = EventKind.WRITTEN, f"after the injection {item.changed_by!r} changed the value"
     return found
 
 
 class _WriteOutcomes:
-    """Finds the outcomes of writes by byte range; a binary search keeps this fast for thousands.
+    """Finds the outcomes of writes by byte range; a binary search keeps this fast for many writes.
 
-    The caller may leave out confirmed writes, unless the outcome of some write was lost.
+    The caller may leave out confirmed writes, unless a write was lost.
     """
 
     def __init__(self, known: Iterable[tuple[Write, str | Lost]]) -> None:
@@ -222,7 +222,7 @@ class _WriteOutcomes:
         self._stops = list(accumulate((write.offset + len(write.data) for write, _ in self._known), max))
 
     def about(self, write: Write) -> list[str | Lost]:
-        """Return the outcomes of all writes that share bits with this one."""
+        """Return the outcomes of all writes that contain bits of the given write."""
         first = bisect_right(self._stops, write.offset)
         last = bisect_left(self._starts, write.offset + len(write.data))
         return [outcome for other, outcome in self._known[first:last] if _share_bits(write, other)]
@@ -233,10 +233,10 @@ def _end_of(outcomes: Sequence[str | Lost], error: str) -> End:
     refusal = next((outcome for outcome in outcomes if outcome and isinstance(outcome, str)), "")
     lost = Lost.UNSENT in outcomes
     if Lost.UNKNOWN in outcomes or (lost and "" in outcomes):  # partly written
-        return EventKind.UNKNOWN, f"sent, but not confirmed: {error}"
+        return EventKind.UNKNOWN, f"the write was sent, but the device did not confirm it: {error}"
     if refusal:
         return EventKind.REFUSED, refusal
-    return (EventKind.EXPIRED, f"not sent: {error}") if lost else (EventKind.WRITTEN, "")
+    return (EventKind.EXPIRED, f"the write was not sent: {error}") if lost else (EventKind.WRITTEN, "")
 
 
 def _share_bits(one: Write, other: Write) -> bool:
@@ -246,10 +246,10 @@ def _share_bits(one: Write, other: Write) -> bool:
 
 
 def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[_Outcome]:
-    """Check that a connector returned one outcome for each write.
+    """Return ``outcomes`` after checking that there is one for each write.
 
     Raises:
-        ConnectorError: Their numbers differ.
+        ConnectorError: The connector returned fewer or more outcomes.
 
     """
     if len(outcomes) != len(writes):
@@ -260,7 +260,8 @@ def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[
 def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
     """Yield the last events of items.
 
-    Consecutive items of a command share one event if its kind and text are the same.
+    Consecutive items of a command share one event if the event's kind and text are the same for
+    all.
     """
     both = zip(items, ends, strict=True)
     for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
@@ -270,7 +271,10 @@ def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
 
 
 def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
-    """Yield the first item and the length of each run of consecutive places of a command."""
+    """Group a command's items by consecutive ``place``.
+
+    Yield the first item and length of each group.
+    """
     first, count = items[0], 1
     for item in items[1:]:
         if item.place == first.place + count:
@@ -287,7 +291,8 @@ def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
 class CommandProcessor:
     """Processes the commands of one block.
 
-    The command thread calls :meth:`run`. The loop's thread calls the other methods.
+    The command thread calls :meth:`run`. Any thread may call :meth:`stop`. Only the loop's thread
+    calls the other methods.
     """
 
     def __init__(
@@ -306,13 +311,13 @@ class CommandProcessor:
 
         Args:
             output: Publishes the source's images and events.
-            writable: Patterns of writable registers; None if the device cannot be written.
+            writable: Patterns of writable registers; None if the connector cannot write.
             now_ns: The loop's clock.
-            allow_nonfinite: Patterns of registers that may be written NaN and infinities.
-            armed: True if injections may reach the device.
+            allow_nonfinite: Patterns of the registers to which NaN and infinities may be written.
+            armed: True if injections may change what is written to the device.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources, for conditions. Default: only this source's.
-            accepted: Called when accepted items begin to wait for a cycle.
+            accepted: Called when newly accepted items wait for a cycle.
 
         """
         self._writer = output.writer
@@ -336,12 +341,18 @@ class CommandProcessor:
         self._stopped = False
 
     def open(self) -> None:
-        """Start accepting commands: the device is connected and its block matches the layout."""
+        """Start accepting commands.
+
+        Call it once the device is connected and its data match the layout.
+        """
         with self._turn:
             self._closed = ""
 
     def close(self, reason: str) -> None:
-        """Stop accepting commands, because the connection was lost. Waiting items expire."""
+        """Stop accepting commands, because the connection was lost.
+
+        Waiting items expire for ``reason``.
+        """
         with self._turn:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
@@ -350,12 +361,15 @@ class CommandProcessor:
         self._make_room()
 
     def settle(self) -> None:
-        """Wait until every item whose acceptance was published is ready for :meth:`carry_out`."""
+        """Wait until each item whose acceptance was published also waits for :meth:`carry_out`."""
         with self._verdict:
             pass
 
     def release(self, cycle: int) -> None:
-        """Accept the delayed writes that are due in a cycle. Call it before :meth:`carry_out`."""
+        """Accept the writes whose delay by an injection ends in a cycle.
+
+        Call it before :meth:`carry_out`.
+        """
         for layer, write in self._injections.declared.release(cycle):
             command = Command(NO_WRITER, layer.id, self._writer.incarnation, FAR_NS, (write,))
             self._accept(command, layer)
@@ -366,10 +380,11 @@ class CommandProcessor:
         return bool(self._items)
 
     def carry_out(self, write: Callable[[Sequence[Write]], list[str]]) -> None:
-        """Write all waiting items in one batch and publish the outcome of each.
+        """Write all waiting items in one batch, and publish the outcome of each.
 
-        If two items have a value for the same bit, the value of the item accepted later is written.
-        If ``write`` raises an exception, the outcomes are published before it is raised again.
+        If two items write the same bit, the value of the item accepted later is written. If
+        ``write`` raises an exception, the outcomes are published before the exception is raised
+        again.
         """
         items = self._take(lambda _: True)
         now_ns = self._now_ns()
@@ -427,10 +442,10 @@ class CommandProcessor:
         return [item for item, wanted in kinds if wanted]
 
     def _expire(self, items: Sequence[Item]) -> None:
-        self._end(items, [(EventKind.EXPIRED, "no cycle began before its deadline")] * len(items))
+        self._end(items, [(EventKind.EXPIRED, "no cycle began before the command's deadline")] * len(items))
 
     def _patience_ns(self) -> int:
-        """Return the time in ns until the next deadline or check; negative if there is none."""
+        """Return how long :meth:`run` may wait for a command, in ns; negative: without limit."""
         with self._turn:
             deadlines = [item.command.deadline_ns for item in self._items]
         waits = [max(0, min(deadlines) - self._now_ns()) + 1_000_000] if deadlines else []
@@ -438,14 +453,14 @@ class CommandProcessor:
         return min(waits, default=-1)
 
     def _make_room(self) -> None:
-        """Wake the command thread to try the held command again."""
+        """Wake the command thread, so that it tries again a command that had to wait for room."""
         if self._held is not None:
             self._writer.block.commands.wake()
 
     def _take_one(self, writer: int) -> bool:
-        """Accept or reject the held command if there is one, else the oldest one of a writer.
+        """Accept or reject the command that waits for room, or else the oldest command of a writer.
 
-        Return False if there is no command, or if the command must wait for room.
+        Return False if there is no command, or if it must wait for room.
         """
         if self._held is not None:
             command, self._held = self._held, None
@@ -461,7 +476,7 @@ class CommandProcessor:
         return self._judge(command)
 
     def _garbage(self, writer: int, error: ValueError) -> None:
-        """Report a malformed command, at most once per writer and ``TELL_NS``."""
+        """Report a malformed command, at most once in ``TELL_NS`` for each writer."""
         now_ns = time.monotonic_ns()
         if now_ns - self._garbage_ns.get(writer, -TELL_NS) >= TELL_NS:
             self._garbage_ns[writer] = now_ns
@@ -498,7 +513,7 @@ class CommandProcessor:
         return True
 
     def _accept(self, command: Command, layer: Layer | None) -> None:
-        """Apply the injections below ``layer`` to a command, and queue the rest for the cycle."""
+        """Apply the injections below ``layer`` to a command, and queue the remaining items."""
         left, taken = _divert(self._output, command, layer)
         left = [pair for pair in left if not self._made_unfit(pair[0])]
         self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # _divert has published every DIVERTED event
@@ -517,10 +532,10 @@ class CommandProcessor:
             self._accepted()
 
     def _made_unfit(self, item: Item) -> bool:
-        """Refuse the item if injections made its value non-finite; return whether they did."""
+        """Refuse the item if injections made its value NaN or infinite; return whether they did."""
         reason = "" if item.data is None else self._finite.refusal(item.parts())
         if reason:
-            self._end([item], [(EventKind.REFUSED, f"the injection {item.changed_by!r} changes it: {reason}")])
+            self._end([item], [(EventKind.REFUSED, f"the injection {item.changed_by!r} changed the value: {reason}")])
         return bool(reason)
 
     def _has_room(self, command: Command) -> bool:
@@ -532,7 +547,7 @@ class CommandProcessor:
         return len(items) + len(command.writes) <= MAX_WAITING and size <= self._most_bytes
 
     def _refusal(self, command: Command) -> str:
-        """Return why a command came for the wrong process or too late; empty if it did not."""
+        """Return why the command arrived too late or for an earlier process; "" if it did not."""
         if command.incarnation != self._writer.incarnation:
             return "the source was restarted after the command was sent: send it again"
         late_ns = self._now_ns() - command.deadline_ns
@@ -567,8 +582,9 @@ def _divert(
     """Apply the layers below ``above`` to a command's items, and publish what the layers changed.
 
     Returns:
-        The items with bits left for the device, each with the layer that changed it last (``above``
-        if none did); and the items with no bit left.
+        Two lists. The first has each item of which bits are left for the device, with the layer
+        that changed the item last (``above`` if none did). The second has the items without any bit
+        left.
 
     """
     left: list[tuple[Item, Layer | None]] = []

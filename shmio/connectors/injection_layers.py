@@ -3,7 +3,7 @@
 Each injection is a layer over the source's block. Images on ``/out`` pass the layers from the
 innermost to the outermost; writes on ``/in`` pass them from the outermost to the innermost. The
 layer with the highest priority is outermost. Of layers with the same priority, the newest is
-outermost. A client or the operation of a declared injection supplies a layer's values.
+outermost. The values of a layer come from a client or from the operation of a declared injection.
 """
 
 from __future__ import annotations
@@ -28,14 +28,17 @@ from shmio.segment import NO_WRITER, Direction
 MAX_INJECTIONS: Final = 64
 """The largest number of injections on one source at a time."""
 MAX_HELD: Final = 256
-"""The number of writes that one injection may delay; further writes are rejected."""
+"""The largest number of writes that one injection may delay at once.
+
+Further writes are rejected.
+"""
 
 Bits = np.ndarray[Any, np.dtype[np.uint8]]
 
 
 @dataclass(frozen=True)
 class Owner:
-    """The owner of an injection: a command queue, and the process that used it at that time."""
+    """The owner of an injection: a command queue, and the process that used the queue at that time."""
 
     writer: int
     pid: int
@@ -51,9 +54,9 @@ class CycleImage(NamedTuple):
 
 @dataclass
 class Layer:
-    """One injection that runs in its source's process.
+    """One injection, as the process of its source applies it.
 
-    ``cover`` is an array of the block's size in which the covered bits are set.
+    ``cover`` is an array of the block's size. The bits set in it are those that the layer covers.
     """
 
     id: int
@@ -70,7 +73,8 @@ class Layer:
     def given(self) -> bool:
         """True if the layer covers ``/out`` and a client supplies its values.
 
-        That client receives the values from the device or the next inner layer.
+        That client receives the values that the layer hides: those of the device or the next inner
+        layer.
         """
         return self.direction is Direction.OUT
 
@@ -80,14 +84,15 @@ class Layer:
         return True
 
     def show(self, image: Bits, now: CycleImage) -> None:  # noqa: ARG002  the values do not depend on time
-        """Write the layer's values of ``/out`` into an image, in place."""
+        """Replace the covered bits of an image on ``/out`` by the layer's values, in place."""
         image ^= (image ^ self.values) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:  # noqa: ARG002
-        """Apply the layer to some bits of a write to the device.
+        """Apply the layer to the given bits of a write to the device.
 
         Returns:
-            The new data, or the same object if unchanged; None if the layer takes the write.
+            The new data, or the same object if they are unchanged. None if the bits must not reach
+            the device.
 
         """
         return None
@@ -97,9 +102,9 @@ class DivertedWrite(NamedTuple):
     """A write to the device after all layers were applied to it."""
 
     met: list[tuple[Layer, list[Write]]]
-    """The layers that took or changed the write, each with the parts that it received."""
+    """The layers that changed or kept the write, each with the parts that it received."""
     left: bytes
-    """Mask of the bits that are left for the device."""
+    """Mask of the bits that still go to the device."""
     data: bytes
     """The values of the write, after the layers have changed them."""
     by: Layer | None
@@ -115,11 +120,11 @@ class LayerStack:
     now: CycleImage = field(default_factory=lambda: CycleImage(-1, 0, b""))
 
     def lay(self, injection: Layer) -> str:
-        """Add a layer; return why it cannot be added, or "" if it was added."""
+        """Add a layer; return the reason why it cannot be added, or "" if it was added."""
         if any(layer.id == injection.id for layer in self.layers):
             return f"there is an injection {injection.id} already"
         if len(self.layers) >= MAX_INJECTIONS:
-            return f"{MAX_INJECTIONS} injections cover this source already, the maximum: lift one"
+            return f"{MAX_INJECTIONS} injections cover this source already, which is the maximum: lift one"
         place = sum(layer.priority <= injection.priority for layer in self.layers)
         self.layers.insert(place, injection)
         return ""
@@ -143,14 +148,14 @@ class LayerStack:
         return self.seen(raw, layers).tobytes() if layers else None
 
     def seen(self, raw: bytes, inner: Iterable[Layer]) -> Bits:
-        """Return a copy of the image ``raw`` to which these layers over ``/out`` were applied."""
+        """Return a copy of the image ``raw`` with the given layers over ``/out`` applied."""
         image = np.frombuffer(raw, np.uint8).copy()
         for layer in inner:
             layer.show(image, self.now)
         return image
 
     def before(self, raw: bytes, layer: Layer) -> Bits:
-        """Return a copy of ``raw`` to which the active layers inside ``layer`` were applied."""
+        """Return a copy of ``raw`` with the active layers inside ``layer`` applied."""
         return self.seen(raw, self.inner(layer))
 
     def inner(self, layer: Layer) -> list[Layer]:
@@ -159,7 +164,7 @@ class LayerStack:
         return [other for other in inner if other.direction is Direction.OUT and other.active]
 
     def outer(self, layer: Layer) -> list[Layer]:
-        """Return the layers outside ``layer`` for which clients supply the values.
+        """Return the layers over ``/out`` outside ``layer`` whose values come from clients.
 
         The list is empty if ``layer`` covers ``/in``.
         """
@@ -168,9 +173,9 @@ class LayerStack:
         return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.given]
 
     def inner_values(self, raw: bytes, layer: Layer) -> list[Write]:
-        """Return the values in the bits of ``layer`` that come from inner layers over ``/out``.
+        """Return the values that inner layers over ``/out`` supply for bits that ``layer`` covers.
 
-        The values in its other bits come from the device; the result does not include them.
+        The result excludes bits whose values come from the device.
         """
         inner = self.inner(layer)
         bits = np.zeros(self.size, np.uint8)
@@ -181,7 +186,8 @@ class LayerStack:
     def onward(self, raw: bytes, layer: Layer, write: Write) -> list[tuple[Layer, list[Write]]]:
         """Return the parts of a client's values over ``/out`` that outer layers hide from readers.
 
-        The clients of those layers receive them, after the layers in between were applied.
+        Each part comes with the layer whose client receives it. The layers between the two are
+        already applied to the values.
         """
         taken: list[tuple[Layer, list[Write]]] = []
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
@@ -199,8 +205,8 @@ class LayerStack:
 
         Args:
             write: The write.
-            above: The layer that sends the write; only layers inside it apply. None for a write
-                that does not come from a layer.
+            above: The layer that sends the write; only layers inside it apply. None if no layer
+                sends the write; then all layers apply.
 
         """
         met: list[tuple[Layer, list[Write]]] = []
@@ -226,7 +232,7 @@ class LayerStack:
 
 
 def shadow(injection: Layer, writes: Sequence[Write]) -> str:
-    """Set the values of a layer over ``/out``; return why it does not cover them, or ""."""
+    """Set the values of a layer over ``/out``; return which bytes it does not cover, or ""."""
     if reason := uncovered(injection, writes):
         return reason
     for write in writes:
@@ -235,7 +241,10 @@ def shadow(injection: Layer, writes: Sequence[Write]) -> str:
 
 
 def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
-    """Return a message about bytes that the layer does not cover; empty if it covers all."""
+    """Return a message that names bytes outside the layer's cover.
+
+    Empty if the layer covers all.
+    """
     for write in writes:
         cover = injection.cover[write.offset : write.offset + len(write.data)]
         if len(cover) < len(write.data) or (~cover & (write.mask or 0xFF)).any():
@@ -271,7 +280,7 @@ def parts_of(write: Write, bits: Bits) -> list[Write]:
 
 
 class DelayedWrite(NamedTuple):
-    """A delayed write, with the cycle and the instance time at which it came."""
+    """A write that an injection delays, and the cycle and instance time at which it arrived."""
 
     write: Write
     cycle: int
@@ -282,8 +291,8 @@ class DelayedWrite(NamedTuple):
 class DeclaredLayer(Layer):
     """The layer of one declared injection.
 
-    ``writes`` counts the writes over ``/in`` since the injection became active. ``held`` are the
-    writes that it delays at present.
+    ``writes`` counts the writes over ``/in`` since the injection became active. ``held`` contains
+    the writes that it delays at present.
     """
 
     program: Program
@@ -312,7 +321,7 @@ class DeclaredLayer(Layer):
 
     @property
     def full(self) -> bool:
-        """True if the injection delays ``MAX_HELD`` writes, and cannot take more."""
+        """True if the injection delays ``MAX_HELD`` writes, and so cannot delay more."""
         return len(self.held) >= MAX_HELD
 
     @property
@@ -354,10 +363,10 @@ class DeclaredLayer(Layer):
         image ^= (image ^ changed) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:
-        """Apply the operation to some bits of a write to the device.
+        """Apply the operation to the given bits of a write to the device.
 
         Returns:
-            The new data; None if the operation drops or delays the write.
+            The new data; None if the operation drops or delays these bits.
 
         """
         at = self._moment(self.writes, now)
@@ -377,9 +386,9 @@ class DeclaredLayer(Layer):
         return bytes(old ^ (old ^ image[span]) & bits)
 
     def due(self, now: CycleImage) -> list[Write]:
-        """Remove and return the writes whose delay is over.
+        """Remove and return the writes whose delay has passed.
 
-        ``now`` describes the cycle that is about to write.
+        ``now`` describes the cycle that is about to write them.
         """
         due: list[Write] = []
         if not isinstance(self.operation, Delay):

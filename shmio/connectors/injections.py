@@ -1,6 +1,6 @@
 """Carries out commands about injections, and evaluates declared injections in each cycle.
 
-The layers that they form, and the order in which these change the image, are in
+The order in which injections change an image is defined in
 :mod:`shmio.connectors.injection_layers`; :mod:`shmio.connectors.output` applies them.
 """
 
@@ -45,7 +45,7 @@ from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.standing_injections import StandingInjection
 
 LOOK_NS: Final = 400_000_000
-"""Period at which owners are checked, so that an injection ends within 1 s after its client."""
+"""Period in ns at which owners are checked, so that an injection ends within 1 s after its client."""
 SEED_BITS: Final = 53
 """Length of a generated seed in bits; every JSON reader can represent such integers exactly."""
 CONFIGURED: Final = Owner(NO_WRITER, 0)
@@ -54,7 +54,7 @@ CONFIGURED: Final = Owner(NO_WRITER, 0)
 Blocks = Callable[[], Mapping[str, Block]]
 """Returns the present blocks of the instance by source name."""
 OwnerOf = Callable[[int], Owner | None]
-"""Returns the process that uses a command queue at present; None if no live process does."""
+"""Returns the process that uses the command queue of a writer; None if no live process does."""
 
 _DECODER: Final = msgspec.json.Decoder(Declaration)
 
@@ -67,9 +67,9 @@ log = logging.getLogger("shmio.source")
 class ConditionValues:
     """Reads the register values that conditions need in one cycle.
 
-    Each image is fetched once, and only if a condition needs it. No injection is applied to these
-    images, so that an injection cannot influence its own condition. The values of a source with bad
-    quality are unknown, and so are those of a register with a bad status.
+    It fetches each image once, and only if a condition needs it. The images are without injections,
+    so that no injection can influence its own condition. A value is unknown if its source has bad
+    quality or its register has a bad status.
     """
 
     def __init__(self, own: str, image: Image, blocks: Mapping[str, Block], before: int | None) -> None:
@@ -79,8 +79,8 @@ class ConditionValues:
             own: The name of the source to which the image belongs.
             image: The source's next image.
             blocks: The blocks of all sources.
-            before: The present step; None outside steps. Other sources that take part in the step
-                are read as they were before it, even if they have completed it already.
+            before: The number of the present step; None outside steps. If another source has
+                already completed this step, its values from before the step are used.
 
         """
         self._blocks = blocks
@@ -114,10 +114,10 @@ class ConditionValues:
 
 
 def newest(block: Block, before: int | None) -> Frame | None:
-    """Return the newest frame of a block, or the newest one from before the step ``before``.
+    """Return the newest frame of a block, or the newest from before the step ``before``.
 
-    So a source sees the same frames of others in each run, whichever source completes the step
-    first (the Jacobi method).
+    A source therefore sees the same frames of others in each run, whichever source completes the
+    step first (the Jacobi method).
     """
     frame = block.latest()
     while frame is not None and before is not None and block.came_with(frame, before):
@@ -128,8 +128,8 @@ def newest(block: Block, before: int | None) -> Frame | None:
 class DeclaredInjections:
     """Adds, evaluates and lifts the declared injections of one source.
 
-    The loop's thread calls :meth:`release` and :meth:`forget`. The command thread calls the other
-    methods.
+    The loop's thread publishes images, which evaluates the injections, and calls :meth:`release`
+    and :meth:`forget`. The command thread calls the other methods.
     """
 
     def __init__(self, publisher: LayerPublisher, blocks: Blocks) -> None:
@@ -143,22 +143,22 @@ class DeclaredInjections:
 
     @property
     def overload(self) -> str:
-        """Reason why no write can be accepted at present; empty if writes can be accepted."""
+        """Why no write can be accepted at present; empty if writes can be accepted."""
         full = next((layer for layer in self._layers if layer.full), None)
-        return f"the injection {full.name} delays {MAX_HELD} writes already, the maximum" if full else ""
+        return f"the injection {full.name} delays {MAX_HELD} writes already, which is the maximum" if full else ""
 
     @property
     def reads_other_sources(self) -> bool:
-        """True if a condition reads registers of other sources, which a reload may change."""
+        """True if a condition reads registers of other sources, which may change on a reload."""
         return any(layer.program.foreign for layer in self._layers)
 
     def seen(self, frame: Frame) -> None:
-        """Start from the last frame of the previous process."""
+        """Continue from the last frame of the source's previous process."""
         time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
         self._publisher.injections.now = CycleImage(frame.cycle, time_ns, frame.raw)
 
     def resume(self, standing: StandingInjection, running: Running[Declaration], seen: Bits) -> None:
-        """Resume an injection of the previous process.
+        """Resume an injection of the source's previous process.
 
         ``seen`` is the image that readers saw last.
         """
@@ -174,7 +174,10 @@ class DeclaredInjections:
         self._settle()
 
     def declare(self, command: Command, owner: Owner) -> str:
-        """Add the injection that a command declares; return why it cannot be added, or ""."""
+        """Add the injection that a command declares.
+
+        Return the reason why it cannot be added, or "".
+        """
         try:
             declaration = _DECODER.decode(b"".join(write.data for write in command.writes))
             for complaint in contradictions(declaration):
@@ -186,9 +189,9 @@ class DeclaredInjections:
         return self._lay(layer, command)
 
     def lift(self, layer: DeclaredLayer, command: Command) -> str:
-        """Lift an injection of the configuration until its declaration changes.
+        """Lift a configured injection; it stays lifted until its declaration changes.
 
-        Return why it cannot be lifted, or "".
+        Return the reason why it cannot be lifted, or "".
         """
         if layer.activation.state is State.LIFTED:
             return f"the injection {layer.name} was lifted already"
@@ -200,7 +203,7 @@ class DeclaredInjections:
         return ""
 
     def follow(self) -> None:
-        """Add, replace and lift injections after the configuration has changed."""
+        """Add, replace and lift injections if the configuration has changed."""
         sequence = self._own.declared.sequence
         if sequence == self._configuration or sequence % 2:  # odd: a write is in progress, and a wake-up follows
             return
@@ -208,7 +211,9 @@ class DeclaredInjections:
         wanted = {declaration.name: declaration for declaration in self._own.declared.read()}
         stale = {x.id for x in self._layers if x.configured and wanted.get(x.name) != x.program.declaration}
         if stale:
-            self._publisher.lift(lambda layer: layer.id in stale, "the configuration has removed or changed it")
+            self._publisher.lift(
+                lambda layer: layer.id in stale, "the configuration has removed or changed the injection"
+            )
             self.settle()
         there = {layer.name for layer in self._layers if layer.configured}
         for declaration in wanted.values():
@@ -260,11 +265,13 @@ class DeclaredInjections:
         periods_ns = {source: block.period_ns for source, block in self._blocks.items()}
         program = compile_program(declaration, layouts, periods_ns)
         if program.source != self._own.source:
-            raise ConfigError(f"target: it names source {program.source}, but this is source {self._own.source}")
+            raise ConfigError(
+                f"target: it names source {program.source}, but the declaration was sent to source {self._own.source}"
+            )
         return program
 
     def rebind(self) -> None:
-        """Compile a condition again if a reload has changed a source that it reads."""
+        """Compile each condition again that reads a source which a reload has changed."""
         if not self.reads_other_sources:
             return
         blocks = dict(self._blocks_of())
@@ -287,8 +294,8 @@ class DeclaredInjections:
     def _advance(self, image: Image) -> list[Record]:
         """Evaluate all declared injections for the next image, and return events about the changes.
 
-        The caller holds the output's ``turn``. Only the first image of a cycle counts: how many
-        more a cycle has depends on timing, which must not change the result.
+        The caller holds the output's ``turn``. Only the first image of a cycle is evaluated: how
+        many images follow it depends on timing, which must not influence the result.
         """
         looked = self._publisher.injections.now.cycle
         time_ns = image.at.clock_ns if image.at else self._time_ns(image.cycle)
@@ -346,7 +353,7 @@ def _seed(declaration: Declaration) -> int:
 
 
 def _finished(layer: DeclaredLayer) -> bool:
-    """Return whether the injection is over and can be lifted.
+    """Return whether the injection is over and has to be lifted.
 
     Injections of the configuration stay listed when they are over.
     """
@@ -359,7 +366,7 @@ def _activation_event(layer: DeclaredLayer) -> Record:
 
 
 def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[Record]:
-    """Return the events of a new injection; together they have its declaration with its seed."""
+    """Yield the events of a new injection, which together carry its declaration including its seed."""
     document = msgspec.json.encode(msgspec.structs.replace(layer.program.declaration, seed=layer.seed))
     return in_parts(layer_event(EventKind.INJECTED, layer, layer.name, command), document)
 
@@ -368,15 +375,15 @@ def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[
 
 
 class InjectionProcessor:
-    """Adds and lifts the injections of one source, and sets their values."""
+    """Adds and lifts the injections of one source, and stores the values that clients give them."""
 
     def __init__(self, output: Output, writable: bytes, refuse_in: str, owner_of: OwnerOf, blocks: Blocks) -> None:
-        """Create the processor, and resume the injections of the previous process.
+        """Create the processor, and resume the injections of the source's previous process.
 
         Args:
             output: Publishes the source's images and events.
             writable: The bits that commands may write, as an image of the block.
-            refuse_in: Why no injection may cover ``/in``; empty if it may.
+            refuse_in: Why injections over ``/in`` are refused; empty if they are allowed.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
 
@@ -403,9 +410,9 @@ class InjectionProcessor:
         return max(0, self._look_ns - time.monotonic_ns())
 
     def toward_device(self, command: Command) -> Layer | None:
-        """Return the injection over ``/in`` for which the command sends values to the device.
+        """Return the injection over ``/in`` whose client sends the device values by this command.
 
-        None for any other command.
+        None if the command does anything else.
         """
         layer = self.injections.find(command.injection) if command.kind is CommandKind.SHADOW else None
         if layer is None or layer.direction is not Direction.IN or isinstance(layer, DeclaredLayer):
@@ -415,12 +422,12 @@ class InjectionProcessor:
     def take(self, command: Command) -> str:
         """Carry out an INJECT, DECLARE or LIFT command, or a SHADOW command over ``/out``.
 
-        Return why the command is rejected, or "".
+        Return the reason why the command is rejected, or "".
         """
         if command.kind in (CommandKind.INJECT, CommandKind.DECLARE):
             owner = self._owner_of(command.writer)
             if owner is None:
-                return "no live process owns its command queue"
+                return "no live process owns the queue from which the command came"
             if command.kind is CommandKind.DECLARE:
                 return self.declared.declare(command, owner)
             return self._lay(command, owner)
@@ -438,8 +445,8 @@ class InjectionProcessor:
     def look(self) -> None:
         """Apply changes of the configuration, and every ``LOOK_NS`` check owners and conditions.
 
-        The check lifts each injection without ``keep`` whose client is gone, and compiles the
-        conditions that read changed sources again.
+        The check lifts each injection without ``keep`` whose client has ended. It compiles
+        conditions again if they read sources that a reload has changed.
         """
         self.declared.follow()
         if self.patience_ns != 0:
@@ -452,7 +459,7 @@ class InjectionProcessor:
             if not layer.keep and self._owner_of(layer.owner.writer) != layer.owner
         }
         if gone:
-            self._publisher.lift(lambda layer: layer.id in gone, "its client is gone")
+            self._publisher.lift(lambda layer: layer.id in gone, "the injection's client has ended")
             self.declared.settle()
 
     def _lay(self, command: Command, owner: Owner) -> str:
@@ -474,7 +481,7 @@ class InjectionProcessor:
 
     def _shadow(self, layer: Layer, command: Command) -> str:
         if isinstance(layer, DeclaredLayer):
-            return f"the injection {layer.name} is declared: clients cannot set its values"
+            return f"the injection {layer.name} computes its values: clients cannot set them"
         with self._output.turn:
             if reason := shadow(layer, command.writes):
                 return reason
@@ -493,7 +500,7 @@ class InjectionProcessor:
         return ""
 
     def _resume(self) -> None:
-        """Resume the injections of the previous process, so that readers see the same values."""
+        """Resume the injections of the source's previous process; readers see the same values."""
         block = self._writer.block
         last = block.latest()
         raw, image = (last.raw, last.image) if last else (bytes(block.layout.size),) * 2
@@ -518,10 +525,10 @@ class InjectionProcessor:
                 layer.values ^= (layer.values ^ self._given(layer, raw)) & hidden
 
     def _given(self, layer: Layer, raw: bytes) -> Bits:
-        """Return the image below ``layer``, with the values that its client has sent.
+        """Return the image below ``layer``, overwritten by the values from the layer's client.
 
-        These values are read from the events that are still in the segment, because the last image
-        does not show values that outer layers hide.
+        Outer layers hide these values in the last image. They are therefore read from the events
+        that are still in the segment.
         """
         values = self.injections.before(raw, layer)
         events = self._writer.block.events

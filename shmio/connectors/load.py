@@ -1,4 +1,4 @@
-"""What a source asks of its device in each cycle, as far as that is known without the device."""
+"""How much a source requests from its device in each cycle, as far as known without the device."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ def counted(count: int, noun: str) -> str:
 
 @dataclass(frozen=True)
 class Requests:
-    """The requests of a cycle."""
+    """The number of requests in a cycle."""
 
     count: int
-    """How many, at most."""
+    """The largest number of requests in a cycle."""
     in_flight: int = 1
-    """How many of them the device certainly takes at once."""
+    """How many requests at once the device is certain to accept."""
     assumption: str = ""
-    """What the count depends on, such as ``PDU of 240 bytes``; empty if it depends on nothing."""
+    """On what the count depends, such as ``PDU of 240 bytes``; empty if it depends on nothing."""
 
     @property
     def round_trips(self) -> int:
-        """How many round trips a cycle takes one after the other."""
+        """The number of successive round trips in a cycle."""
         return -(-self.count // max(1, self.in_flight))
 
 
 @dataclass(frozen=True)
 class Load:
-    """What a source asks of its device in each cycle."""
+    """What a source requests from its device in each cycle."""
 
     reads: str
-    """What it reads, such as ``340 registers in DB5, DB7 and inputs``."""
+    """What the source reads, such as ``340 registers in DB5, DB7 and inputs``."""
     requests: tuple[Requests, ...] = ()
-    """The requests of a cycle, one entry for each assumption; none if the device sends values by itself."""
+    """The requests of a cycle under each assumption; empty if the device sends values unasked."""
     note: str = ""
-    """What else is to be known, such as why a cycle may take fewer or more requests."""
+    """A remark for the user, such as why a cycle may take fewer or more requests; may be empty."""

@@ -1,6 +1,6 @@
-"""Publishes a source's images with its injections applied, and the list and events of these injections.
+"""Publishes a source's images with injections applied, and the list and events of injections.
 
-The injections and their order are in :mod:`shmio.connectors.injection_layers`.
+The order of the injections is defined in :mod:`shmio.connectors.injection_layers`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,19 @@ from shmio.segment.events import EVENT_DATA_SIZE
 from shmio.segment.standing_injections import StandingInjection, encode, ranges_of
 
 EXTRA_FRAMES: Final = 4
-"""Most frames per period in addition to the cycle's own.
+"""Largest number of frames in a period in addition to the cycle's own frame.
 
-Rings are sized for all of them over 8 s.
+A ring has room for 8 s of frames at this rate.
 """
 GROWTH: Final = 64
-"""Bytes reserved per injection in the segment, because its numbers grow."""
+"""Bytes reserved for each injection in the segment, because the numbers in its text grow longer."""
 
 
 class Image(NamedTuple):
-    """An image of the block with its metadata; times as in :meth:`BlockWriter.publish`."""
+    """An image of the block, and its metadata.
+
+    The times are those of :meth:`BlockWriter.publish`.
+    """
 
     raw: bytes
     cycle: int
@@ -39,9 +42,12 @@ class Image(NamedTuple):
     reason: str
     asked_ns: int | None = None
     shown: bytes | None = None
-    """The image that consumers saw when it was recorded, if it differed from ``raw``."""
+    """The image that consumers saw when it was recorded, if injections changed it then.
+
+    Else None.
+    """
     at: Stamp | None = None
-    """When to publish the image; default: now."""
+    """The times to publish the image with; None: the present time."""
 
     @property
     def base(self) -> bytes:
@@ -50,11 +56,11 @@ class Image(NamedTuple):
 
 
 class Output:
-    """Publishes images, and republishes the last one when injections change.
+    """Publishes images, and publishes the last image again when injections change.
 
-    Several threads may call it; ``turn`` serialises them. Changes that come faster than
-    ``EXTRA_FRAMES`` per period share a frame. Events about a change are published after the frame
-    that shows it.
+    Several threads may call it; the lock ``turn`` serialises them. If injections change more often
+    than ``EXTRA_FRAMES`` times in a period, several changes share a frame. Events about a change
+    are published after the frame that shows the change.
     """
 
     def __init__(self, writer: BlockWriter, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
@@ -66,9 +72,9 @@ class Output:
         """
         self.turn = threading.Lock()
         self.advance: Callable[[Image], Iterable[Record]] | None = None
-        """Called with each new image before it is published.
+        """Called with each new image before the image is published.
 
-        The events that it returns follow the frame.
+        The events that it returns are published after the frame.
         """
         self._now_ns = now_ns
         self._gap_ns = writer.block.period_ns // EXTRA_FRAMES
@@ -86,9 +92,10 @@ class Output:
 
     @property
     def raw(self) -> bytes:
-        """The bytes published last, at first by the previous process of the source.
+        """The bytes published last, without injections of this instance.
 
-        Zeros if there are none.
+        Until this process has published, those of the source's previous process; zeros if there are
+        none.
         """
         return bytes(self.writer.block.layout.size) if self._last is None else self._last.raw
 
@@ -107,20 +114,23 @@ class Output:
 
     @property
     def source_ns(self) -> int:
-        """When the device had the image published last, ns since 1970.
+        """When the device had the values of the image published last, in ns since 1970.
 
-        0 if none came from it yet.
+        0 if the device has not delivered an image yet.
         """
         return 0 if self._last is None else self._last.source_ns
 
     @property
     def next_ns(self) -> int:
-        """The earliest time of the next frame between two cycles, ns on the given clock."""
+        """The earliest time of the next frame between two cycles, in ns of the ``now_ns`` clock."""
         return self._next_ns
 
     @property
     def patience_ns(self) -> int:
-        """How long changes still wait for :meth:`flush`, in ns; negative if there are none."""
+        """The time in ns until changes that wait must be published by :meth:`flush`.
+
+        Negative if no changes wait.
+        """
         return max(0, self._next_ns - self._now_ns()) if self._changed else -1
 
     def publish(self, image: Image) -> None:
@@ -132,14 +142,14 @@ class Output:
             self._publish(image.at)
 
     def resume(self, image: Image) -> None:
-        """Continue from an image that the previous process has published."""
+        """Continue from an image that the source's previous process has published."""
         with self.turn:
             self._last = image
 
     def show(self, records: Iterable[Record]) -> None:
         """Publish the present state of the injections, then ``records``. The caller holds ``turn``.
 
-        If the last frame is too recent, the changes wait for :meth:`flush`.
+        If the last frame was published too recently, the changes wait for :meth:`flush`.
         """
         self._owed += records
         self._changed = True
@@ -147,7 +157,7 @@ class Output:
             self._publish()
 
     def flush(self) -> None:
-        """Publish pending changes once their time has come."""
+        """Publish the changes that wait, if it is time."""
         with self.turn:
             if self._changed and self._now_ns() >= self._next_ns:
                 self._publish()
@@ -185,7 +195,7 @@ class LayerPublisher:
         Args:
             output: Publishes the source's images and events.
             writable: The bits that commands may write, as an image of the block.
-            refuse_in: Why no injection may cover ``/in``; empty if it may.
+            refuse_in: Why injections over ``/in`` are refused; empty if they are allowed.
 
         """
         self.output = output
@@ -201,12 +211,15 @@ class LayerPublisher:
         return self.output.injections
 
     def lay(self, layer: Layer) -> str:
-        """Add a layer; return why not, or "". The caller holds the output's ``turn``."""
+        """Add a layer; return the reason why it was refused, or "".
+
+        The caller holds the output's ``turn``.
+        """
         if layer.direction is Direction.IN:
             if self._refuse_in:
                 return self._refuse_in
             if (layer.cover & ~self._writable).any():
-                return "it covers registers that are not writable; name them in the source's `writable`"
+                return "the injection covers registers that are not writable; name them in the source's `writable`"
         if reason := self.injections.lay(layer):
             return reason
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
@@ -218,17 +231,20 @@ class LayerPublisher:
         return ""
 
     def restore(self, layer: Layer) -> None:
-        """Add a layer of the previous process, which is published already."""
+        """Add a layer that the source's previous process has already published."""
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
         self.injections.lay(layer)
 
     def lift(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> None:
-        """Remove layers, and publish why."""
+        """Remove the layers that ``which`` selects, and publish the reason."""
         with self.output.turn:
             self.output.show(self.removed(which, reason, command))
 
     def removed(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> list[Record]:
-        """Remove layers, and return the events. The caller holds the output's ``turn``."""
+        """Remove the layers that ``which`` selects, and return the events about this.
+
+        The caller holds the output's ``turn``.
+        """
         gone = [layer for layer in self.injections.layers if which(layer)]
         above = {other.id for layer in gone for other in self.injections.outer(layer)}
         self.injections.lift(which)
@@ -245,19 +261,19 @@ class LayerPublisher:
         return [*held, *self.inner_values(left, ends[0]), *ends] if ends else []
 
     def inner_values(self, layers: Iterable[Layer], end: Record) -> Iterator[Record]:
-        """Yield the values that clients' layers over ``/out`` now get from further in.
+        """Yield events with the values that clients now receive from layers inside their own.
 
-        These events precede ``end``, the event that caused the change.
+        The events precede ``end``, the event that caused the change.
         """
         for layer in layers:
             record = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
             yield from _parts(record, self.injections.inner_values(self.output.base, layer))
 
     def computed(self, base: bytes) -> Iterator[Record]:
-        """Yield the changed values that clients' layers over ``/out`` get from declared ones.
+        """Yield the changes of values that declared injections supply to clients' outer layers.
 
-        The events also come when the last such layer has become inactive. No command causes them:
-        their command number is 0, and ``item`` and ``items`` count them.
+        The events are also sent when the last such injection has become inactive. No command causes
+        them: their command number is 0, and ``item`` and ``items`` count them.
         """
         for layer in self.injections.layers:
             inner = self.injections.inner(layer) if layer.given else []
@@ -273,7 +289,7 @@ class LayerPublisher:
                 yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
 
     def laid(self, layer: Layer, end: Record) -> Iterator[Record]:
-        """Yield the events of a new client's layer: direction, priority, keep and ranges."""
+        """Yield the events about a client's new layer: direction, priority, ``keep`` and ranges."""
         how = {
             "direction": layer.direction.name.lower(),
             "priority": layer.priority,
@@ -286,7 +302,7 @@ class LayerPublisher:
         """Write the list of injections into the segment. The caller holds the output's ``turn``.
 
         Raises:
-            ValueError: The list is too long, or would be with ``growth`` more bytes.
+            ValueError: The list is too long, or would be too long if it grew by ``growth`` bytes.
 
         """
         items = (self._item(layer) for layer in self.injections.layers)
@@ -305,8 +321,8 @@ class LayerPublisher:
 
 
 def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:
-    """Remove the writes that a delay holds, and yield their EXPIRED events."""
-    reason = f"a delay held it: {reason}"
+    """Discard the writes that a declared injection delays, and yield their EXPIRED events."""
+    reason = f"an injection delayed the write, and discarded it: {reason}"
     while layer.held:
         offset, mask, data = layer.held.popleft().write
         yield Record(EventKind.EXPIRED, reason, NO_WRITER, layer.id, 0, 1, offset, mask, len(data), b"", layer.id)
@@ -315,7 +331,7 @@ def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:
 def pieces(
     kind: EventKind, command: Command, place: int, writes: Iterable[Write], layer: Layer | None
 ) -> Iterator[Record]:
-    """Yield events with the data of parts of an item; long parts take several."""
+    """Yield events with the data of parts of an item; a long part needs several events."""
     name, number = (layer.name, layer.id) if layer else ("", 0)
     return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number), writes)
 
@@ -333,6 +349,6 @@ def in_parts(record: Record, document: bytes) -> Iterator[Record]:
 
 
 def layer_event(kind: EventKind, layer: Layer, text: str, command: Command | None = None) -> Record:
-    """Return an event about an injection, caused by ``command`` or else by its owner."""
+    """Return an event about an injection; without ``command``, its owner counts as the cause."""
     writer, number = (layer.owner.writer, layer.id) if command is None else (command.writer, command.id)
     return Record(kind, text, writer, number, 0, 1, injection=layer.id)

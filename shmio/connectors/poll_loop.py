@@ -1,8 +1,8 @@
-"""The loop that polls a device: connector to segment, cycle by cycle.
+"""The loop that polls a device and publishes what its connector reads, cycle by cycle.
 
-It owns time, quality and recovery, so that every connector behaves alike: an absolute schedule,
-counted overruns, one bad frame when quality changes, the connection closed after any error,
-back-off, and recovery without a restart.
+The loop handles time, quality and recovery, so that these are alike for all connectors. It keeps an
+absolute schedule and counts overruns. When quality turns bad, it publishes one bad frame. After any
+error it closes the connection, and connects again after a back-off.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from shmio.logs import fields
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
 RECONNECT: Final = Backoff(0.1, 2.0)
-"""Waits before the next attempt to connect."""
+"""The waiting times before attempts to connect again."""
 STABLE_NS: Final = 1_000_000_000
-"""A connection that has lasted longer than this resets the back-off."""
+"""A connection that has lasted longer than this time in ns resets the back-off."""
 _MEASURES: Final = re.compile(r"\b[0-9]+(?= (?:ms|s|bytes)\b)")
-"""What varies in a reason; codes and addresses do not."""
+"""Numbers that may differ between two texts of the same reason: times and sizes."""
 
 _Result = TypeVar("_Result")
 
@@ -40,7 +40,8 @@ log = logging.getLogger("shmio.source")
 class Due(NamedTuple):
     """The next cycle.
 
-    ``due_ns`` is when it is due and may be past; ``skipped`` counts the cycles skipped to reach it.
+    ``due_ns`` is the time when it is due, which may have passed. ``skipped`` is the number of
+    cycles skipped before it.
     """
 
     cycle: int
@@ -61,11 +62,14 @@ class Schedule:
         self._last: int | None = None
 
     def moved(self, ahead_ns: int, lead: int) -> Schedule:
-        """Return a schedule for a clock that is ``ahead_ns`` ahead, with ``lead`` cycles added."""
+        """Return a schedule for a clock that is ``ahead_ns`` ahead.
+
+        Cycle numbers are ``lead`` higher.
+        """
         return Schedule(self._start_ns - ahead_ns - lead * self._period_ns, self._period_ns)
 
     def next(self, now_ns: int) -> Due:
-        """Return the next cycle, skipping those whose whole period has passed."""
+        """Return the next cycle. It skips cycles whose whole period has passed."""
         current = self.at(now_ns)
         if self._last is None:
             cycle, skipped = current + 1, 0
@@ -80,17 +84,20 @@ class Schedule:
         return self._start_ns + cycle * self._period_ns
 
     def at(self, now_ns: int) -> int:
-        """Return the cycle that was due last. No later process begins with an earlier cycle."""
+        """Return the number of the cycle that was due last.
+
+        A later process begins with a higher number.
+        """
         return (now_ns - self._start_ns) // self._period_ns
 
     def restart(self) -> None:
-        """Forget the last cycle: the time until the next one is an outage and not an overrun."""
+        """Forget the last cycle: the time until the next cycle is an outage and not an overrun."""
         self._last = None
 
 
 @dataclass(slots=True)
 class Counters:
-    """The counters that ``status`` shows of a source. Only the loop writes them."""
+    """The counters that ``status`` shows for a source. Only the loop changes them."""
 
     polls: int = 0
     overruns: int = 0
@@ -98,10 +105,13 @@ class Counters:
     connects: int = 0
     round_trip_us: int = 0
     busy_since_ns: int = 0
-    """When the running hook was called, ns; 0 between hooks."""
+    """When the loop called the method that is now running, in ns; 0 between calls."""
 
     def watch(self, now_ns: Callable[[], int], hook: Callable[[], _Result]) -> _Result:
-        """Call a hook, and record for the main thread when the call began."""
+        """Call a method of the source, and record when the call began.
+
+        Other threads detect a hang by it.
+        """
         self.busy_since_ns = now_ns()
         try:
             return hook()
@@ -116,16 +126,18 @@ class QualityLog:
         self._writer = writer
         self._state: tuple[Quality, str] | None = None  # the reason without its numbers
         self.note = ""
-        """Why quality is not good, for the process table; empty if it is good."""
+        """Why quality is not good, for the process table; empty if quality is good."""
 
     def update(self, quality: Quality, reason: str, cycle: int, well: str = "") -> bool:
-        """Report the quality if it or its reason has changed; numbers in the reason do not count.
+        """Report the quality if the quality or its reason has changed.
+
+        Times and sizes in the text of a reason do not count as changes.
 
         Args:
             quality: The present quality.
-            reason: Why it is not good; empty if it is.
+            reason: Why quality is not good; empty if it is good.
             cycle: The present cycle, for the log.
-            well: Text for the log line if quality is good.
+            well: Text to append to the log line if quality is good.
 
         Returns:
             Whether there was a change.
@@ -151,7 +163,10 @@ class Clock(Protocol):
         """Return the time of CLOCK_MONOTONIC in ns."""
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait for ``duration_ns``; return True as soon as the loop is to stop."""
+        """Wait for ``duration_ns``.
+
+        Return True as soon as the loop must stop, else False at the end.
+        """
 
 
 class WallClock:
@@ -165,7 +180,10 @@ class WallClock:
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait for ``duration_ns``; return True as soon as the loop is to stop."""
+        """Wait for ``duration_ns``.
+
+        Return True as soon as the loop must stop, else False at the end.
+        """
         return self._stopped.wait(max(0, duration_ns) / 1e9)
 
     def stop(self) -> None:
@@ -174,21 +192,21 @@ class WallClock:
 
 
 class _Submitted(NamedTuple):
-    """A cycle for which an image was requested from the device."""
+    """A cycle for which the loop has requested an image from the device."""
 
     cycle: int
     asked_ns: int
-    """Time of the request on the loop's clock."""
+    """Time of the request on the loop's clock, in ns."""
     monotonic_ns: int
     utc_ns: int
-    """Time of the request in UTC.
+    """Time of the request in UTC, in ns since 1970.
 
-    The image in the answer is at least as new as this and ``monotonic_ns``.
+    The values in the answer are at least as new as this time and ``monotonic_ns``.
     """
 
 
 class SourceLoop:
-    """Polls one connector on schedule, publishes every frame and carries out writes."""
+    """Polls one connector on schedule, publishes a frame for each image, and carries out writes."""
 
     def __init__(
         self,
@@ -207,13 +225,13 @@ class SourceLoop:
 
         Args:
             connector: The protocol of the device.
-            writer: The writing side of the source's block.
+            writer: Writes the source's block.
             schedule: When cycles are due.
             clock: The loop's clock.
             writable: Patterns of the registers that commands may write.
-            allow_nonfinite: See :class:`CommandProcessor`, also for the arguments below.
-            armed: Whether injections may reach the device.
-            owner_of: Finds the process that has a command queue.
+            allow_nonfinite: Patterns of the registers to which NaN and infinities may be written.
+            armed: Whether injections may change what is written to the device.
+            owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
 
         """
@@ -244,7 +262,7 @@ class SourceLoop:
         return self._quality_log.note
 
     def run(self) -> None:
-        """Poll until the clock says stop, then publish the end of the source."""
+        """Poll until the clock tells the loop to stop, then publish that the source has stopped."""
         try:
             while True:
                 due = self._schedule.next(self._clock.now_ns())
@@ -263,7 +281,7 @@ class SourceLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def poll(self, cycle: int) -> bool:
-        """Run one cycle: connect if necessary, write, request an image, publish what comes.
+        """Run one cycle: connect if necessary, write, request an image, publish images.
 
         Returns:
             False if the loop was told to stop during back-off.
@@ -293,12 +311,12 @@ class SourceLoop:
         return _Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns())
 
     def _drain(self) -> None:
-        """Publish the images requested before a write: no older frame may follow its event."""
+        """Publish all requested images before a write: its event must not precede older frames."""
         while self._under_way:
             self._collect(self._clock.now_ns() + round(self._connector.timeout_s * 1e9))
 
     def _collect(self, until_ns: int, leave: int = 0) -> None:
-        """Publish the images that come by ``until_ns``; ``leave`` requests may stay in flight."""
+        """Publish the images that arrive by ``until_ns``; ``leave`` requests may stay in flight."""
         while len(self._under_way) > leave:
             raw = self._call(lambda: self._connector.collect(until_ns))
             if raw is None:
@@ -350,7 +368,10 @@ class SourceLoop:
         return not stop
 
     def _disconnected(self, cycle: int, reason: str) -> None:
-        """Publish one bad frame for each new reason, with the last known bytes."""
+        """Stop accepting commands.
+
+        If the reason is new, publish a bad frame with the last bytes.
+        """
         self.commands.close(reason)
         if self._quality_log.update(Quality.BAD, reason, cycle):
             provenance = self._connector.provenance

@@ -1,4 +1,4 @@
-"""The image of a source whose device gives each register a value, a status and a time of its own."""
+"""The image of a source whose device gives each register its own value, status and time."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from shmio.model.statuses import (
 class RegisterImage:
     """Collects the registers of a block, and returns whole images for :meth:`Connector.read`.
 
-    At first, each register is bad and waits for its first value. A register that turns bad keeps
-    its last value. The layout must have a status area, which the layouts of connectors with
-    ``register_quality`` have.
+    At first, the status of each register is bad, because it waits for a value. If a register turns
+    bad later, it keeps its last value. The layout must have a status area, as the layouts of
+    connectors with ``register_quality`` do.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -35,14 +35,16 @@ class RegisterImage:
         return bytes(self._image)
 
     def put(self, index: int, value: Value, source_ns: int = 0, code: int = GOOD) -> str:
-        """Store the value of a register; a value that does not fit its type turns it bad.
+        """Store the value of a register.
+
+        If the value does not fit the register's type, set a bad status.
 
         Args:
             index: The register's index in the layout.
-            value: The value: see :meth:`Codec.encode_into`; text for times, lists for arrays.
-            source_ns: UTC time of the value in the device, ns since 1970; 0: unknown, the frame's
-                time counts.
-            code: OPC UA status code. If it is bad, the value is stored nevertheless.
+            value: A value as for :meth:`Codec.encode_into`: text for times, lists for arrays.
+            source_ns: When the device had the value, UTC in ns since 1970. 0 if unknown; readers
+                then use the time of the frame.
+            code: OPC UA status code. The value is stored even if the code is bad.
 
         Returns:
             Why the value does not fit; "" if it does.
@@ -57,11 +59,11 @@ class RegisterImage:
         return fault
 
     def put_bytes(self, index: int, data: bytes, source_ns: int = 0, code: int = GOOD) -> None:
-        """Store the value of a register as its bytes in the layout, which must be ``size`` bytes."""
+        """Store the value of a register, given as its ``size`` bytes in the layout."""
         register = self._layout.registers[index]
         self._image[register.offset : register.offset + register.size] = data
         self._area.put(self._image, index, RegisterStatus(code, source_ns))
 
     def fail(self, index: int, code: int, source_ns: int = 0) -> None:
-        """Turn a register bad, or uncertain, with a status code; its last value stays."""
+        """Set a bad or uncertain status code; the register keeps its last value."""
         self._area.put(self._image, index, RegisterStatus(code, source_ns))

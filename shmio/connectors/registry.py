@@ -35,7 +35,7 @@ BUILT_IN = {
 }
 
 BROWSED = {"opc.tcp": "opcua", "mqtt": "mqtt", "mqtts": "mqtt"}
-"""Which connector lists what a device offers, by the scheme of the device's URL."""
+"""The connector that lists what a device offers, by the scheme of the device's URL."""
 
 
 def names() -> list[str]:
@@ -50,7 +50,10 @@ def _offered() -> EntryPoints:
 
 
 def clash(name: str) -> str:
-    """Return which packages offer a connector of this name that is taken, with the remedy; "" if none do."""
+    """Return a message if several packages offer a connector of this name; else "".
+
+    A package may also offer a connector under the name of a built-in one.
+    """
     packages = sorted({_package(point) for point in _offered() if point.name == name})
     if name in BUILT_IN and packages:
         return (
@@ -85,7 +88,7 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
         if not points:
             raise ConfigError(f"no connector {name!r}; there are: {', '.join(names())}{meant(name, names())}")
         if len(points) > 1:
-            raise ConfigError(clash(name) or f"the package {_package(points[0])} offers {name!r} twice")
+            raise ConfigError(clash(name) or f"the package {_package(points[0])} offers the connector {name!r} twice")
         try:
             found = points[0].load()
         except Exception as error:
@@ -96,7 +99,7 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
 
 
 def options_type(name: str) -> type[msgspec.Struct]:
-    """Return the struct type of the connector's own configuration keys."""
+    """Return the struct type of the keys of ``[[source]]`` that belong to this connector."""
     return load(name).Options
 
 
@@ -106,11 +109,10 @@ def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str]
     Args:
         name: The connector's name.
         options: The keys and values from the TOML file.
-        texts: Keys and values from a properties file. Values are texts, which are converted.
+        texts: Keys and values from a properties file; the values are text and are converted.
 
     Raises:
-        ConfigError: A key is invalid. The message begins with the key, without the place in the
-            file.
+        ConfigError: A key is invalid. The message begins with the key, and names no file or line.
 
     """
     for fault in option_faults(name, options, texts or {}):

@@ -11,15 +11,20 @@ Place = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]
 
 
 def look_up(host: str, port: int) -> Sequence[Place]:
-    """Return the addresses of a host as ``socket.getaddrinfo`` does; OSError if it has none."""
+    """Return the addresses of a host, as ``socket.getaddrinfo`` does.
+
+    Raises:
+        OSError: The host has no address.
+
+    """
     return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
 
 
 def connect(places: Sequence[Place], timeout_s: float) -> socket.socket:
-    """Connect to the first address that answers; all of them share the time-out.
+    """Connect to the first address that answers. ``timeout_s`` limits all attempts together.
 
     Raises:
-        OSError: No address answers; the error is that of the last one.
+        OSError: No address answers. The error is that of the last address.
 
     """
     deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)

@@ -1,4 +1,4 @@
-"""Which registers a write sets, for devices that take whole values."""
+"""Finds the registers that a write sets, for devices that accept only whole values."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ def touched(layout: Layout, write: Write, present: Callable[[int], Value]) -> It
 
     Args:
         layout: The layout of the block.
-        write: The write. It may set some elements of an array, and else only whole registers.
-        present: Returns the present value of an array of which some elements are written;
-            ValueRangeError if it is not known.
+        write: The write. It may set some elements of an array. All other registers must be set as a
+            whole.
+        present: Returns the present value of an array, for the elements that are not written. It
+            raises ValueRangeError if the value is not known.
 
     Yields:
         The index of each register, and its new value.
 
     Raises:
-        ValueError: The write sets a part of a value, or no register.
+        ValueError: The write sets only a part of a value, or sets no register.
 
     """
     none = True
@@ -42,7 +43,7 @@ def touched(layout: Layout, write: Write, present: Callable[[int], Value]) -> It
         none = False
         if share != wanted:
             if not _whole_elements(register, share):
-                raise ValueError(f"{register.path}: a message has no parts of a value: write the whole register")
+                raise ValueError(f"{register.path}: a message cannot carry a part of a value: write the whole register")
             try:
                 codec(register, layout.byte_order).encode_into(present(index), image)
             except ValueRangeError:
@@ -53,11 +54,11 @@ def touched(layout: Layout, write: Write, present: Callable[[int], Value]) -> It
         apply(write, image)
         yield index, codec(register, layout.byte_order).decode(image)
     if none:
-        raise ValueError("no register of the layout is there")
+        raise ValueError("the layout has no register at the written bytes")
 
 
 def _whole_elements(register: Register, share: bytes) -> bool:
-    """Return whether these bits of a register are whole elements of an array."""
+    """Return whether the bits ``share`` of a register consist of whole elements of an array."""
     if not register.dims:
         return False
     if register.type == "BOOL":

@@ -57,7 +57,8 @@ def _check_in(program: Program, source: Source, layout: Layout) -> None:
     writable = np.frombuffer(cover(layout, source.writable), np.uint8)
     if (program.cover & ~writable).any():
         raise ConfigError(
-            f"target: it covers registers that are not writable; name them in `writable` of source {source.name!r}"
+            "target: the injection covers registers that are not writable; "
+            f"name them in `writable` of source {source.name!r}"
         )
 
 

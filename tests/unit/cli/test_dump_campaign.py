@@ -102,7 +102,7 @@ def test_values_of_a_client_become_set_operations(derive: Derive) -> None:
         (10, given(5, 7)),
         (15, given(5, 7)),
         (20, given(5, 8)),
-        (30, lifted(5, "its client is gone")),
+        (30, lifted(5, "the injection's client has ended")),
     )
     same = {"target": "cell/count", "operation": "set", "priority": 3}
     assert found == [

@@ -290,7 +290,7 @@ def test_unknown_outcome_is_reported_with_a_remedy(device: Device, capsys: pytes
 def test_timeout_limits_the_wait(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.idle = True
     assert main(["set", "--timeout", "0.2", "cell/count", "1"]) == 1
-    assert "no cycle began before its deadline" in capsys.readouterr().err
+    assert "no cycle began before the command's deadline" in capsys.readouterr().err
 
 
 def test_each_source_gets_its_own_command_and_partial_success_is_printed(

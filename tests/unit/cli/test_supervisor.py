@@ -1040,7 +1040,7 @@ def test_injection_toward_the_device_needs_armed_and_writable(
     example("Outputs/100", "Inputs/100")
     assert main(["check"]) == 1
     assert (
-        "target: it covers registers that are not writable; name them in `writable` of source 'cell'"
+        "target: the injection covers registers that are not writable; name them in `writable` of source 'cell'"
         in capsys.readouterr().err
     )
 

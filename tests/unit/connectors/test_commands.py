@@ -239,7 +239,7 @@ def test_lost_connection_leaves_the_outcome_unknown(bench: Bench) -> None:
     with pytest.raises(ConnectorError):
         bench.processor.carry_out(lost)
     event = bench.event()
-    assert (event.kind, event.text) == (EventKind.UNKNOWN, "sent, but not confirmed: cut")
+    assert (event.kind, event.text) == (EventKind.UNKNOWN, "the write was sent, but the device did not confirm it: cut")
 
 
 def test_each_item_of_a_lost_batch_has_its_known_outcome(bench: Bench) -> None:
@@ -257,9 +257,9 @@ def test_each_item_of_a_lost_batch_has_its_known_outcome(bench: Bench) -> None:
     assert [(end.command, end.item, end.items, end.kind, end.text) for end in ends] == [
         (first, 0, 1, EventKind.WRITTEN, ""),
         (first, 1, 1, EventKind.REFUSED, "no"),
-        (first, 2, 1, EventKind.UNKNOWN, "sent, but not confirmed: cut"),
-        (first, 3, 1, EventKind.EXPIRED, "not sent: cut"),
-        (second, 0, 3, EventKind.EXPIRED, "not sent: cut"),
+        (first, 2, 1, EventKind.UNKNOWN, "the write was sent, but the device did not confirm it: cut"),
+        (first, 3, 1, EventKind.EXPIRED, "the write was not sent: cut"),
+        (second, 0, 3, EventKind.EXPIRED, "the write was not sent: cut"),
     ]
 
 

@@ -223,7 +223,7 @@ def test_shadow_is_lifted_when_its_client_ends_unless_it_is_kept(rig: Rig) -> No
     rig.client.shadow(gone, {"speed": 13})
     rig.owners[4] = Owner(4, 101)  # another process owns the queue now
     lifted = rig.event(EventKind.LIFTED)
-    assert (lifted.injection, lifted.text) == (gone, "its client is gone")
+    assert (lifted.injection, lifted.text) == (gone, "the injection's client has ended")
     rig.sees({"axis/1": 11, "axis/2": 12, "speed": 0})
 
 
@@ -277,7 +277,7 @@ def test_invalid_requests_are_refused(rig: Rig) -> None:
     with pytest.raises(CommandError, match="there is no injection"):
         rig.client.lift(number + 1)
     del rig.owners[5]
-    with pytest.raises(CommandError, match="owns its command queue"):
+    with pytest.raises(CommandError, match="owns the queue from which"):
         rig.other.inject(["speed"])
 
 

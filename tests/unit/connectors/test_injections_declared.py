@@ -326,7 +326,7 @@ def test_write_reaches_the_device_altered(make: Callable[..., Rig]) -> None:
         (EventKind.WRITTEN, number, b"", 0),
         (EventKind.WRITTEN, number, b"", 0),
     ]
-    assert [event.text for event in events[-2:]] == ["after the injection 'gain' changed its value", ""]
+    assert [event.text for event in events[-2:]] == ["after the injection 'gain' changed the value", ""]
     rig.poll()
     rig.write({"speed": 21})
     rig.poll()
@@ -380,7 +380,7 @@ def test_delayed_write_expires_when_its_injection_is_lifted_or_the_device_discon
         rig.processor.open()
     (lost,) = rig.told(EventKind.EXPIRED)
     assert lost.injection == number
-    assert lost.text == f"a delay held it: {'lifted' if by == 'lift' else 'cable out'}"
+    assert lost.text == f"an injection delayed the write, and discarded it: {'lifted' if by == 'lift' else 'cable out'}"
     for _ in range(4):
         rig.poll()
     assert rig.written == []
@@ -393,7 +393,7 @@ def test_full_delay_rejects_writes(make: Callable[..., Rig]) -> None:
         assert rig.other.write({"speed": value})[0].kind is OutcomeKind.TAKEN
     (outcome,) = rig.other.write({"speed": 1})
     assert (outcome.kind, outcome.text) == (
-        OutcomeKind.REJECTED, f"the injection late delays {MAX_HELD} writes already, the maximum",
+        OutcomeKind.REJECTED, f"the injection late delays {MAX_HELD} writes already, which is the maximum",
     )  # fmt: skip
     rig.client.lift(rig.block.standing.read()[0].number)
     rig.write({"speed": 1})
@@ -416,7 +416,7 @@ def test_clients_declaration_is_lifted_when_it_is_over_or_the_client_ends(make: 
         event = rig.events.next(20)
         assert event is not None
         lifted += [(event.injection, event.text)] if event.kind == EventKind.LIFTED else []
-    assert lifted == [(over, "over"), (gone, "its client is gone")]
+    assert lifted == [(over, "over"), (gone, "the injection's client has ended")]
     assert [standing.number for standing in rig.block.standing.read()] == [kept]
 
 
@@ -493,7 +493,10 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     ("wrong", "reason"),
     [
         (declaration("x", "cell/speeds", "freeze"), "target: cell/speeds: no such register"),
-        (declaration("x", "other/speed", "freeze"), "target: it names source other, but this is source cell"),
+        (
+            declaration("x", "other/speed", "freeze"),
+            "target: it names source other, but the declaration was sent to source cell",
+        ),
         (declaration("x", "cell/speed", "set"), "value: this key is needed for operation 'set'"),
         (declaration("x", "cell/speed", "set", value="hot"), "value: speed: INT: expected"),
         (declaration("x", "cell/speed", "freeze", when="cell/speed >"), "when: at character 13: expected a register"),
@@ -528,6 +531,8 @@ def test_nan_from_an_injection_does_not_reach_the_device(
     rig.write({"axis/1": 0.0, "axis/2": 2.5})
     rig.poll()
     (refused,) = rig.told(EventKind.REFUSED)
-    assert refused.text.startswith("the injection 'mad' changes it: axis/1: NaN and infinities are written only if")
+    assert refused.text.startswith(
+        "the injection 'mad' changed the value: axis/1: NaN and infinities are written only if"
+    )
     other = LAYOUT.registers[LAYOUT.by_path["axis/2"]].offset
     assert [write.offset for write in rig.written] == [other]

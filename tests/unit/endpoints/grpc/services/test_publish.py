@@ -300,7 +300,7 @@ def test_a_source_that_is_not_connected_refuses_at_once(segment: Segment, caplog
         assert counted(served) == (0, 1001)
 
     with_plant(segment, test)
-    assert "unknown: sent, but not confirmed: cable out" in caplog.text
+    assert "unknown: the write was sent, but the device did not confirm it: cable out" in caplog.text
     assert "rejected: the source is not connected: cable out" in caplog.text
 
 
