@@ -1,4 +1,4 @@
-"""The two processes of the MQTT endpoint: the bridge, and our own broker."""
+"""The two processes of the MQTT endpoint: the bridge, and the instance's own broker."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 BROKER = "broker"
-"""The name of our own broker's process."""
+"""The name of the process of the instance's own broker."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -52,9 +52,9 @@ def _run_bridge(worker: Worker) -> None:
 
 
 def run_broker(worker: Worker) -> None:
-    """Run our own broker until the worker is stopped.
+    """Run the instance's own broker until the worker is stopped.
 
-    It is mosquitto if that is installed, otherwise aMQTT.
+    The broker is mosquitto if that is installed, otherwise aMQTT.
     """
     settings = msgspec.convert(worker.config, Mqtt)
     program = choose_broker(settings)
@@ -65,8 +65,8 @@ def run_broker(worker: Worker) -> None:
             _run_mosquitto(worker, Mosquitto(program, settings, worker.segment.instance, place), settings)
         else:
             log.warning(
-                "mosquitto is not installed: aMQTT on %s, for development only: every program on this host may publish "
-                "everything, even values",
+                "mosquitto is not installed, so aMQTT runs on %s, for development only: every program on this host "
+                "may publish everything, even values",
                 settings.listen,
             )
             from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  needs the extra, and is large

@@ -41,7 +41,7 @@ from shmio.segment.doorbell import TURN_NS, Relay
 OFFLINE: Final = b"offline"
 STOPPED: Final = "the bridge was stopped"
 LEAVE_S: Final = 2.0
-"""Time limit for closing, within which the broker must accept the last messages."""
+"""Time limit in s for the broker to accept the last messages when the bridge closes."""
 TURN_S: Final = 0.2
 MAX_CLEARED: Final = 20_000
 """Maximum number of topics whose retained messages the bridge deletes at the broker."""
@@ -109,12 +109,12 @@ class Bridge:
         # When clients see that we are online, they may send commands at once.
         self.connection.is_ready = lambda: self.command_connection.ready
         self._recalled: frozenset[str] | None = None
-        """Our topics when we asked for an earlier bridge's retained messages; None: not yet asked."""
+        """Topics whose retained messages the bridge asked the broker for; None: not asked yet."""
         self._behind: set[Feed] = set()
         self._rest_s = 0.0
         """How long :meth:`turn` may wait for events, in s."""
         self._missed = 0
-        """Number of frames that removed feeds had missed."""
+        """Number of frames that feeds had missed before they were removed."""
         self._generation = -1
         self._reader = ThreadPoolExecutor(1, "reader")
         self._sparkplug: Session | None = None
@@ -174,9 +174,9 @@ class Bridge:
         self._rest_s = 0.0 if self._behind or self.outbox.can_send else min(due_s)
 
     def _mark_due(self) -> Iterator[float]:
-        """Mark the changes whose rate limit no longer applies.
+        """Mark the changes that a rate limit no longer delays.
 
-        Yields, for each source, the time until the next such change, in s.
+        Yields, for each source, the time in s until the next rate limit ends.
         """
         for feed in self._feeds.values():
             due_ns = None if feed.step_driven else feed.mark_due()
@@ -196,7 +196,7 @@ class Bridge:
         return rest_s
 
     def _publish_all(self) -> None:
-        """Publish that we are online, and the current state of every topic.
+        """Publish that the bridge is online, and the current state of every topic.
 
         Before this state, the outbox sends the changes that it kept during an outage.
         """
@@ -212,12 +212,12 @@ class Bridge:
     # ---- other clients that publish on our topics --------------------------------------------------------------------
 
     def watch(self) -> None:
-        """Subscribe to our own topics."""
+        """Subscribe to the bridge's own topics."""
         self.connection.watch(self._own)
         self.command_connection.watch()
 
     def unwatch(self) -> None:
-        """Unsubscribe from our own topics."""
+        """Unsubscribe from the bridge's own topics."""
         self.connection.unwatch(self._own)
         self.command_connection.unwatch()
 
@@ -228,7 +228,7 @@ class Bridge:
         return [*states, *output_filters(self.prefix, self._clients.values())]
 
     def correct(self, topic: str) -> None:
-        """Publish our value on a topic again, or delete what another client has published there."""
+        """Publish the bridge's value on a topic again, or delete what another client published."""
         log.warning(
             "another client publishes on %s, a topic of this instance, which now publishes its own value again: let no "
             "other account publish there, and no other bridge use this prefix",
@@ -240,7 +240,7 @@ class Bridge:
             self.outbox.mark(ClearedTopic(topic))
 
     def correct_all(self) -> None:
-        """Publish everything again."""
+        """Publish the current state of all topics again."""
         self.outbox.mark(self._status)
         for feed in self._feeds.values():
             feed.resend()
@@ -268,7 +268,7 @@ class Bridge:
                 self._guard.report(message.topic)
 
     def _clear_old(self, message: MQTTMessage) -> None:
-        """Delete a retained value of an earlier bridge, on a topic that this one does not use."""
+        """Delete a retained value of an earlier bridge on a topic that this bridge does not use."""
         if not (message.retain and message.payload and self._recalled is not None) or len(self._cleared) >= MAX_CLEARED:
             return
         with suppress(UnicodeDecodeError):
@@ -338,7 +338,7 @@ class Bridge:
             self._selector.register(relay.descriptor, selectors.EVENT_READ, partial(self._wake_feed, feed, relay))
 
     def _remove_feed(self, feed: Feed, successor: Feed | None = None) -> None:
-        """Remove a feed, and delete retained messages on topics that its successor does not use."""
+        """Remove a feed. Delete its retained messages on topics that its successor does not use."""
         feed.command_client.poll()
         self._behind.discard(feed)
         stay = set() if successor is None else {channel.topic for channel in successor.all()}
@@ -359,7 +359,7 @@ class Bridge:
     # ---- the end -----------------------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Send the messages that wait, publish that we are offline, and disconnect."""
+        """Send the waiting messages, publish that the bridge is offline, and disconnect."""
         self.steps.close()
         until_s = time.monotonic() + LEAVE_S
         self._drain(until_s, lambda: not self.outbox.busy)

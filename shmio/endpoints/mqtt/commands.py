@@ -24,21 +24,21 @@ from shmio.segment import DONE, Block, EventKind
 from shmio.segment.commands import End, worst
 
 REPLIES: Final = "shmio/results"
-"""Topics below the prefix that clients may choose for their results.
+"""Beginning, after the prefix, of the response topics that clients may choose for results.
 
-With a response topic elsewhere, a client could make us write values or publish false ones.
+With any other response topic, a client could make the bridge write values or publish false values.
 """
 OUTPUTS: Final = ("/out", "/frames")
 RETAINED: Final = "a retained command is not carried out; publish commands without the retain flag"
 MAX_CORRELATION_BYTES: Final = 1024
 MAX_TOPIC_BYTES: Final = 65535 - len("/result")
-"""Maximum length of a command's topic.
+"""Maximum length of a command's topic, in bytes.
 
-A topic has at most 65535 bytes (MQTT 5.0, section 1.5.4), and the result's topic is longer.
+A topic has at most 65535 bytes (MQTT 5.0, section 1.5.4), and the topic of the result is longer.
 """
 
 Done = Callable[[EventKind, str], None]
-"""Called once for each command, with its outcome and the reason."""
+"""Function that is called once for each command, with its outcome and the reason."""
 Answer = Callable[[Message, Properties | None], None]
 
 log = logging.getLogger("shmio.mqtt")
@@ -57,7 +57,7 @@ class CommandClient:
         """
         self.block = block
         self.depths = _depths(block.layout)
-        """The numbers of segments that paths of this source have."""
+        """The different numbers of segments of the paths of this source."""
         self._source_writer = SourceWriter(block, writer)
         self._source_writer.prepare()
         self._pending = InFlightTable(writer)
@@ -87,7 +87,7 @@ class CommandClient:
         """
         cost = CommandCost.of(sizes(register))
         if self._pending and self._pending.open_events + cost.events > MAX_OPEN:
-            raise CommandError(f"{self.block.source}: too many commands are under way; wait for their results")
+            raise CommandError(f"{self.block.source}: too many commands are under way: wait for their results")
         if self.block.retired:
             raise CommandError(RETIRED)
         self._pending.add(self._source_writer.submit({register.path: value}), cost, partial(_tell, done))
@@ -117,15 +117,15 @@ def _depths(layout: Layout) -> Sequence[int]:
 
 
 def command_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """Return the filters for commands, which match none of the topics that we publish.
+    """Return the topic filters for commands. They match no topic on which the bridge publishes.
 
-    There is one for each path depth of each source.
+    There is a filter for each path depth of each source.
     """
     return [f"{prefix}/{one.block.source}/{'+/' * depth}in" for one in clients for depth in one.depths]
 
 
 def output_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """Return the filters for values that an earlier bridge may have published for these sources."""
+    """Return topic filters that match values of these sources, also those of earlier bridges."""
     found = []
     for one in clients:
         base = f"{prefix}/{one.block.source}"
@@ -134,7 +134,7 @@ def output_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
 
 
 def result_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """Return the filters for the topics of results."""
+    """Return the topic filters for the results of commands."""
     return [f"{one}/result" for one in command_filters(prefix, clients)] + [f"{prefix}/{REPLIES}/#"]
 
 
@@ -148,7 +148,7 @@ class CommandReceiver:
             prefix: Prefix of all topics.
             rules: The configuration's rules for topics.
             clients: The clients of the current sources, by name.
-            answer: Called with each result.
+            answer: Called with the message of each result.
 
         """
         self.received = 0
@@ -157,7 +157,7 @@ class CommandReceiver:
         self._prefix, self._rules, self._clients, self._answer = prefix, rules, clients, answer
 
     def take(self, message: MQTTMessage) -> None:
-        """Handle a message. If its topic is a command topic, send the value to the source."""
+        """Handle a message. If it has the topic of a command, send its value to the source."""
         try:
             topic = message.topic
         except UnicodeDecodeError:
@@ -187,7 +187,7 @@ class CommandReceiver:
         topic = parse_topic(text, self._clients, None)
         client = self._clients.get(topic.source)
         if client is None:
-            raise PathError(f"{topic.source}: no such source")
+            raise PathError(f"{topic.source}: there is no such source")
         return client, look_up(client.block.layout, topic)
 
 
@@ -218,7 +218,7 @@ class _Reply:
 
 
 def _value(payload: bytes, register: Register, *, json: bool) -> Any:
-    """Decode a payload: a text, or JSON with a value or with an object that has one.
+    """Decode a payload: a plain text, or as JSON a value or an object with a value.
 
     Raises:
         ValueRangeError: The payload is not a value of the register.
@@ -234,10 +234,10 @@ def _value(payload: bytes, register: Register, *, json: bool) -> Any:
 
 
 def _bare(text: str, register: Register) -> str:
-    """Return the text of a JSON value, or of the ``value`` of a JSON object.
+    """Return a JSON value as text. If it is an object, return its member ``value`` as text.
 
     Raises:
-        ValueRangeError: The text is not such JSON.
+        ValueRangeError: The text is not JSON, or has no such value.
 
     """
     try:

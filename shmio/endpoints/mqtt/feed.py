@@ -32,7 +32,10 @@ log = logging.getLogger("shmio.mqtt")
 MAX_FRAMES_PER_TURN: Final = 8
 """Maximum number of frames that are read before the bridge does other work."""
 CATCH_UP_S: Final = 3.0
-"""A bridge that is further behind than this, or than half the ring, skips to the newest frame."""
+"""Time in s by which the bridge may be behind, but by no more than half the ring.
+
+If it is further behind, it skips to the newest frame.
+"""
 
 
 def follow(block: Block) -> FrameFollower:
@@ -60,7 +63,10 @@ class Feed:
         self.block = block
         self.follower = follow(block)
         self.step_driven = False
-        """True if only steps publish: the block is on the instance's clock, and time is virtual."""
+        """True if values are published only by steps.
+
+        This is so while time is virtual, if the block is on the instance's clock.
+        """
         self.command_client = CommandClient(block, writer)
         base = f"{prefix}/{block.source}"
         self.status = StatusChannel(self.follower, f"{base}/status")
@@ -106,7 +112,7 @@ class Feed:
 
     @property
     def ended(self) -> bool:
-        """True if a reload has ended the block, and all its frames were read."""
+        """True if a reload has ended the block, and all its frames have been read."""
         return self.follower.ended
 
     def poll(self) -> bool:
@@ -116,7 +122,7 @@ class Feed:
         for frame in self.follower.read(MAX_FRAMES_PER_TURN):
             if self.follower.take_missed():
                 log.warning(
-                    "source %s: the bridge was too slow: it has missed %d frames", self.block.source, self.missed
+                    "source %s: the bridge was too slow, and has missed %d frames", self.block.source, self.missed
                 )
                 self._outbox.mark(self.status)
             self.take(frame)
@@ -154,7 +160,7 @@ class Feed:
             self.mark_due()
 
     def _mark_injected(self, frame: Frame) -> None:
-        """Mark the channels whose injections begin or end, even if the values are equal."""
+        """Mark the channels whose injections begin or end, even if their values do not change."""
         sequence, before = self.block.standing.sequence, self._injected
         if sequence != self._injection_sequence:
             self._injection_sequence = sequence
@@ -179,7 +185,7 @@ class Feed:
         return [self.status, *self.channels, *([self.frames] if self.frames else [])]
 
     def _is_due(self, channel: ValueChannel | FramesChannel, frame: Frame) -> bool:
-        """Return whether to publish a change now: no rate limit or dead-band holds it back."""
+        """Return whether to publish a change now, because no rate limit or dead-band applies."""
         if not channel.limited:
             return True
         if channel in self._limited or channel.due_ns > self.block.now_ns():
@@ -188,10 +194,11 @@ class Feed:
         return channel.moved(frame.image)
 
     def mark_due(self) -> int | None:
-        """Mark the channels whose rate limit no longer applies.
+        """Mark the changed channels that a rate limit no longer delays.
 
         Returns:
-            When the next rate limit ends, in ns of the source's clock, or None if none is pending.
+            The time at which the next rate limit ends, in ns of the source's clock; None: no change
+            waits for a rate limit.
 
         """
         now_ns, frame = self.block.now_ns(), self.follower.frame

@@ -1,7 +1,7 @@
 """Queues topics for the broker in the order of their first change, each with its newest value.
 
-While the broker is away, every change goes to a bounded backlog instead. The backlog is sent first
-when the broker is back.
+While there is no broker, every change goes to a bounded backlog instead. When there is a broker
+again, the backlog is sent first.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from paho.mqtt.properties import Properties
 from shmio.endpoints.mqtt.topics import Channel, Message
 
 OVERHEAD_BYTES: Final = 200
-"""Approximate memory of one message in addition to its payload."""
+"""Approximate memory that one message needs in addition to its payload, in bytes."""
 TURN_MESSAGES: Final = 500
 """Maximum number of messages that are sent before the bridge does other work."""
 MAX_RESULTS: Final = 1024
-"""Maximum number of queued results. Beyond it, the oldest are dropped."""
+"""Maximum number of queued results. If there are more, the oldest results are dropped."""
 
 Item = TypeVar("Item")
 
@@ -34,9 +34,9 @@ class _Entry(NamedTuple, Generic[Item]):
 
 
 class Backlog(Generic[Item]):
-    """A bounded memory for items in rows; each row is first in, first out.
+    """A bounded memory with several rows of items. Each row is first in, first out.
 
-    When it is full, the oldest item of all rows is dropped.
+    When the backlog is full, the oldest item of all rows is dropped.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -48,15 +48,15 @@ class Backlog(Generic[Item]):
         self._most = most_bytes
         self._rows: dict[str, deque[_Entry[Item]]] = {}
         self._number = 0
-        """Sequence number of the newest item; older items have lower numbers."""
+        """Sequence number of the newest item. Older items have lower numbers."""
 
     def put(self, item: Item, size: int, *, row: str = "", changes: int = 1) -> None:
-        """Append an item, and drop the oldest ones until everything fits.
+        """Append an item, and drop the oldest items until the rest fits.
 
         Args:
             item: The item.
             size: Size of the item, in bytes.
-            row: The row.
+            row: Name of the row.
             changes: Number of changes in the item.
 
         """
@@ -135,15 +135,15 @@ class Outbox:
         self.keeping = False
         """True if changes are kept while there is no connection.
 
-        This is so after the first connection, or after an attempt to connect has failed.
+        It is set after the first connection, or after an attempt to connect has failed.
         """
         self._catching_up = False
-        """True while the backlog is being sent, and then the current state of every topic."""
+        """True while the backlog, and after it the current state of every topic, is being sent."""
         self._catch_up_bytes = 0
-        """Size up to which the backlog takes new changes while it is being sent.
+        """Size in bytes up to which the backlog takes new changes while it is being sent.
 
-        It shrinks with what was sent. Otherwise a broker that is slower than the changes would
-        never catch up.
+        It shrinks as the backlog is sent. Otherwise the backlog would never end if changes come
+        faster than the broker takes them.
         """
         self.sent = 0
         self._dropped_results = 0
@@ -175,9 +175,9 @@ class Outbox:
         return self._backlog.dropped + self._dropped_results
 
     def mark(self, channel: Channel) -> None:
-        """Mark a topic as changed. A topic that waits already keeps its place.
+        """Mark a topic as changed. A topic that already waits keeps its place.
 
-        Until the backlog has been sent, new changes are appended to it, if there is room.
+        Until the backlog has been sent, changes are appended to the backlog, if it has room.
         """
         if self._connection.up and not (self._catching_up and self._backlog.bytes < self._catch_up_bytes):
             self._waiting[channel] = None
@@ -210,7 +210,7 @@ class Outbox:
             self._results_waiting.append((message, properties))
 
     def lose(self, unacknowledged: Iterable[Message]) -> None:
-        """After a lost connection, keep its unacknowledged messages and the changes that waited."""
+        """After a lost connection, keep its unacknowledged messages and the waiting changes."""
         for message in reversed(list(unacknowledged)):
             if message.keep:
                 self._backlog.put_back(message._replace(retain=False), _size(message))

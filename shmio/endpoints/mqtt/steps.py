@@ -1,4 +1,4 @@
-"""Delivers steps of virtual time: each waits until the broker has acknowledged its changes."""
+"""Delivers steps of virtual time. Each step waits until the broker acknowledges its changes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shmio.model.clock import Clock
 from shmio.segment.clock import ClockPage
 
 PATIENCE_S: Final = 3.0
-"""Time limit for a broker to acknowledge a step; less than the time-out of a step."""
+"""Time limit in s for a broker to acknowledge a step. It is less than the time-out of a step."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -26,7 +26,7 @@ class StepDelivery:
     """Delivers steps to the broker. Use it only in the bridge's thread."""
 
     def __init__(self, clock: ClockPage, index: int, topic: str, connection: BrokerConnection, outbox: Outbox) -> None:
-        """Let each step from now on wait for this process.
+        """Make each step from now on wait for this process.
 
         Args:
             clock: The clock page.
@@ -45,10 +45,10 @@ class StepDelivery:
         clock.deliver(index, self.done)  # from now on each step waits for this process
 
     def poll(self, feeds: Collection[Feed]) -> Collection[Feed]:
-        """Begin to deliver a new step, or finish a delivery; update which feeds steps drive.
+        """Begin to deliver a new step, or finish a delivery. Set which feeds publish only by steps.
 
         Returns:
-            The feeds that steps no longer drive. They may have frames that were not read.
+            The feeds that no longer publish only by steps. They may have unread frames.
 
         """
         now = self._clock.read()
@@ -78,7 +78,10 @@ class StepDelivery:
         self._outbox.flush()
 
     def _over(self, marker: StepMarker) -> bool:
-        """Return whether the delivery has ended: acknowledged, timed out, or without a broker."""
+        """Return whether the delivery has ended.
+
+        It ends by the broker's acknowledgement, by a time-out, or with the connection.
+        """
         if not self._connection.up:
             return True
         if marker.sent is not None and not self._connection.is_unacknowledged(marker.sent):
@@ -90,7 +93,7 @@ class StepDelivery:
         return False
 
     def close(self) -> None:
-        """Let steps no longer wait for this process."""
+        """Make steps no longer wait for this process."""
         self._clock.abstain(self._index)
 
 
@@ -106,7 +109,7 @@ class StepMarker:
         self._message = Message(topic, msgspec.json.encode(fields), 1, retain=False)
 
     def message(self, *, late: bool = False) -> Message:
-        """Return the message; unless ``late``, remember it as sent."""
+        """Return the message. Unless ``late`` is True, remember it as sent."""
         if not late:
             self.sent = self._message
         return self._message

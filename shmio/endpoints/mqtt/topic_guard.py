@@ -17,38 +17,38 @@ from shmio.backoff import Backoff
 AT_ONCE: Final = 200
 """Maximum number of topics that are corrected together."""
 PAUSE: Final = Backoff(0.1, 5.0)
-"""Pauses between corrections. They grow while others continue to publish on our topics."""
+"""Pauses between corrections. They grow while others publish on the bridge's topics."""
 CALM_PAUSES: Final = 4
 """Number of pauses without a correction after which the pauses are short again."""
 CALM_S: Final = 60.0
-"""Time without a rest after which the rests are short again."""
+"""Time without a rest, in s, after which the rests are short again."""
 MOST_WAITING: Final = 1000
-"""Maximum number of topics to correct. Beyond it, everything is published again."""
+"""Maximum number of topics to correct. If there are more, all topics are published again."""
 MOST_HEARD: Final = 2000
-"""Maximum number of others' messages in one second.
+"""Maximum number of other clients' messages in one second.
 
-Beyond it, a rest begins without corrections.
+If there are more, the guard rests: for a time, it corrects nothing.
 """
 REST: Final = Backoff(10.0, 320.0)
-"""Durations of the rests. They grow while others continue to publish on our topics."""
+"""Durations of the rests. They grow while others publish on the bridge's topics."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 class TopicOwner(Protocol):
-    """The bridge, as the guard sees it."""
+    """The methods of the bridge that the guard uses."""
 
     def watch(self) -> None:
-        """Subscribe to our own topics."""
+        """Subscribe to the bridge's own topics."""
 
     def unwatch(self) -> None:
-        """Unsubscribe from our own topics."""
+        """Unsubscribe from the bridge's own topics."""
 
     def correct(self, topic: str) -> None:
-        """Publish our value on a topic again."""
+        """Publish the bridge's value on a topic again."""
 
     def correct_all(self) -> None:
-        """Publish everything again."""
+        """Publish the current state of all topics again."""
 
 
 class TopicGuard:
@@ -59,13 +59,13 @@ class TopicGuard:
         self._waiting: dict[str, None] = {}
         self._everything = False
         self._pauses = self._rests = 0
-        """Numbers of consecutive pauses and rests; each is longer than the one before."""
+        """Numbers of consecutive pauses and rests. Each is longer than the previous."""
         self._due_s = self._until_s = self._second_s = 0.0
         self._count = 0
         self._resting = False
 
     def begin(self) -> None:
-        """Begin after a connect: everything is published anyway, so there is nothing to correct."""
+        """Begin after a connect. All topics are published then, so there is nothing to correct."""
         if not self._resting:
             self._waiting.clear()
             self._everything = False
@@ -87,7 +87,7 @@ class TopicGuard:
             rest_s = REST.wait_s(self._rests)
             self._rests += 1
             self._resting, self._everything, self._until_s = True, True, now_s + rest_s
-            log.warning("other clients publish too much on our topics: no corrections for %g s", rest_s)
+            log.warning("other clients publish too much on this instance's topics: no corrections for %g s", rest_s)
         elif topic not in self._waiting and len(self._waiting) >= MOST_WAITING:
             self._everything = True
         else:

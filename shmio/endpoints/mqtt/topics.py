@@ -1,6 +1,6 @@
 """The topics that the bridge publishes: their names, the configuration's rules, and channels.
 
-A channel makes the payload of one topic when the outbox sends it.
+A channel makes the payload of one topic when the outbox sends the topic.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _ToJson = Callable[[bytes], Any]
 
 
 def output_topic(prefix: str, source: str, path: str = "") -> str:
-    """Return the topic of a register or structure of a source; of the whole source without path."""
+    """Return the topic of a source's register or structure; without path, of the whole source."""
     return f"{prefix}/{source}/{path}/out" if path else f"{prefix}/{source}/out"
 
 
 class TopicRules:
-    """The configuration's rules for topics. The first rule that matches is used."""
+    """The configuration's rules for topics. The first rule that matches a path applies."""
 
     def __init__(self, topics: Sequence[MqttTopic]) -> None:
         """Compile the rules.
@@ -65,11 +65,11 @@ class TopicRules:
                 yield path
 
     def structure(self, source: str, path: str) -> str | None:
-        """Return the structure as part of which a register is published.
+        """Return the structure whose topic has the value of a register.
 
         Returns:
-            The path of the structure; empty: the whole source; None: the register has its own
-            topic.
+            The path of the structure; empty: the topic of the whole source has the value; None:
+            the register has its own topic.
 
         """
         glob, rule = self._first(f"{source}/{path}")
@@ -91,7 +91,7 @@ class TopicRules:
 class Message(NamedTuple):
     """One message for the broker.
 
-    ``keep`` is True for a change of a value, which the backlog keeps while the broker is away.
+    ``keep`` is True for a change of a value, which the backlog keeps while there is no broker.
     ``source_ns`` is the time of the value at the source, in ns since 1970; 0: unknown, or no value.
     """
 
@@ -111,7 +111,7 @@ class Channel(Protocol):
     def message(self, *, late: bool = False) -> Message:
         """Make the message from the current state.
 
-        If ``late``, it is not sent now, but when the broker is back.
+        If ``late`` is True, it is not sent now, but when there is a broker again.
         """
 
 
@@ -125,13 +125,13 @@ class _RuledChannel:
         self.limited = rule.deadband > 0 or rule.max_rate_hz is not None
         """True if a dead-band or a maximum rate applies."""
         self.due_ns = 0
-        """When the next message may be sent, in ns of the source's clock."""
+        """Time at which the next message may be sent, in ns of the source's clock."""
         self._follower = follower
         self._qos, self._retain = rule.qos, rule.retain
         self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
 
     def moved(self, _image: bytes) -> bool:
-        """Return whether a change is large enough to publish. Without a dead-band it always is."""
+        """Return whether a change exceeds the dead-band, or there is no dead-band."""
         return True
 
     def _pause(self) -> None:
@@ -156,10 +156,13 @@ class RegisterChannel(_RuledChannel):
         self._to_text = texts(register)
         self._sent: Value = None
         self._sent_quality: Quality | None = None
-        """The quality of the register's status in the last message; None if the source gives registers none."""
+        """The quality in the last message; None if the source gives registers no status."""
 
     def moved(self, image: bytes) -> bool:
-        """Return whether the value is outside the dead-band around the last value sent, or the quality another."""
+        """Return whether the value differs by more than the dead-band from the last message.
+
+        A change of quality also counts.
+        """
         if not self._deadband or self._quality_in(image) is not self._sent_quality:
             return True
         pairs = zip(_flat(self._decode(image)), _flat(self._sent), strict=False)
@@ -170,7 +173,7 @@ class RegisterChannel(_RuledChannel):
         return None if area is None else area.quality(image, area.index(self._register))
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message. Without a good value, a text is empty, and JSON has the reason."""
+        """Make the message. If there is no good value, a text is empty, and JSON has the reason."""
         return self._message(self._json(late=late) if self.json else self._text(), late=late)
 
     def _text(self) -> bytes:
@@ -232,7 +235,7 @@ class StructureChannel(_RuledChannel):
     def message(self, *, late: bool = False) -> Message:
         """Make the message. While the quality is bad, it has the last known values.
 
-        If the source gives each register a status, the quality is that of the worst register.
+        If the source gives each register a status, the message has the worst of their qualities.
         """
         follower = self._follower
         block, frame = follower.block, follower.frame

@@ -1,4 +1,4 @@
-"""aMQTT as our own broker where mosquitto is not installed. It is for development on one host.
+"""aMQTT as the instance's own broker, for development on a host without mosquitto.
 
 It speaks MQTT 3.1.1. Every program that reaches it may publish and subscribe to everything. Roles
 cannot be enforced: aMQTT publishes wills without asking its plugins, and replaces a client's
@@ -28,7 +28,7 @@ _CONFIG: Final = {
     "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {}},
 }
 _UNSUPPORTED: Final = b"\x20\x03\x00\x84\x00"
-"""A CONNACK that refuses the version of the protocol (MQTT 5.0, section 3.2)."""
+"""A CONNACK packet that refuses the version of the protocol (MQTT 5.0, section 3.2)."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -98,7 +98,7 @@ async def _until_version(reader: StreamReader) -> bytes:
 
 
 class _Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classes have no types
-    """Returns the bytes that were read before, then reads the rest."""
+    """Reader that first returns bytes that were read before, and then reads the connection."""
 
     def __init__(self, reader: StreamReader, begun: bytes) -> None:
         super().__init__(reader)
@@ -112,7 +112,7 @@ class _Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's class
 
 
 class _Writer(StreamWriterAdapter):  # type: ignore[misc]
-    """Gives clients of the UNIX socket an address, because aMQTT refuses clients without one."""
+    """Gives each client of the UNIX socket an address, because aMQTT demands one."""
 
     def get_peer_info(self) -> tuple[str, int]:
         """Return the host and port of the client."""

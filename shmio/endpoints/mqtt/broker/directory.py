@@ -1,7 +1,7 @@
-"""The directory of our own broker, with its socket and the bridge's password.
+"""The directory of the instance's own broker, with its socket and the bridge's password.
 
 The directory is next to the supervisor's socket, and only this user can read it. Each start of the
-broker makes a new password, which only the UNIX socket accepts.
+broker makes a new password. The broker accepts it only on its UNIX socket.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shmio.errors import EndpointError
 from shmio.segment import Segment
 
 SOCKET: Final = "s"
-"""Name of the socket. The socket's path must not be longer than that of the supervisor's socket."""
+"""Name of the socket. Its path must not be longer than the path of the supervisor's socket."""
 SECRET: Final = "key"  # noqa: S105  a name
 """Name of the file with the bridge's password."""
 BRIDGE: Final = "bridge"
@@ -62,7 +62,7 @@ def prepare(place: Path) -> None:
             os.close(fd)
         clear(place)
     except OSError as error:
-        raise EndpointError(f"the broker's directory {place}: {error.strerror}") from None
+        raise EndpointError(f"cannot create the broker's directory {place}: {error.strerror}") from None
 
 
 def clear(place: Path) -> None:

@@ -1,4 +1,4 @@
-"""Eclipse Mosquitto as our own broker: its configuration, its access rules, and its process.
+"""Eclipse Mosquitto as the instance's own broker: configuration, access rules, and process.
 
 Only the bridge may publish values, status and results.
 """
@@ -27,7 +27,7 @@ STOP_S: Final = 3.0
 MAX_PACKET_BYTES: Final = 1 << 21
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
-"""Maximum size of the queue for one slow client. The client loses newer messages."""
+"""Maximum size of the queue for a slow client, in bytes. The client loses newer messages."""
 MAX_LEVELS: Final = 64
 """Maximum number of levels in the path of a register that can be written by MQTT."""
 READERS: Final = MqttAccount(roles=["read"])
@@ -75,7 +75,7 @@ def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
 class Rights(NamedTuple):
     """The rights of an account.
 
-    ``filters`` are the topics on which it may publish.
+    ``filters`` are the topics on which the account may publish.
     """
 
     read: bool
@@ -113,11 +113,11 @@ def _commands(settings: Mqtt, instance: str) -> Iterator[str]:
 
 
 def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
-    """Return the text of an ACL file. Mosquitto denies everything else, also in wills.
+    """Return the text of an ACL file. Mosquitto denies everything that the file does not allow.
 
     Args:
         given: The rights of each account, by its name.
-        accounts: Whether there are accounts; if not, the user name that a client gives is ignored.
+        accounts: Whether there are accounts. If not, mosquitto ignores the user names of clients.
 
     """
     lines = []
@@ -135,7 +135,7 @@ def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
 class Mosquitto:
     """The mosquitto process.
 
-    Start it from the main thread, because it dies with the thread that starts it.
+    Start it from the main thread, because the process ends with the thread that started it.
     """
 
     def __init__(self, program: str, settings: Mqtt, instance: str, place: Path) -> None:
@@ -217,7 +217,7 @@ class Mosquitto:
             self._process.stderr.close()
 
     def _read(self) -> None:
-        """Copy mosquitto's log lines to our log."""
+        """Copy mosquitto's log lines to the log of this process."""
         for line in self._process.stderr or ():
             self._last = ID.sub("…", _STAMP.sub("", line.strip()))
             log.info("mosquitto: %s", self._last)

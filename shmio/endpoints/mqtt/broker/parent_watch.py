@@ -1,7 +1,7 @@
-"""Runs a program that dies with the process that started it.
+"""Runs a program that ends when its parent process ends.
 
-Usage: ``parent_watch PARENT PROGRAM [ARGUMENT...]``. PARENT is the id of the process that starts
-it.
+Usage: ``parent_watch PARENT PROGRAM [ARGUMENT...]``. PARENT is the id of the parent process, which
+runs this command.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _PR_SET_PDEATHSIG: Final = 1  # prctl(2)
 
 
 def main() -> None:
-    """Replace this process by the program, or exit if the parent has died already."""
+    """Replace this process by the program, or exit if the parent has already ended."""
     parent, program = int(sys.argv[1]), sys.argv[2]
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() == parent:

@@ -1,4 +1,4 @@
-"""Chooses the program of our own broker: mosquitto, or aMQTT for development where there is none."""
+"""Chooses the program of the instance's own broker: mosquitto, or aMQTT for development."""
 
 from __future__ import annotations
 
@@ -27,8 +27,9 @@ def find_mosquitto() -> str | None:
     """Find mosquitto.
 
     Returns:
-        The program that ``SHMIO_MOSQUITTO`` names, if it is set; otherwise the one in the PATH or
-        in the usual directories. None: there is none, or ``SHMIO_MOSQUITTO`` is empty.
+        The program that ``SHMIO_MOSQUITTO`` names, if it is set; otherwise the mosquitto in the
+        PATH or in the usual directories. None: mosquitto was not found, or ``SHMIO_MOSQUITTO`` is
+        empty.
 
     """
     named = os.environ.get("SHMIO_MOSQUITTO")
@@ -38,7 +39,7 @@ def find_mosquitto() -> str | None:
 
 
 def choose_broker(settings: Mqtt) -> str | None:
-    """Choose the program of our own broker.
+    """Choose the program of the instance's own broker.
 
     Returns:
         The path of mosquitto; None: aMQTT.
@@ -65,7 +66,7 @@ def choose_broker(settings: Mqtt) -> str | None:
 
 
 def _only_mosquitto(settings: Mqtt) -> Iterator[str]:
-    """Yield each setting that aMQTT cannot satisfy: its key, and its meaning."""
+    """Yield each setting that aMQTT does not support, as text with its key and meaning."""
     if not Address.parse(str(settings.listen)).loopback:
         yield f"mqtt.listen: {settings.listen} can be reached from other hosts"
     if settings.tls is not None:

@@ -27,11 +27,11 @@ from shmio.endpoints.mqtt.topics import Message
 from shmio.errors import ConfigError
 
 CONNECT_S: Final = 4.0
-"""Time limit for each of TCP connect, TLS handshake and CONNACK."""
+"""Time limit in s for each of these: TCP connect, TLS handshake, and CONNACK."""
 SLOW_S: Final = 15.0
 SLOW: Final = "no answer yet: the broker, the name server, or the file system of mqtt.tls or mqtt.password_file is slow"
 MAX_PACKET_BYTES: Final = 1 << 21
-"""Maximum packet size that we accept. Only MQTT 5 tells the broker."""
+"""Maximum packet size that the bridge accepts, in bytes. Only MQTT 5 tells the broker."""
 # Reason codes: MQTT 5.0, section 2.4. Paho uses the same numbers for MQTT 3.1.1.
 _WHO: Final = frozenset({0x86, 0x87})
 _BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
@@ -71,9 +71,9 @@ class ConnectAttempt:
             policy: Chooses the broker.
             protocol: The version of MQTT.
             will: The will of the connection, or None.
-            most: Maximum number of messages that the broker may send before we acknowledge one.
-                Only MQTT 5 tells the broker.
-            wake: Called by the thread at the end, unless the attempt was abandoned.
+            most: Maximum number of messages that the broker may send before the bridge acknowledges
+                one. Only MQTT 5 tells the broker.
+            wake: Called by the thread when the attempt ends, unless the attempt was abandoned.
 
         """
         self.target = policy.next()
@@ -85,11 +85,11 @@ class ConnectAttempt:
         """
         self.client: BrokerClient | None = None
         self.socket: socket.socket | None = None
-        """The connected socket. Nothing was read from it yet."""
+        """The connected socket, from which nothing has been read yet."""
         self.sent = False
-        """True if a broker may have received a CONNECT, with our client id and will."""
+        """True if a broker may have received a CONNECT with the bridge's client id and will."""
         self.problem = ""
-        """Why the attempt failed; empty if it did not."""
+        """Reason why the attempt failed; empty if it did not fail."""
         self._policy, self._protocol, self._will, self._most, self._wake = policy, protocol, will, most, wake
         self._lock = threading.Lock()
         self._abandoned = False
@@ -183,7 +183,7 @@ def close_socket(client: Client) -> None:
 
 
 def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
-    """Describe the reason code of a broker."""
+    """Describe the reason code with which a broker refuses a connection."""
     if code.value in _WHO:
         return f"it refuses our login ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
     if code.value in _BUSY:
@@ -198,19 +198,19 @@ def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
 
     Args:
         error: The TLS error, if there was one.
-        up: The broker had accepted us.
-        tls: TLS is in use.
+        up: Whether the broker had accepted the CONNECT.
+        tls: Whether TLS is in use.
 
     """
     if error is not None:
         return _tls(error)
     lost = "the connection was lost"
     missing = "needs a client certificate (mqtt.tls.certificate and key)" if tls else "expects TLS there (mqtt.tls)"
-    return lost if up else f"{lost} before the login: it is full, or {missing}, or is not a broker"
+    return lost if up else f"{lost} before the login: the broker is full, or {missing}, or this is not a broker"
 
 
 def _why(error: Exception, target: Target, *, tls: bool) -> str:
-    """Describe why no connection could be made; ``tls`` is True if TLS is in use."""
+    """Describe why no connection could be made. ``tls`` is True if TLS is in use."""
     if isinstance(error, ssl.SSLError):
         return _tls(error)
     if isinstance(error, socket.gaierror):
@@ -231,4 +231,6 @@ def _tls(error: ssl.SSLError) -> str:
         return f"its certificate is not trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
     if "_ALERT_" in (error.reason or ""):
         return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key, which it may require"
-    return f"the TLS handshake failed ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"
+    return (
+        f"the TLS handshake failed ({error.reason or 'the broker ended the connection'}): check mqtt.tls, and the port"
+    )

@@ -1,8 +1,8 @@
 """Connections to the broker: they reconnect with growing waits, and never block.
 
 Commands and their results have their own connection. On the connection for values, the broker's
-acknowledgements would wait behind all commands. A flood of commands with QoS 0, which no limit
-holds back (MQTT 5.0, section 4.9), would then delay values.
+acknowledgements would wait behind all commands. A flood of commands with QoS 0 would then delay
+values, because the protocol does not limit their number (MQTT 5.0, section 4.9).
 """
 
 from __future__ import annotations
@@ -35,28 +35,28 @@ from shmio.endpoints.mqtt.topics import Message
 from shmio.layout.topic import shorten
 
 STABLE_S: Final = 5.0
-"""A connection that has lasted this long resets the back-off."""
+"""A connection that has lasted this long, in s, resets the back-off."""
 MOST_TOLD: Final = 300
 """Maximum length of the text with the problems of all brokers, in characters."""
 SUBSCRIBE_S: Final = CONNECT_S
-"""Time limit for the SUBACK of the subscription to commands."""
+"""Time limit for the broker's SUBACK to the subscription to commands, in s."""
 MOST_IN_FLIGHT: Final = 1000
 """Maximum number of unacknowledged messages."""
 FEW_IN_FLIGHT: Final = 4
-"""The same for connections that receive commands.
+"""Maximum number of unacknowledged messages on connections that receive commands.
 
-The broker may send so many in one turn, and each takes time.
+The broker may send that many commands in one turn, and each takes time.
 """
 HEAD_BYTES: Final = 128
 """Maximum size of the parts of a packet other than topic and payload."""
 OFTEN: Final = 4
 OFTEN_S: Final = 60.0
-"""If ``OFTEN`` connections are lost within this time, the problem names a likely cause."""
+"""If ``OFTEN`` connections are lost within this time, in s, the problem names a likely cause."""
 REFUSED_S: Final = 10.0
-"""How long a refused message stays the current problem while the broker accepts others."""
+"""Time in s for which a refused message stays the current problem, if others are accepted."""
 WITH_WILL: Final = "Disconnect with will message"
 _WATCHED: Final = 1
-"""Identifier of the subscription to our own topics."""
+"""Identifier of the subscription to the bridge's own topics."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -64,7 +64,7 @@ log = logging.getLogger("shmio.mqtt")
 class Limits(NamedTuple):
     """The limits that a broker states in its CONNACK (MQTT 5.0, section 3.2.2.3).
 
-    MQTT 3.1.1 has none. ``in_flight`` is the maximum number of unacknowledged messages.
+    MQTT 3.1.1 has no such limits. ``in_flight`` is the maximum number of unacknowledged messages.
     ``packet_bytes`` is None if packets may have any size.
     """
 
@@ -81,7 +81,7 @@ class Limits(NamedTuple):
 
         Args:
             properties: The properties of the CONNACK; None with MQTT 3.1.1.
-            most: The number of unacknowledged messages that we want.
+            most: The number of unacknowledged messages that the bridge wants.
 
         """
         given = vars(properties) if properties is not None else {}
@@ -101,9 +101,9 @@ class Limits(NamedTuple):
 
 
 def _subscription(*, retained: bool) -> SubscribeOptions:
-    """Return the options to subscribe to other clients' messages, each with its own retain flag.
+    """Return the options to subscribe to other clients' messages, with their retain flags.
 
-    If ``retained``, the broker also sends retained messages.
+    If ``retained`` is True, the broker also sends retained messages.
     """
     before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
     return SubscribeOptions(1, noLocal=True, retainAsPublished=True, retainHandling=before)
@@ -128,7 +128,7 @@ class ConnectionProblems:
         self.problem = problem
 
     def connection_lost(self, problem: str, client_id: str) -> str:
-        """Count a lost connection, and return the text of the problem."""
+        """Count a lost connection. Return the problem, with a likely cause if it occurs often."""
         self._lost_s.append(time.monotonic())
         if len(self._lost_s) < OFTEN or self._lost_s[-1] - self._lost_s[0] > OFTEN_S:
             return problem
@@ -151,21 +151,21 @@ class ConnectionProblems:
             self.report(problem)
 
     def message_accepted(self) -> None:
-        """End the problem of refused messages if the last refusal was long enough ago."""
+        """Clear the problem of refused messages if the last refusal was long enough ago."""
         if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
             self.problem = self._subscription_problem
 
 
 def is_watched(message: MQTTMessage) -> bool:
-    """Return whether a message comes from another client, on one of our own topics."""
+    """Return whether another client has sent a message on one of the bridge's own topics."""
     return _WATCHED in (vars(message.properties) if message.properties else {}).get("SubscriptionIdentifier", ())
 
 
 class BrokerConnection:
-    """A connection to a broker that reconnects. Use it only in the bridge's thread.
+    """A connection to a broker. After a loss, it reconnects. Use it only in the bridge's thread.
 
-    It registers its socket with ``selector``. Call the ``data`` of the key when the socket is
-    ready.
+    It registers its socket with ``selector``. Call the ``data`` of the selector's key when the
+    socket is ready.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class BrokerConnection:
         will: Callable[[], Message | None],
         most: int,
     ) -> None:
-        """Prepare to connect; :meth:`turn` connects.
+        """Prepare to connect. :meth:`turn` connects.
 
         Args:
             policy: Chooses the broker and the waits.
@@ -188,7 +188,7 @@ class BrokerConnection:
         """
         self.up = False
         self.is_ready: Callable[[], bool] = lambda: True
-        """Called after CONNACK until it returns True. Only then the connection is ``up``."""
+        """Called after CONNACK until it returns True. Only then, the connection is ``up``."""
         self.came_up = False
         """Set when the connection comes up; the user of this object resets it."""
         self.on_lost: Callable[[list[Message]], None] = lambda _: None
@@ -208,7 +208,7 @@ class BrokerConnection:
         self._attempt: ConnectAttempt | None = None
         self._protocol = MQTTv5
         self._deadline_s: float | None = None
-        """Deadline for the broker's CONNACK; None if we are not waiting for it."""
+        """Deadline for the broker's CONNACK; None if the connection does not wait for it."""
         self._retry_s = self._up_s = self._misc_s = 0.0
         self._new_will: Message | None = None  # not yet sent to any broker
         self._in_flight: dict[int, Message] = {}
@@ -217,12 +217,12 @@ class BrokerConnection:
 
     @property
     def problem(self) -> str:
-        """Why there is no connection, or what the broker refuses; empty if there is no problem."""
+        """Reason why there is no connection, or what the broker refuses; empty: no problem."""
         return self.problems.problem
 
     @property
     def at(self) -> Target | None:
-        """The broker that has accepted our CONNECT, or None."""
+        """The broker that has accepted the CONNECT, or None."""
         return None if self._client is None or self._deadline_s is not None else self._target
 
     @property
@@ -345,9 +345,9 @@ class BrokerConnection:
         """Drop the connection, or the attempt that waits for CONNACK.
 
         Args:
-            problem: Why.
-            politely: Send DISCONNECT, so that the will is not published. Do not set this in a
-                callback.
+            problem: Reason for the drop.
+            politely: Whether to send DISCONNECT, so that the broker does not publish the will. Do
+                not set this in a callback.
 
         """
         problem = f"broker {self._target}: {problem}"
@@ -422,7 +422,7 @@ class BrokerConnection:
     def subscribe(self, filters: Sequence[str], *, retained: bool = False) -> None:
         """Subscribe to filters.
 
-        Unless ``retained``, MQTT 5 brokers leave out retained messages. MQTT 3.1.1 brokers send
+        Without ``retained``, MQTT 5 brokers leave out retained messages. MQTT 3.1.1 brokers send
         them with the retain flag. New messages from bridged brokers may have this flag, too.
         """
         client = self._client
@@ -435,7 +435,7 @@ class BrokerConnection:
         self._subscription = self._subscription if retained or mid is None else mid
 
     def watch(self, filters: Sequence[str]) -> None:
-        """Subscribe to other clients' messages on our own topics; see :func:`is_watched`.
+        """Subscribe to other clients' messages on the bridge's own topics: see :func:`is_watched`.
 
         This needs MQTT 5.
         """
@@ -447,7 +447,7 @@ class BrokerConnection:
         self._client.subscribe([(one, options) for one in filters], properties=properties)
 
     def unwatch(self, filters: Sequence[str]) -> None:
-        """Unsubscribe from our own topics."""
+        """Unsubscribe from the bridge's own topics."""
         if self._client is not None and filters and self.mqtt5:
             self._client.unsubscribe(list(filters))
 
@@ -464,10 +464,10 @@ class BrokerConnection:
         self._problem_of.clear()
 
     def close(self, *, will: bool = False) -> None:
-        """Disconnect. Messages that were written to the socket still arrive.
+        """Disconnect. Messages that have been written to the socket still arrive.
 
         Args:
-            will: Ask the broker to publish the will. This needs MQTT 5.
+            will: Whether to ask the broker to publish the will. This needs MQTT 5.
 
         """
         if self._client is not None:
@@ -495,7 +495,7 @@ class CommandConnection:
         filters: Callable[[], Sequence[str]],
         answers: Callable[[], Sequence[str]],
     ) -> None:
-        """Create the connection; :meth:`turn` connects.
+        """Create the connection. :meth:`turn` connects.
 
         Args:
             settings: The configuration's ``[mqtt]`` section.
@@ -516,19 +516,19 @@ class CommandConnection:
 
     @property
     def ready(self) -> bool:
-        """True if commands can arrive, or if the reason is known why they cannot."""
+        """True if commands can arrive, or if it is known why they cannot arrive."""
         return self.connection.subscribed or bool(self.connection.problem)
 
     @property
     def problem(self) -> str:
-        """Why no commands arrive or no results are sent; empty if there is no problem."""
+        """Reason why no commands arrive or no results are sent; empty if there is no problem."""
         return f"commands: {self.connection.problem}" if self.connection.problem else ""
 
     def turn(self, at: Target | None) -> float:
-        """Connect to the broker that gets the values, and do what is due.
+        """Connect to the broker that receives the values, and do what is due.
 
         Args:
-            at: This broker, or None if there is no connection for values.
+            at: The broker that receives the values; None: there is no connection for values.
 
         Returns:
             After how many seconds to call this again.

@@ -1,4 +1,4 @@
-"""Reads and writes the socket of a connection, as far as it is ready.
+"""Reads and writes the socket of a connection without blocking.
 
 It reads a few packets at a time, and writes in batches.
 """
@@ -20,20 +20,20 @@ from shmio.endpoints.mqtt.connection.attempt import close_socket
 BATCH: Final = 32
 """Maximum number of messages in a batch.
 
-The messages of a batch share TCP segments. The first is sent when the last has been made.
+The messages of a batch share TCP segments. The first message is sent when the last has been made.
 """
 PACKETS: Final = 4
 """Maximum number of packets that are read before the bridge does other work.
 
-One call of paho may read one for each of our unacknowledged messages, which takes hardly any time.
+One call of paho may read a packet for each unacknowledged message, which takes hardly any time.
 """
 
 
 class SocketIo:
     """Reads and writes the socket of a client. Use it only in the bridge's thread.
 
-    It registers the socket with ``selector``. Call the ``data`` of the key when the socket is
-    ready.
+    It registers the socket with ``selector``. Call the ``data`` of the selector's key when the
+    socket is ready.
     """
 
     def __init__(
@@ -55,15 +55,15 @@ class SocketIo:
         self._client, self._selector, self._on_failure = client, selector, on_failure
         self._socket: socket.socket | None = made
         self.writing = False
-        """True while data waits until the socket has room."""
+        """True while data waits for room in the socket."""
         self._packets = 0
-        """Number of packets that called one of the client's callbacks."""
+        """Number of received packets for which one of the client's callbacks was called."""
         client.on_socket_register_write = lambda *_: None  # from now on this object writes, not paho
         _set(made, socket.TCP_NODELAY, 1)  # a batch does not wait for the acknowledgement of the one before
         selector.register(made, selectors.EVENT_READ, self._serve)
 
     def counting(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Wrap a callback of the client, to count the packets that call it."""
+        """Wrap a callback of the client, so that its calls are counted."""
 
         def counted(*told: object) -> None:
             self._packets += 1
@@ -72,7 +72,7 @@ class SocketIo:
         return counted
 
     def turn(self) -> float:
-        """Do what the selector cannot see, and return after how many seconds to call this again."""
+        """Read what the selector cannot see, and return the time in s until the next call."""
         if self._unseen():
             self._serve(selectors.EVENT_READ)
         self.push()
@@ -92,7 +92,7 @@ class SocketIo:
         close_socket(self._client)
 
     def _serve(self, events: int) -> None:
-        """Read and write the socket as far as it is ready."""
+        """Read and write the socket, as far as this does not block."""
         code = self._read() if events & selectors.EVENT_READ else MQTTErrorCode.MQTT_ERR_SUCCESS
         if not code and self._socket is not None and (events & selectors.EVENT_WRITE or not self.writing):
             code = self._write(self._socket)
@@ -106,7 +106,7 @@ class SocketIo:
     def _read(self) -> MQTTErrorCode:
         """Read a few packets.
 
-        Without a limit, paho reads one for each of our unacknowledged messages.
+        Without a limit, paho reads a packet for each unacknowledged message.
         """
         before, most = -1, self._packets + PACKETS
         code = MQTTErrorCode.MQTT_ERR_SUCCESS

@@ -1,4 +1,4 @@
-"""The addresses of the brokers, and the order and times in which to try them."""
+"""The addresses of the brokers, and the rules when to try which broker."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ from shmio.config import Mqtt
 from shmio.config.mqtt import brokers
 
 RECONNECT: Final = Backoff(0.25, 15.0, jitter=0.5)
-"""Waits before the next attempt.
+"""Waits before the next attempt to connect.
 
-They vary at random, because the bridges of a plant must not all reconnect at the same time.
+They vary at random, so that the bridges of a plant do not all reconnect at the same time.
 """
 RECONNECT_OWN: Final = Backoff(0.25, 0.5, jitter=0.5)
-"""Waits for our own broker, which is on this host and is restarted at once."""
+"""Waits before the next attempt to connect to the instance's own broker.
+
+They are short, because this broker is on this host and is restarted at once.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The address of one broker; ``host`` is the path of the socket if ``transport`` is ``unix``."""
+    """The address of a broker. If ``transport`` is ``unix``, ``host`` is the path of the socket."""
 
     host: str
     port: int = 1883
@@ -37,7 +40,8 @@ def targets(settings: Mqtt, own_socket: str) -> list[Target]:
 
     Args:
         settings: The configuration's ``[mqtt]`` section.
-        own_socket: Path of our own broker's socket, which is used unless the broker is external.
+        own_socket: Path of the socket of the instance's own broker. It is used unless the broker
+            is external.
 
     """
     if settings.broker != "external":
@@ -46,7 +50,7 @@ def targets(settings: Mqtt, own_socket: str) -> list[Target]:
 
 
 class ReconnectPolicy:
-    """Chooses the broker to try next, and the wait before."""
+    """Chooses the broker to try next, and the wait before the attempt."""
 
     def __init__(self, settings: Mqtt, client_id: str, there: Sequence[Target]) -> None:
         self.settings = settings
@@ -66,18 +70,18 @@ class ReconnectPolicy:
         self.reset_failures()
 
     def retry_same(self) -> None:
-        """Choose the last broker again next time."""
+        """Choose the same broker again next time."""
         self._next -= 1
 
     def next(self) -> Target:
-        """Return the next broker, and advance to the one after it."""
+        """Return the next broker to try. The next call returns the broker after it."""
         self._next += 1
         return self._targets[(self._next - 1) % len(self._targets)]
 
     def wait_s(self) -> float:
         """Count a failure, and return the wait before the next attempt, in s.
 
-        It grows with each failure.
+        The wait grows with each failure.
         """
         backoff = RECONNECT_OWN if all(target.transport == "unix" for target in self._targets) else RECONNECT
         wait_s = backoff.wait_s(self._failures // self.count)

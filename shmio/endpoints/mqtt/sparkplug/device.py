@@ -26,7 +26,7 @@ class DeviceEvent(Enum):
 
 
 class DeviceChange(NamedTuple):
-    """A change of a device; ``at`` has the indices of the metrics with new values."""
+    """A change of a device. ``at`` has the indices of the metrics with new values."""
 
     kind: DeviceEvent
     at: Sequence[int] = ()
@@ -35,7 +35,7 @@ class DeviceChange(NamedTuple):
 class Device:
     """Follows one block for Sparkplug. Use it only in the bridge's thread.
 
-    To create one takes seconds for a large layout.
+    For a large layout, it takes seconds to create a device.
     """
 
     def __init__(self, block: Block, command_client: CommandClient, globs: Sequence[Glob], *, elements: bool) -> None:
@@ -44,8 +44,8 @@ class Device:
         Args:
             block: The block of the source.
             command_client: Sends commands to the source.
-            globs: Select the metrics, by path with the source's name.
-            elements: Make each element of an array a metric.
+            globs: Patterns that select the metrics, by path with the source's name.
+            elements: Whether to make each element of an array a metric.
 
         """
         self.block = block
@@ -60,7 +60,7 @@ class Device:
         self._follower = follow(block)
 
     def set_metrics(self, metrics: Sequence[Metric]) -> None:
-        """Set the metrics of the device's parts, in the order of the parts."""
+        """Set the metrics of the device's registers and elements, in their order."""
         self._metrics = metrics
 
     @property
@@ -69,7 +69,7 @@ class Device:
         return self._follower.quality is not Quality.BAD
 
     def poll(self) -> Iterator[DeviceChange]:
-        """Read a few new frames, and yield the changes."""
+        """Read a few new frames, and yield the changes of the device."""
         for frame in self._follower.read(MAX_FRAMES_PER_TURN):
             if (change := self._take(frame)) is not None:
                 yield change
@@ -83,11 +83,11 @@ class Device:
 
     @property
     def behind(self) -> int:
-        """Number of frames that have not been read."""
+        """Number of frames that the device has not read yet."""
         return self._follower.behind
 
     def samples(self, at: Sequence[int] | None = None) -> list[Sample]:
-        """Return samples of all metrics, or of those with the indices ``at``."""
+        """Return samples of all metrics, or only of the metrics with the indices ``at``."""
         follower = self._follower
         frame = follower.frame
         if frame is None:

@@ -1,4 +1,4 @@
-"""A Sparkplug B edge node: makes its messages in order, and decodes its commands. No I/O.
+"""A Sparkplug B edge node: makes its messages in order, and decodes its commands. It does no I/O.
 
 Sources are the devices of the node. A device is born when its source is good for the first time. It
 dies when the source turns bad, and is born again when the source recovers (Eclipse Sparkplug
@@ -44,7 +44,7 @@ NAMESPACE: Final = "spBv1.0"
 REBIRTH: Final = "Node Control/Rebirth"
 MAX_METRICS: Final = 4096
 MAX_BYTES: Final = 1 << 20
-"""Maximum size of one command."""
+"""Maximum size of one command, in bytes."""
 
 INT32: Final = 3
 INT64: Final = 4
@@ -56,7 +56,7 @@ _QUALITY: Final = {Quality.BAD: 0, Quality.UNCERTAIN: 500, Quality.GOOD: 192}  #
 
 
 class _Datatype(NamedTuple):
-    """Sparkplug's representation of a type: the data type and the protobuf field of a single value.
+    """Sparkplug's representation of a type: its data type, and the protobuf field of a value.
 
     For arrays of the type, it also has the data type of the array and the format of its elements.
     """
@@ -107,7 +107,7 @@ class Metric:
         self._bits = 0 if register.dims else _BITS.get(kind.datatype, 0)
 
     def put(self, metric: wire.Metric, value: Any) -> None:
-        """Write a value to a message. None becomes null, also for an array with an element None."""
+        """Write a value to a message. None becomes null, and so does an array with a None in it."""
         data: Any = self._packed(value) if self.register.dims else value
         if data is None:
             metric.is_null = True
@@ -162,7 +162,7 @@ class Metric:
 def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = False) -> Iterator[Register]:
     """Yield the registers, and the elements of arrays, to publish as metrics.
 
-    An array of numbers or bits is one metric. Other arrays are split into their elements. If
+    An array of numbers or bits is one metric. Other arrays are split into their elements. With
     ``single``, all arrays are split.
     """
     for register in registers:
@@ -173,7 +173,7 @@ def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = Fa
 
 
 class Sample(NamedTuple):
-    """A value of one metric; ``at_ms`` is its time at the source, in ms since 1970."""
+    """A value of one metric. ``at_ms`` is its time at the source, in ms since 1970."""
 
     metric: Metric
     value: Any
@@ -185,8 +185,8 @@ class Sample(NamedTuple):
 class Command(NamedTuple):
     """A command of a host application.
 
-    If ``rebirth``, the node has to publish its births again. Otherwise ``values`` has values for
-    ``device``, by path.
+    If ``rebirth`` is True, the node has to publish its births again. Otherwise ``values`` has
+    values for ``device``, by path.
     """
 
     rebirth: bool = False
@@ -195,7 +195,7 @@ class Command(NamedTuple):
 
 
 class EdgeNode:
-    """One edge node, through all its sessions. Use it from one thread."""
+    """One edge node, which outlives its sessions. Use it from one thread."""
 
     def __init__(
         self,
@@ -211,7 +211,8 @@ class EdgeNode:
             group: The group id.
             node: The edge node id.
             now_ms: Returns the time, in ms since 1970.
-            datatypes: Add data types to data messages, for hosts that do not store births.
+            datatypes: Whether to add data types to data messages, for hosts that do not store
+                births.
 
         """
         self._group, self._node, self._datatypes = group, node, datatypes
@@ -221,14 +222,14 @@ class EdgeNode:
         # in tenths of a second advances faster than attempts to connect do.
         self._session = now_ms() // 100 % _SEQUENCE
         self.alive = False
-        """True if the node was born in this session and has not died."""
+        """True if the node has published its birth in this session, and not its death."""
         self._born: set[str] = set()
         self.metrics: dict[str, dict[str, Metric]] = {}
         """The metrics of each device by name, in the order in which they were defined."""
         self._by_alias: dict[int, Metric] = {}
 
     def define(self, devices: Mapping[str, Iterable[Register]]) -> None:
-        """Define the devices and their registers. After this, everything has to be born again."""
+        """Define the devices and their registers. Then publish the births of all of them again."""
         aliases = count(1)
         self.metrics = {
             device: {register.path: Metric(register, next(aliases)) for register in registers}
@@ -239,7 +240,7 @@ class EdgeNode:
 
     @property
     def commands(self) -> list[str]:
-        """The topics to subscribe to, with QoS 1, before anything is published."""
+        """The topics to subscribe to, with QoS 1, before the node publishes anything."""
         return [self._topic("NCMD"), self._topic("DCMD", "+")]
 
     def will(self) -> Message:
@@ -258,7 +259,7 @@ class EdgeNode:
     def birth(self) -> Message:
         """Return the birth of the node: the first message of a session, or the answer to a request.
 
-        Publish the births of the devices after it.
+        Publish the births of the devices after this message.
         """
         self.alive = True
         self._born.clear()
@@ -269,7 +270,7 @@ class EdgeNode:
         return self._message(payload, "NBIRTH")
 
     def device_birth(self, device: str, samples: Iterable[Sample]) -> Message:
-        """Return the birth of a device with all its metrics; those without a sample are null."""
+        """Return the birth of a device with all its metrics. Metrics without a sample are null."""
         self._born.add(device)
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         given = {sample.metric.name: sample for sample in samples}
@@ -282,7 +283,7 @@ class EdgeNode:
     def data(self, device: str, samples: Iterable[Sample], *, historical: bool = False) -> Message:
         """Return a message with changed values.
 
-        If ``historical``, the values are late, and not the current ones.
+        If ``historical`` is True, the message marks the values as late and not current.
         """
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         for sample in samples:
@@ -295,13 +296,13 @@ class EdgeNode:
         return self._message(payload, "DDATA", device)
 
     def device_death(self, device: str) -> Message:
-        """Return the death of a device, whose values are no longer valid."""
+        """Return the death of a device. It says that the device's values are no longer valid."""
         self._born.discard(device)
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         return self._message(payload, "DDEATH", device)
 
     def is_born(self, device: str) -> bool:
-        """Return whether a device was born in this session and has not died."""
+        """Return whether a device has published its birth in this session, and not its death."""
         return device in self._born
 
     def command(self, topic: str, data: bytes, check: Callable[[str, Register], object] = lambda *_: None) -> Command:
@@ -310,8 +311,8 @@ class EdgeNode:
         Args:
             topic: The topic.
             data: The payload.
-            check: Called with the device and the register of a wrong value; it may raise a more
-                important error.
+            check: Called with the device and the register of a wrong value. It may raise an error
+                that is more important.
 
         Raises:
             ValueRangeError: The payload is not Sparkplug B, or a value does not fit its metric.
@@ -325,11 +326,13 @@ class EdgeNode:
         except DecodeError:
             raise ValueRangeError(f"{topic}: this is not a Sparkplug B payload") from None
         if len(payload.metrics) > MAX_METRICS:
-            raise ValueRangeError(f"{topic}: {len(payload.metrics)} metrics, at most {MAX_METRICS} are allowed")
+            raise ValueRangeError(
+                f"{topic}: the payload has {len(payload.metrics)} metrics, at most {MAX_METRICS} are allowed"
+            )
         if topic == self._topic("NCMD"):
             asked = any(metric.name == REBIRTH and metric.boolean_value for metric in payload.metrics)
             if not asked:
-                raise PathError(f"{topic}: the node takes {REBIRTH} = true, and nothing else")
+                raise PathError(f"{topic}: the node accepts only {REBIRTH} = true")
             return Command(rebirth=True)
         device = topic.rpartition("/")[2]
         if device not in self.metrics or topic != self._topic("DCMD", device):
@@ -338,7 +341,7 @@ class EdgeNode:
         for found in payload.metrics:
             metric = self._metric(device, found)
             if metric.name in values:
-                raise ValueRangeError(f"{metric.name}: given twice")
+                raise ValueRangeError(f"{metric.name}: this metric is given twice")
             try:
                 values[metric.name] = metric.take(found)
             except ValueRangeError:
@@ -383,7 +386,7 @@ class EdgeNode:
 
 
 def _put_quality(metric: wire.Metric, quality: Quality, reason: str) -> None:
-    """Add quality and reason to a value, unless the quality is good (6.4.8.1)."""
+    """Add quality and reason to a value, unless the quality is good (specification, 6.4.8.1)."""
     if quality is not Quality.GOOD:
         metric.properties.keys.extend(("Quality", "Reason"))
         metric.properties.values.add(type=INT32, int_value=_QUALITY[quality])

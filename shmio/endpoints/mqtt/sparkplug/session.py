@@ -1,6 +1,6 @@
 """Publishes an instance as an edge node of Sparkplug B.
 
-It has its own connection, because a connection has only one will, and the bridge needs another.
+It has its own connection, because a connection has only one will, and the bridge has another will.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind, Segment
 
 SAMPLE_BYTES: Final = 96
-"""Approximate memory of a sample in addition to its value."""
+"""Approximate memory that a sample needs in addition to its value, in bytes."""
 ELEMENT_BYTES: Final = 32
-"""Approximate memory of a number in a list."""
+"""Approximate memory that a number in a list needs, in bytes."""
 TURN_SAMPLES: Final = 2000
 """Maximum number of samples of the backlog that are sent before the bridge does other work."""
 AHEAD_MS: Final = 86_400_000
-"""Maximum by which the clock of a host may be ahead of ours."""
+"""Maximum time by which the clock of a host may be ahead of this host's clock, in ms."""
 HOST_S: Final = 10.0
-"""Time limit for a primary host to announce itself at one of several brokers."""
+"""Time limit for a primary host to announce itself at one of several brokers, in s."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -51,7 +51,7 @@ class DeviceBacklog(Backlog[list[Sample]]):
         self.put(samples, OVERHEAD_BYTES + sum(map(_size, samples)), row=device, changes=len(samples))
 
     def take(self, device: str) -> list[Sample]:
-        """Remove and return the oldest samples of a device; empty: there are none."""
+        """Remove and return the oldest samples of a device; an empty list if there are none."""
         return self.pop(device) or []
 
 
@@ -61,12 +61,12 @@ class _State(msgspec.Struct):
 
 
 class PrimaryHost:
-    """The state that the primary host has published on the current connection."""
+    """The state of the primary host, as the host has published it at the current broker."""
 
     def __init__(self, name: str) -> None:
         self.topic = f"{NAMESPACE}/STATE/{name}"
         self.online: bool | None = None
-        """The state; None if the host has published none."""
+        """True if the host is online; None if the host has published no state."""
         self._at_ms = float("-inf")
 
     def forget(self) -> None:
@@ -76,8 +76,8 @@ class PrimaryHost:
     def update(self, payload: bytes) -> None:
         """Read a state message.
 
-        A message that is older than the last one is ignored, such as the late will of an earlier
-        session.
+        A message that is older than the last message is ignored. It may be the late will of an
+        earlier session.
         """
         try:
             state = msgspec.json.decode(payload, type=_State)
@@ -96,8 +96,8 @@ class PrimaryHost:
 class Session:
     """The Sparkplug session of an instance. Call :meth:`turn` in each turn of the bridge's thread.
 
-    While the broker is slow, changes are merged. While it is away, they are kept, and sent later as
-    historical.
+    While the broker is slow, changes are merged. While there is no broker, changes are kept, and
+    sent later as historical values.
     """
 
     def __init__(
@@ -131,16 +131,16 @@ class Session:
         self.connection.on_lost = self._lose
         self._host = None if sparkplug.primary_host is None else PrimaryHost(sparkplug.primary_host)
         self._host_lost = False
-        """True if the host has gone since the births. Even if it is back, it does not know them."""
+        """True if the host went offline after the births. When it returns, it does not know them."""
         self._until_s = 0.0
-        """Deadline for the host to announce itself. After it, the session tries the next broker."""
+        """Deadline for the host to announce itself. Then the session tries the next broker."""
         self._elements = sparkplug.elements
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
         self._devices: dict[str, Device] = {}
         self._waiting: dict[str, dict[int, None]] = {}
         self._pause_s = 1 / sparkplug.max_rate_hz if sparkplug.max_rate_hz else 0.0
         self._due_s: dict[str, float] = {}
-        """When the next data of each device may be sent."""
+        """Time at which the next data of each device may be sent."""
         self._backlog = DeviceBacklog(round(settings.backlog_mb * 1e6))
         self._keeping = False
         self._room = 0
@@ -148,7 +148,7 @@ class Session:
         self._rebirth_asked = False
         """True if a host has asked for the births.
 
-        A turn sends them at most once, and only if there is room.
+        A turn sends the births at most once, and only if there is room.
         """
         self._defined = False
         """True if the node's definition includes all current devices."""
@@ -226,7 +226,7 @@ class Session:
         return 0.0 if more else min([rest_s, *(one_s - now_s for one_s in due_s)])
 
     def _wait_for(self, host: PrimaryHost) -> None:
-        """While the host is away, publish the death, and try other brokers."""
+        """While the host is offline, publish the node's death, and try other brokers."""
         if not self.connection.up:
             return
         elsewhere = self._policy.count > 1 and (host.online is False or time.monotonic() >= self._until_s)
@@ -274,7 +274,7 @@ class Session:
             self._send(self.node.device_death(name))
 
     def _keep(self, name: str, device: Device, at: Sequence[int]) -> None:
-        """Keep changes, no more often than they would be sent."""
+        """Keep changes in the backlog, at the rate at which they would be sent."""
         self._waiting[name] |= dict.fromkeys(at)
         if self._is_due(name):
             self._backlog.keep(name, device.samples(list(self._waiting[name])))
@@ -283,7 +283,7 @@ class Session:
     def _is_due(self, name: str) -> bool:
         """Return whether data of a device may be sent now.
 
-        If so, start the pause before the next data.
+        If so, this starts the pause before the next data.
         """
         now_s = time.monotonic()
         if now_s < self._due_s.get(name, 0.0):
@@ -292,7 +292,7 @@ class Session:
         return True
 
     def _lose(self, _unacknowledged: Sequence[Message]) -> None:
-        """After a lost connection, keep the changes that waited for it."""
+        """After a lost connection, keep the changes that waited to be sent."""
         for name, device in self._devices.items():
             waiting = self._waiting[name]
             if waiting and device.alive:
@@ -304,7 +304,7 @@ class Session:
             self._flush_device(name, device)
 
     def _flush_device(self, name: str, device: Device) -> None:
-        """After a device's birth, send its changes, then its backlog as historical."""
+        """After a device's birth, send its changes, then its backlog as historical values."""
         connection, waiting = self.connection, self._waiting[name]
         if not self.node.is_born(name):
             return
@@ -361,7 +361,7 @@ class Session:
 
 
 class _Outcome:
-    """Logs commands that failed, because Sparkplug answers a command only by the new value."""
+    """Logs a failed command, because Sparkplug answers a command only by the new value."""
 
     def __init__(self, path: str) -> None:
         self._path = path
