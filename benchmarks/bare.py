@@ -1,7 +1,7 @@
-"""A bare grpc.aio server, as a process: every call gets the same ready bytes.
+"""A process with a bare grpc.aio server, which answers every call with the same prepared bytes.
 
-As fast as its client takes them; or, with a second argument, so many times a second, out of a queue for each stream, as
-a server has it whose values come from somewhere else.
+It sends as fast as its client takes the messages. With a second argument, it sends so many messages a second on each
+stream, from a queue for the stream. A server whose values come from elsewhere works like that.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ QUEUE = 64
 
 
 class Everything(grpc.GenericRpcHandler):
-    """Answers any call."""
+    """A handler that accepts every call."""
 
     def __init__(self, message: bytes, hz: float) -> None:
         self._message = message
@@ -44,7 +44,7 @@ class Everything(grpc.GenericRpcHandler):
             self._queues.discard(queue)
 
     async def pace(self) -> None:
-        """Fill the queues, for ever."""
+        """Put messages into all queues at the given rate, until the process is stopped."""
         begun_s, count = time.monotonic(), 0
         while self._hz:
             while count < (time.monotonic() - begun_s) * self._hz:

@@ -1,6 +1,6 @@
-"""A bare grpc.aio server, as a process: each step's call sends what is ready on the stream, and is answered then.
+"""A process with a bare grpc.aio server: for each step call, it sends prepared messages on the stream, then answers.
 
-What it sends is what an endpoint has sent to the same client before, as it came: see ``ready.py``.
+The messages are those that an endpoint sent to the same client before, byte for byte: see ``ready.py``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ready import Ready
 
 
 class Bare(grpc.GenericRpcHandler):
-    """All that the client calls; for one client at a time."""
+    """Handlers for all calls of a stepping client. The server has one client at a time."""
 
     def __init__(self, ready: Ready) -> None:
         self._ready = ready
@@ -30,7 +30,7 @@ class Bare(grpc.GenericRpcHandler):
         self._other: grpc.RpcMethodHandler[Any, Any] = grpc.unary_unary_rpc_method_handler(self._nothing)
 
     def service(self, handler_call_details: Any) -> grpc.RpcMethodHandler[Any, Any] | None:
-        """What answers a call."""
+        """Return the handler of a call."""
         handler: grpc.RpcMethodHandler[Any, Any] = self._handlers.get(handler_call_details.method, self._other)
         return handler
 
@@ -61,7 +61,7 @@ class Bare(grpc.GenericRpcHandler):
 
 
 async def serve(ready: Ready) -> None:
-    """Until standard input ends."""
+    """Serve until standard input ends."""
     server = grpc.aio.server()
     server.add_generic_rpc_handlers((Bare(ready),))
     port = server.add_insecure_port("127.0.0.1:0")
@@ -73,7 +73,7 @@ async def serve(ready: Ready) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("ready", help="what is sent, as JSON")
+    parser.add_argument("ready", help="the messages to send, as JSON (see ready.py)")
     asyncio.run(serve(Ready.of(parser.parse_args().ready)))
 
 

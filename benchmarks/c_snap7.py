@@ -1,8 +1,8 @@
-"""The C client snap7, by way of python-snap7 2.1 (later ones are Python), as a process of its own.
+"""Reads DB201 with the C client snap7, by way of python-snap7 2.1 (later versions are pure Python), in its own process.
 
-:func:`fetched` installs it once into ``build/``, apart from the python-snap7 that shmio needs. Run as a script with
-host, port, PDU and packet size, it reads DB201 for as many seconds as each line of its standard input says, and answers
-with the reads a second.
+:func:`fetched` installs python-snap7 2.1 once into ``build/``, apart from the python-snap7 that shmio needs. As a
+script, the module takes host, port, PDU size and packet size. For each line of standard input, a number of seconds,
+it reads DB201 for that time and prints the number of reads a second.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NUMBER, SIZE = 201, 2180  # as in plc.py, which is not imported: shmio's python-
 
 
 def fetched(*, download: bool) -> Path | None:
-    """Folder to put first on PYTHONPATH; None, and a line that says why, when it cannot be had."""
+    """Return the folder of the packages. If they are not available, print why and return None."""
     if PLACE.exists():
         return PLACE
     if not download:

@@ -1,9 +1,9 @@
-"""A value written to the controller, until it is confirmed and until a frame shows it, and where the time goes.
+"""How long a write to the controller takes until it is confirmed and until a frame shows it, and where the time goes.
 
-A program attaches to a running instance and calls ``write``; the times of acceptance, outcome and frame are those that
-the source put into the segment. Beside it two clients without any instance write to the same controller and read the
-block back: python-snap7, and shmio's own S7 client. All take turns, and the source goes on polling. Program,
-supervisor, source, controller and link are processes of their own.
+A program attaches to a running instance and calls ``write``. The source records the times of acceptance, outcome and
+frame in the segment. For comparison, two clients without an instance write to the same controller and read the block
+back: python-snap7, and shmio's own S7 client. They take turns while the source continues to poll. Program,
+supervisor, source, controller and link are separate processes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Writer:
         self.stages: Times = defaultdict(list)
 
     def write(self, value: int) -> tuple[float, float]:
-        """Write and wait for a frame that shows it; (ms until confirmed, ms until the frame was published)."""
+        """Write, and wait for a frame that shows the value. Return the ms until confirmation and until that frame."""
         frames, events = self._block.cursor(), self._block.events.cursor()
         begun_ns = time.monotonic_ns()
         outcome = self._cell.write({PATH: value})[0]
@@ -65,7 +65,10 @@ class Writer:
 def bare(
     write: Callable[[bytes], object], read: Callable[[], bytes | bytearray]
 ) -> Callable[[int], tuple[float, float]]:
-    """Make the same of a client: (ms until confirmed, ms until read back)."""
+    """Make a function that writes by a client without an instance.
+
+    It returns the ms until confirmation and read-back.
+    """
 
     def sample(value: int) -> tuple[float, float]:
         data = _VALUE.pack(value)
@@ -73,14 +76,14 @@ def bare(
         write(data)
         written_ns = time.monotonic_ns()
         if not read().startswith(data):
-            raise SystemExit("the block read back does not hold what was written")
+            raise SystemExit("the block that was read back differs from the block that was written")
         return (written_ns - begun_ns) / 1e6, (time.monotonic_ns() - begun_ns) / 1e6
 
     return sample
 
 
 def measure(period_ms: float, round_trip_ms: float, count: int) -> None:
-    """Print three tables for one period and one link."""
+    """Print three tables for one poll period and one link."""
     with ExitStack() as stack:
         plc = stack.enter_context(Child("plc.py"))
         if round_trip_ms:

@@ -1,4 +1,4 @@
-"""What all benchmarks share: fair rounds, tables with ratios, child processes, the machine's name."""
+"""What all benchmarks share: fair rounds, tables with ratios, child processes, a description of the machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from shmio.layout.model import Layout
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 DB201 = ROOT / "shmio/cli/a50/db201.db"
-"""The reference load: 2,180 bytes, of which 20 REALs move."""
+"""The reference load: a block of 2,180 bytes with 20 REALs that change."""
 
 Samples = Mapping[str, Sequence[float]]
 
@@ -32,16 +32,21 @@ Samples = Mapping[str, Sequence[float]]
 
 
 def begin(description: str) -> bool:
-    """Parse the one option all benchmarks have, and print what the figures depend on; whether to be quick."""
+    """Parse the option that all benchmarks have, and print the title and the machine.
+
+    Return whether ``--quick`` was given.
+    """
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--quick", action="store_true", help="fewer and shorter rounds: does it work, not how fast")
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer and shorter rounds, which check only that the benchmark works"
+    )
     quick: bool = parser.parse_args().quick
     print(f"# {description}\n{machine()}")
     return quick
 
 
 def machine() -> str:
-    """What the figures depend on, in one line."""
+    """Return a line with everything about the machine that affects the figures."""
     cores = len(os.sched_getaffinity(0))
     load = "/".join(f"{value:.2f}" for value in os.getloadavg())
     system, release, architecture = platform.system(), platform.release(), platform.machine()
@@ -57,7 +62,7 @@ def db201() -> Layout:
 
 
 def interleave(contenders: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
-    """One sample of each contender a round, another first each time: the machine's other work falls on all."""
+    """Sample every contender once a round. Each round starts with another one, so that other load affects all alike."""
     names = list(contenders)
     samples: dict[str, list[float]] = {name: [] for name in names}
     for turn in range(rounds):
@@ -68,7 +73,7 @@ def interleave(contenders: Mapping[str, Callable[[], float]], rounds: int) -> di
 
 
 def per_call_ns(function: Callable[[], object], calls: int) -> Callable[[], float]:
-    """Make a sampler: the time of one call, mean of so many, with the garbage collector held."""
+    """Make a sampler of the mean time of one call in ns, over a number of calls, without garbage collection."""
 
     def sample() -> float:
         turns = range(calls)
@@ -84,7 +89,7 @@ def per_call_ns(function: Callable[[], object], calls: int) -> Callable[[], floa
 
 
 def per_second(function: Callable[[], object], duration_s: float) -> Callable[[], float]:
-    """Make a sampler: calls a second, over some time."""
+    """Make a sampler of the number of calls a second, over a duration."""
 
     def sample() -> float:
         count = 0
@@ -98,7 +103,7 @@ def per_second(function: Callable[[], object], duration_s: float) -> Callable[[]
 
 
 def quantiles(values: Sequence[float]) -> tuple[float, float, float]:
-    """Median, p90, p99."""
+    """Return median, 90th and 99th percentile."""
     cuts = statistics.quantiles(values, n=100, method="inclusive")
     return cuts[49], cuts[89], cuts[98]
 
@@ -107,7 +112,7 @@ def quantiles(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def report(title: str, samples: Samples, ours: str, better: Literal["less", "more"]) -> None:
-    """Print best and median of each contender, and how ours compares with it, by the medians."""
+    """Print best and median of each contender, and the ratio of its median to the median of ours."""
     own = statistics.median(samples[ours])
     rows = []
     for name, values in samples.items():
@@ -118,7 +123,7 @@ def report(title: str, samples: Samples, ours: str, better: Literal["less", "mor
 
 
 def report_spread(title: str, samples: Samples, ours: str, digits: int = 1) -> None:
-    """Print median, p90 and p99 of times, and how ours compares, by the medians."""
+    """Print median, p90 and p99 of each contender's times, and the ratio of its median to the median of ours."""
     own = statistics.median(samples[ours])
     rows = []
     for name, values in samples.items():
@@ -129,7 +134,7 @@ def report_spread(title: str, samples: Samples, ours: str, digits: int = 1) -> N
 
 
 def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows under titles; the first column flush left."""
+    """Print rows under titles. The first column is flush left."""
     widths = [max(len(row[place]) for row in [titles, *rows]) for place in range(len(titles))]
     print()
     for row in [titles, *rows]:
@@ -141,14 +146,14 @@ def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 class Child:
-    """A script beside this one, in a process of its own, so that no two parties share an interpreter lock.
+    """A benchmark script in its own process, so that no two parties share an interpreter lock.
 
-    It prints one JSON line when it is ready, works until its standard input ends, and may print another. It cannot
-    outlive its parent.
+    It prints one JSON line when it is ready, works until its standard input ends, and may then print another line. It
+    ends when its parent ends.
     """
 
     def __init__(self, script: str, *arguments: object, packages: Path | None = None) -> None:
-        """``packages``: a folder whose packages come before the installed ones."""
+        """Start the script. Packages in the folder ``packages`` take precedence over installed ones."""
         self._script = script
         runner = "node" if script.endswith(".js") else sys.executable
         command = [runner, str(HERE / script), *map(str, arguments)]
@@ -168,19 +173,19 @@ class Child:
         return json.loads(line)
 
     def ask(self, line: object) -> Any:
-        """Send a line; what it prints then."""
+        """Send a line, and return the JSON answer."""
         assert self._process.stdin is not None
         print(line, file=self._process.stdin, flush=True)
         return self._line()
 
     def finish(self) -> Any:
-        """Tell it to end; what it prints last."""
+        """Close the child's input, and return the last line that it prints."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         return self._line()
 
     def stop(self) -> None:
-        """End it, and wait until it has."""
+        """End the child, and wait until it has ended."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -200,18 +205,18 @@ class Child:
 
 
 def tell(message: object) -> None:
-    """Print one JSON line for the parent."""
+    """Print one JSON line for the parent process."""
     print(json.dumps(message), flush=True)
 
 
 def wait_for_parent() -> None:
-    """Return when the parent closes our standard input, or dies."""
+    """Wait until the parent closes our standard input, or dies."""
     sys.stdin.read()
 
 
 @dataclass(frozen=True)
 class CpuTime:
-    """CPU time a process has used, all threads, in s (10 ms steps)."""
+    """The CPU time in s that all threads of a process have used, in steps of 10 ms."""
 
     user_s: float
     system_s: float
@@ -224,5 +229,5 @@ class CpuTime:
         return cls(int(after_name[11]) * tick_s, int(after_name[12]) * tick_s)
 
     def since(self, before: CpuTime) -> CpuTime:
-        """What was used since then."""
+        """Return the CPU time used since an earlier reading."""
         return CpuTime(self.user_s - before.user_s, self.system_s - before.system_s)

@@ -1,4 +1,4 @@
-"""A model for the benchmarks: 100 registers, as single ones and as an array, all of which change with each step."""
+"""A model for the benchmarks: 100 single registers and an array of 100, all of which change with each step."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ COUNT = 100
 
 
 class Counting(Model):
-    """Counts its steps in each register."""
+    """Writes the number of steps into each register."""
 
     values = Output({f"r{index:02}": "LREAL" for index in range(COUNT)})
     row = Output(f"ARRAY[1..{COUNT}] OF LREAL")

@@ -1,7 +1,7 @@
-"""CPU that a whole instance takes: the A50 cell at 50 Hz, without and with gRPC subscribers.
+"""The CPU use of a whole instance: the A50 cell at 50 Hz, without and with gRPC subscribers.
 
-From /proc/PID/stat of each process. The emulated controller is counted apart, since a plant has a real one; so are the
-subscribers, which are other people's programs.
+The figures come from /proc/PID/stat of each process. The emulated controller is counted separately, because a plant
+has a real one. The subscribers are counted separately, because they are programs of users.
 """
 
 from __future__ import annotations

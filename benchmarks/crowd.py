@@ -1,8 +1,8 @@
-"""gRPC subscribers that are no good, as a process: ``--unread`` never take a value, ``--moving`` come and go.
+"""A process with troublesome gRPC subscribers: ``--unread`` never take a value, ``--moving`` come and go.
 
-Each that moves subscribes by a connection of its own, takes the present value and leaves after ``STAY_S``, every other
-time by dropping the connection in the middle of its call; then it comes again. What they cost the machine is left out
-as far as can be: their register does not change.
+Each of the latter subscribes on its own connection, takes the present value, and leaves after ``STAY_S``. Every other
+time it drops the connection in the middle of its call. Then it comes again. It subscribes to a register that does not
+change, so that its own CPU use stays small.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> None:
     for channel in idle:
         channel.close()
     if arguments.moving and not sum(visits):
-        raise SystemExit("nobody was served")
+        raise SystemExit("no subscriber received a value")
     tell({"visits": sum(visits)})
 
 

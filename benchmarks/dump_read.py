@@ -1,7 +1,7 @@
-"""Reading recordings: all values of one register, frames one by one, seeks, and exports, beside the mcap library.
+"""Reading recordings: all values of a register, single frames, seeks and exports, compared with the mcap library.
 
-The recording has the reference load at 50 Hz, in chunks of 0.85 s, as a recorder writes it: 3 hours. All contenders
-must find the same values and frames before anything is timed.
+The recording has three hours of the reference load at 50 Hz, in chunks of 0.85 s, as a recorder writes it. Before
+anything is timed, all contenders must find the same values and frames.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ HEAD_BYTES = 68
 
 
 def record(file: Path, seconds: int) -> str:
-    """Make the recording: 20 REALs that move as axes do; the path of one of them."""
+    """Write the recording, in which 20 REALs move as axes do, and return the path of one of them."""
     layout = db201()
     axes = [register for register in layout.registers if register.type == "REAL"]
     fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -71,19 +71,19 @@ def record(file: Path, seconds: int) -> str:
 
 
 def columns(dump: Dump, path: str) -> np.ndarray[Any, Any]:
-    """Ours, chunk by chunk."""
+    """Read a register with shmio, chunk by chunk."""
     return dump.columns(f"cell/{path}")[path]
 
 
 def frame_by_frame(dump: Dump, path: str) -> np.ndarray[Any, Any]:
-    """Ours, a Python object for each frame."""
+    """Read a register with shmio, as a Python object for each frame."""
     offset = dump.blocks[0].register(path).offset
     unpack = struct.Struct(">f").unpack_from
     return np.array([unpack(entry.item.raw, offset)[0] for entry in dump.frames("cell")], np.float32)
 
 
 def by_library(file: Path, offset: int) -> np.ndarray[Any, Any]:
-    """What the format's page shows for readers without shmio; in the file's order, which the library need not sort."""
+    """Read a register with the mcap library in the file's order, as docs/reference/dump-format.md shows it."""
     unpack = struct.Struct(">f").unpack_from
     with file.open("rb") as stream:
         messages = mcap.reader.make_reader(stream).iter_messages(topics=["cell/frames"], log_time_order=False)
@@ -92,7 +92,7 @@ def by_library(file: Path, offset: int) -> np.ndarray[Any, Any]:
 
 @contextmanager
 def library_reader(file: Path) -> Iterator[mcap.reader.McapReader]:
-    """One that has read its summary."""
+    """Open the recording with the mcap library, and read its summary."""
     with file.open("rb") as stream:
         reader = mcap.reader.make_reader(stream)
         reader.get_summary()
@@ -115,7 +115,7 @@ def timed(function: Callable[[], object]) -> float:
 
 
 def scans(file: Path, path: str, rounds: int) -> None:
-    """Frames a second, from opening the file on."""
+    """Print how many frames a second each contender reads, including the time to open the file."""
 
     def with_dump(read: Callable[[Dump, str], np.ndarray[Any, Any]]) -> np.ndarray[Any, Any]:
         with shmio.open_dump(file) as dump:
@@ -135,7 +135,7 @@ def scans(file: Path, path: str, rounds: int) -> None:
 
 
 def seeks(file: Path, count: int) -> None:
-    """From a random time to the first frame there, in ms; and opening."""
+    """Print the time in ms to open the file, and to find the first frame after a random time."""
     chance = random.Random(1)
     with shmio.open_dump(file) as dump, library_reader(file) as reader:
         times = [chance.randrange(dump.begin_ns, dump.end_ns) for _ in range(count)]
@@ -167,7 +167,7 @@ def seeks(file: Path, count: int) -> None:
 
 
 def exports(file: Path, folder: Path, frames: int) -> None:
-    """All 22 registers of each frame."""
+    """Print how long exports of all 22 registers of each frame take."""
     rows = []
     for form in ("parquet", "csv", "mcap"):
         out = folder / f"out.{form}"

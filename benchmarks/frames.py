@@ -1,8 +1,8 @@
-"""A source without a device, and the gRPC endpoint in its own process; frames are published as they are asked for.
+"""A process that publishes frames on request, as a source without a device, with the gRPC endpoint in a second process.
 
-It prints the endpoint's address, its pid and the instance's start. For each line {"hz", "seconds"} that it reads it
-publishes so many frames a second, in which every register has another value, and prints how many these were. An
-argument is the number of registers.
+It prints the endpoint's address, its pid and the instance's start. For each line {"hz", "seconds"} that it reads, it
+publishes so many frames a second, and then prints their number. Every register changes with each frame. An argument
+sets the number of registers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ TICK_S = 0.001
 
 
 def publish(segment: Segment, hz: float, seconds: float, registers: int) -> int:
-    """At times that are evenly spaced, or as many as are due each ms."""
+    """Publish frames at evenly spaced times; at more than 1 kHz, publish those that are due once a ms.
+
+    Return the count.
+    """
     writer = segment.writer("cell")
     packer = struct.Struct(f">{registers}f")
     begun_s, count = time.monotonic(), 0

@@ -1,8 +1,8 @@
-"""shmio.v1: register updates a second to one Python client that decodes them to numpy, in a process of its own.
+"""shmio.v1: register updates a second to one Python client, which decodes them to numpy arrays in its own process.
 
-Every frame has another value in every register. Frames are offered faster than they can be taken: every frame that is
-read counts with the registers that it has changed, and those that were missed are told by the client. The source, the
-endpoint and the client are three processes: where cores are short, they share them.
+Every register changes with every frame. Frames are published faster than the client can take them. Each frame that
+the client receives counts with its number of registers. The client reports how many frames it missed. Source,
+endpoint and client are three processes: on a machine with few cores, they share them.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ WARM_UP_S = 0.3
 
 
 class Load:
-    """Frames of so many registers, offered at a rate."""
+    """A source that publishes frames of so many registers at a rate."""
 
     def __init__(self, source: Child, hz: float) -> None:
         self._source = source
         self._hz = hz
 
     def during(self, seconds: float) -> threading.Thread:
-        """Offer them meanwhile."""
+        """Publish frames in a thread for so many seconds."""
         line = json.dumps({"hz": self._hz, "seconds": seconds})
         thread = threading.Thread(target=self._source.ask, args=(line,))
         thread.start()
@@ -36,7 +36,7 @@ class Load:
 
 
 def count(update: Update) -> int:
-    """Elements that came as numpy arrays."""
+    """Return how many elements of an update came as numpy arrays."""
     return sum(len(values) for _, _, values in update.changes)
 
 
@@ -71,7 +71,7 @@ def sample(cell: Client, load: Load, pid: int, seconds: float, registers: int, *
 
 
 def measure(registers: int, hz: float, rounds: int, seconds: float) -> None:
-    """Print one table for one size of frames."""
+    """Print one table for one number of registers."""
     modes: dict[str, dict[str, Any]] = {
         "every frame": {"every_frame": True},
         "latest": {},

@@ -1,10 +1,12 @@
-"""gRPC streams: updates a second, beside a bare grpc.aio server that sends ready bytes; latency at 1 kHz.
+"""gRPC streams: updates a second compared with a bare grpc.aio server that sends prepared bytes; latency at 1 kHz.
 
-Clients are those of @grpc/grpc-js, one process with a connection for each stream. Version 1 has one register a stream,
-the same for all; a subscriber of version 2 has 100. Frames come as fast as the bare server could send what they change,
-or a little faster. The source that publishes them is one process more than the bare server has beside it: where cores
-are short, the server's CPU time for an update says more than the rate. *Out of a queue* is the bare server with an
-asyncio.Queue for each stream, filled at the pace of the frames: what a server must do whose values come from elsewhere.
+The clients use @grpc/grpc-js, in one process with a connection for each stream. A stream of version 1 has one
+register, the same for all. A subscriber of version 2 has 100 registers. Frames are published as fast as the bare
+server could send the changes, or slightly faster.
+
+The source is a process that the bare server does not have beside it. On a machine with few cores, compare the
+server's CPU time for an update rather than the rate. *Out of a queue* is the bare server with an asyncio.Queue for
+each stream, filled at the pace of the frames: a server whose values come from elsewhere must do that.
 """
 
 from __future__ import annotations
@@ -28,10 +30,10 @@ from shmio.wire import simlog_v2_pb2 as v2
 
 V1, V2 = "/simulation.server.SimlogAPI/", "/simlog.server.SimlogAPI/"
 MESSAGE_BYTES: Final = 40
-"""Of an update of version 1; one of version 2 has as many."""
+"""Size of the bare server's message, which is that of an update of version 1 or 2."""
 WARM_UP_S = 0.3
 OFFERED = 1.05
-"""Updates, of those that the bare server sends."""
+"""Ratio of the updates that are published to those that the bare server sends."""
 BARE = "bare grpc.aio, ready bytes"
 
 
@@ -40,12 +42,12 @@ def call(method: str, request: Message) -> dict[str, Any]:
 
 
 def first(count: int) -> list[dict[str, Any]]:
-    """Streams of version 1."""
+    """Return the calls of so many streams of version 1."""
     return [call(V1 + "Subscribe", v1.TopicDescriptor(path="cell/r0"))] * count
 
 
 def second(count: int, topics: int) -> list[dict[str, Any]]:
-    """Subscribers of version 2."""
+    """Return the calls of so many subscribers of version 2, each with so many topics."""
     streams = []
     for number in range(count):
         stream = call(V2 + "CreateSubscriber", v2.Subscriber(name="bench", uuid=f"bench {number}"))
@@ -59,24 +61,24 @@ def second(count: int, topics: int) -> list[dict[str, Any]]:
 
 @contextmanager
 def clients(address: str, streams: list[dict[str, Any]], started_ns: int = 0, **stamps: Any) -> Iterator[Child]:
-    """A process with these streams, each of which has had a message."""
+    """Start a process with these streams, and wait until each stream has received a message."""
     with Child("streams.js", address, started_ns) as child:
         child.ask(json.dumps({"streams": streams, "stamps": None} | stamps))
         yield child
 
 
 class Contender:
-    """A server under one load: updates a second, and what each of them costs it."""
+    """A server under one load, with its updates a second and its CPU time for each update."""
 
     def __init__(self, address: str, pid: int, streams: list[dict[str, Any]], work: Callable[[float], object]) -> None:
-        """``work``: what goes on for so many seconds."""
+        """Prepare to measure a server. ``work`` is called with a number of seconds, and makes updates for that time."""
         self._server = address, pid
         self._streams = streams
         self._work = work
         self.cost_us: list[float] = []
 
     def sample(self, duration_s: float) -> float:
-        """Updates a second."""
+        """Return the updates a second."""
         address, pid = self._server
         with clients(address, self._streams) as client:
             self._work(WARM_UP_S)

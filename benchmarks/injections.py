@@ -1,7 +1,7 @@
-"""What injections cost the loop that polls: the CPU time to publish one frame of DB201 with different ones standing.
+"""The CPU time to publish one frame of DB201, with different injections active.
 
-One process publishes into shared memory; nobody reads. The first line is the path without any injection. Conditions
-are looked at once a cycle, operations make the image that consumers see.
+One process publishes into shared memory, and nobody reads. The first line is without any injection. Conditions are
+evaluated once a cycle. Operations make the image that consumers see.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ CASES: dict[str, list[Declaration]] = {
 
 
 def publisher(stack: ExitStack, declared: list[Declaration]) -> Callable[[], None]:
-    """What publishes a frame of the next cycle at each call."""
+    """Return a function that publishes the frame of the next cycle at each call."""
     spec = BlockSpec(
         "cell", LAYOUT, PERIOD_NS, 10**9, 1 << 22, Attributes("s7", ("**",), True), declared_document(declared)
     )
@@ -76,7 +76,7 @@ def publisher(stack: ExitStack, declared: list[Declaration]) -> Callable[[], Non
 
 
 def cpu_ns(function: Callable[[], object], calls: int) -> Callable[[], float]:
-    """Make a sampler: CPU time of one call, mean of so many."""
+    """Make a sampler of the mean CPU time of one call in ns, over a number of calls."""
 
     def sample() -> float:
         begun_ns = time.thread_time_ns()

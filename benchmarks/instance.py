@@ -57,7 +57,7 @@ def _prioritised(priority: int | None) -> str:
 
 @dataclass(frozen=True)
 class Polled:
-    """A source: what it polls, and how often."""
+    """A source, with the controller that it polls and its period."""
 
     name: str
     plc: Address
@@ -65,10 +65,10 @@ class Polled:
     layout: Path = DB201
     writable: Sequence[str] = ()
     priority: int | None = None
-    """Real-time."""
+    """The source's real-time priority; None for an ordinary process."""
 
     def text(self) -> str:
-        """Its part of the configuration."""
+        """Return the source's section of the configuration."""
         return _SOURCE.format(
             name=self.name,
             layout=self.layout,
@@ -80,19 +80,20 @@ class Polled:
 
 @dataclass(frozen=True)
 class Instance:
-    """A running instance: its sources, the gRPC endpoint, and maybe an emulated controller ``plc``."""
+    """A running instance: its sources, the gRPC endpoint and, in some benchmarks, an emulated controller ``plc``."""
 
     segment: Segment
     grpc: Address
     pids: dict[str, int]
-    """Of each process by its name; the supervisor's is ``supervisor``."""
+    """The pid of each process by its name. The supervisor's name is ``supervisor``."""
 
 
 @contextmanager
 def instance(period_ms: float, *, more: str = "", priority: int | None = None) -> Iterator[Instance]:
-    """Run a source ``cell`` that polls an emulated controller of the instance's own, with the program of the A50 cell.
+    """Run a source ``cell`` that polls an emulated controller with the program of the A50 cell.
 
-    ``more``: further sections of the configuration. ``priority``: real-time, of both.
+    ``more`` holds further sections of the configuration. ``priority`` is the real-time priority of source and
+    controller.
     """
     with reserved_port() as plc:
         emulator = _EMULATOR.format(layout=DB201, plc=plc) + _prioritised(priority)
@@ -104,7 +105,11 @@ def instance(period_ms: float, *, more: str = "", priority: int | None = None) -
 def started(
     sources: Sequence[Polled], *, more: str = "", clock: str = "wall", until: State = State.RUNNING
 ) -> Iterator[Instance]:
-    """Run an instance with these sources; ``more``: further sections of the configuration. ``until``: this state."""
+    """Run an instance with these sources until the block ends.
+
+    ``more`` holds further sections of the configuration. The instance is ready when the supervisor is in the state
+    ``until``.
+    """
     name = f"bench-{os.getpid()}"
     with ExitStack() as stack:
         grpc = stack.enter_context(reserved_port())
@@ -122,7 +127,7 @@ def started(
         segment = _when(until, name, supervisor)
         if segment is None:
             output.seek(0)
-            raise SystemExit(f"the instance does not start:\n{output.read()}")
+            raise SystemExit(f"the instance did not start. Its output:\n{output.read()}")
         stack.enter_context(segment)
         pids = {"supervisor": supervisor.pid} | {slot.name: slot.report.pid for slot in segment.processes}
         yield Instance(segment, grpc, pids)
@@ -134,7 +139,10 @@ def _stop(supervisor: subprocess.Popen[bytes]) -> None:
 
 
 def _when(state: State, name: str, supervisor: subprocess.Popen[bytes]) -> Segment | None:
-    """Wait until all processes run and, if RUNNING, the sources' first frames are there; None if that does not come."""
+    """Open the instance once its supervisor is in this state.
+
+    None if that takes too long, or if the supervisor ends.
+    """
     deadline_s = time.monotonic() + START_S
     while time.monotonic() < deadline_s and supervisor.poll() is None:
         with contextlib.suppress(NotRunningError):

@@ -1,10 +1,11 @@
 """Starts a cell with 96,000 registers in six blocks of 48 kB, and measures how long programs take to use it.
 
-The instance has an S7 source and an emulated controller for each block, the gRPC endpoint, the MQTT bridge with its
-broker, and a recorder: 16 processes. It polls at 10 Hz.
+The instance has 16 processes: an S7 source and an emulated controller for each block, the gRPC endpoint, the MQTT
+bridge with its broker, and a recorder. It polls at 10 Hz.
 
-``up``: from the command until it has returned. ``good``: until all six sources have good values. ``attach``: a program
-attaches and reads one register. ``get`` and ``list``: the whole commands, for one register and for all of them.
+``up``: from the start of the command to its return. ``good``: until all six sources have good values. ``attach``:
+until a program has attached and read one register. ``get`` and ``list``: the whole commands, for one register and for
+all of them.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ print(time.perf_counter() - begin)
 
 
 def timed(*command: str | Path, cwd: Path) -> float:
-    """Run a command; s until it has ended."""
+    """Run a command, and return the s until it ended."""
     # As in a user's shell: what a command prints is buffered, and Python keeps the code that it has compiled.
     plain = {name: os.environ[name] for name in os.environ if not name.startswith("PYTHON")}
     begin_s = time.monotonic()
@@ -83,7 +84,7 @@ def timed(*command: str | Path, cwd: Path) -> float:
 
 
 def measure(cell: Cell) -> dict[str, float]:
-    """Start the cell, use it once in each way, and stop it; s of each."""
+    """Start the cell, use it once in each way, and stop it. Return the s of each."""
     begin_s = time.monotonic()
     up_s = timed(BIN / "shmio-supervisor", "up", "--detach", cwd=cell.folder)
     until(lambda: all(cell.processes()[f"s{n}"]["quality"] == "good" for n in range(1, BLOCKS + 1)), "good values")
@@ -100,7 +101,6 @@ def measure(cell: Cell) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print a table."""
     quick = begin("Large cell: the time to start and use 96,000 registers in six sources, in s")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

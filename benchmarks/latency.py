@@ -1,7 +1,7 @@
-"""From a change in the controller's block to a gRPC client in another process, and where the time goes.
+"""The time from a change in the controller's block to a gRPC client in another process, and where the time goes.
 
-The controller writes CLOCK_MONOTONIC into the block at random times; the block is as long as DB201. The supervisor,
-the source, the endpoint, the controller and the client are processes of their own.
+The controller writes CLOCK_MONOTONIC into the block at random times. The block is as long as DB201. Supervisor,
+source, endpoint, controller and client are separate processes.
 """
 
 from __future__ import annotations

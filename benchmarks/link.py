@@ -1,4 +1,4 @@
-"""A slow link for the benchmarks, as a process: relays to one address and adds to its round trip only."""
+"""A process that plays a slow link: it relays to one address and delays each byte, without limiting the rate."""
 
 from __future__ import annotations
 

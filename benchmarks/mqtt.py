@@ -1,8 +1,8 @@
-"""MQTT: the bridge beside a bare paho publisher of the same topics and payloads, to the same mosquitto.
+"""MQTT: shmio's bridge compared with a bare paho publisher of the same topics and payloads, on the same mosquitto.
 
-Both send as fast as the broker acknowledges, from one thread. Then what a subscriber in a process of its own sees of
-frames at 50 Hz: the time from a frame to its value there, and what of a core the bridge takes for all of DB201, of
-which 20 REALs move.
+Both send as fast as the broker acknowledges, from one thread. Two further figures are for frames of DB201 at 50 Hz in
+which 20 REALs move: the time from a frame to the arrival of its value at a subscriber in another process, and the
+bridge's share of a core.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def bridge(made: Segment, address: Address, qos: int) -> Iterator[Bridge]:
 
 
 class Moving:
-    """Frames of DB201 of which 20 REALs move, as those of the cell do."""
+    """Frames of DB201 in which 20 REALs move, as in the A50 cell."""
 
     def __init__(self, made: Segment) -> None:
         layout = made.blocks["cell"].layout
@@ -82,7 +82,7 @@ class Moving:
 
 
 def ours(running: Bridge, moving: Moving, duration_s: float) -> Callable[[], float]:
-    """Messages a second from frames that come as fast as they are taken."""
+    """Make a sampler of the bridge's messages a second, with frames published as fast as the bridge takes them."""
 
     def sample() -> float:
         before, begun_s = running.outbox.sent, time.perf_counter()
@@ -100,7 +100,7 @@ def ours(running: Bridge, moving: Moving, duration_s: float) -> Callable[[], flo
 
 
 def bare(address: Address, moving: Moving, qos: int, duration_s: float) -> Callable[[], float]:
-    """The same messages by paho alone, its loop in the same thread."""
+    """Make a sampler of the messages a second that paho alone sends, with its loop in the same thread."""
     client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5)
     client.max_inflight_messages_set(0)
     open_mids: set[int] = set()
@@ -158,7 +158,7 @@ def latencies(address: Address, qos: int, count: int) -> list[float]:
 
 
 def share(address: Address, qos: int, duration_s: float) -> float:
-    """Percent of a core that the bridge's thread takes at 50 Hz."""
+    """Return the percentage of a core that the bridge's thread uses at 50 Hz."""
     with segment(db201()) as made:
         moving, stop = Moving(made), threading.Event()
 

@@ -1,7 +1,7 @@
-"""MQTT: what cells of 20 to 4000 REALs, all of which move at 50 Hz, cost by each way of publishing them.
+"""MQTT: the cost of cells with 20 to 4000 REALs, all of which move at 50 Hz, for each way to publish them.
 
-``told``: how many of the changes were sent; the others came too fast, and were merged into newer values, or left out
-as the rule says. One subscriber takes everything, as a dashboard would.
+``told`` is the percentage of changes that were sent. The others came too fast: they were merged into newer values, or
+omitted by a rate limit of the rule. One subscriber receives everything, as a dashboard would.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ WAYS: Mapping[str, Mapping[str, Any]] = {
     "Sparkplug": {"topic": [NOTHING], "sparkplug": Sparkplug(group="bench")},
 }
 PARTS = {"text": 1, "structure": A_STRUCTURE}
-"""How many changes a message tells, at most; the others' tell a frame."""
+"""The most changes that one message carries. For ways that are not listed, a message carries all changes of a frame."""
 
 
 def moving(count: int) -> Layout:
@@ -48,7 +48,7 @@ def moving(count: int) -> Layout:
 
 
 def cost(made: Segment, address: Address, count: int, way: str, duration_s: float) -> tuple[float, float, float]:
-    """Messages a second, percent of the changes that they tell, percent of a core."""
+    """Return messages a second, the percentage of the changes that they carried, and the percentage of a core used."""
     writer, stop = made.writer("cell"), threading.Event()
     images = [struct.pack(f">{count}f", *(0.001 * cycle + place for place in range(count))) for cycle in range(100)]
     settings = Mqtt(broker="external", host=str(address), prefix="bench", **WAYS[way])

@@ -1,4 +1,4 @@
-"""Subscribes to a stamp and prints, for so many messages, how old each was in ms; ``ready`` first."""
+"""Subscribes to a register that holds a time stamp. Prints ``ready``, then the age in ms of each message."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a subscriber has of its neighbours: frame to client alone, beside one that never reads, beside 50 that move.
+"""A subscriber's latency from frame to client: alone, beside one that never reads, and beside 50 that come and go.
 
-A source polls each millisecond a controller that writes CLOCK_MONOTONIC into its block at random times; all parties are
-processes of their own. The situations take turns. The memory is that of the endpoint's process after each.
+Each millisecond, a source polls a controller that writes CLOCK_MONOTONIC into its block at random times. All parties
+are separate processes. The situations take turns. The memory is that of the endpoint's process after each situation.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ SITUATIONS: dict[str, Sequence[object]] = {
 
 
 def resident_mb(pid: int) -> float:
-    """Memory of a process that is its own, and in RAM, proc_pid_status(5)."""
+    """Return the process's private memory in RAM in MB, proc_pid_status(5)."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith("RssAnon:")).split()[1]) / 1024
 
 
 def latencies_ms(running: Instance, crowd: Sequence[object], duration_s: float) -> tuple[list[float], int]:
-    """From frame to client, of one subscriber beside this crowd; and how often somebody of that came."""
+    """Return a subscriber's latencies in ms beside these other subscribers, and how often one of those came."""
     with ExitStack() as stack:
         others = stack.enter_context(Child("crowd.py", running.grpc, *crowd)) if crowd else None
         client = stack.enter_context(Child("subscriber.py", running.grpc, PATH, "--stamps"))
@@ -51,7 +51,7 @@ def latencies_ms(running: Instance, crowd: Sequence[object], duration_s: float) 
 
 
 def main() -> None:
-    quick = begin("Neighbours: what others' subscriptions cost one")
+    quick = begin("Neighbours: how other subscribers affect a subscriber's latency")
     rounds, duration_s = (1, 2.0) if quick else (5, 10.0)
     found: dict[str, list[float]] = {name: [] for name in SITUATIONS}
     visits = dict.fromkeys(SITUATIONS, 0)

@@ -1,7 +1,8 @@
-"""A controller for the benchmarks, as a process: shmio's emulated S7 server with one data block.
+"""A controller for the benchmarks: shmio's emulated S7 server with one data block, in its own process.
 
-The block is still unless ``--stamp-ms`` is given: then a program writes the time of CLOCK_MONOTONIC in ns into its
-first eight bytes, a LINT, at random intervals around that mean, so that changes fall anywhere in a client's poll cycle.
+The block does not change unless ``--stamp-ms`` is given. Then a program writes the time of CLOCK_MONOTONIC in ns into
+its first eight bytes, a LINT. It does so at random intervals around that mean, so that changes fall anywhere in a
+client's poll cycle.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ SEED = 201
 
 
 def still_block(size: int = SIZE) -> bytes:
-    """Fill a block with bytes that differ from place to place."""
+    """Return a block whose neighbouring bytes differ."""
     return random.Random(SEED).randbytes(size)
 
 
 def stamp(server: S7Server, block: bytearray, mean_s: float, wait: Callable[[float], bool]) -> None:
-    """Write the time into the block until told to stop."""
+    """Write the time into the block at random intervals until told to stop."""
     intervals = random.Random(SEED)
     while not wait(mean_s * intervals.uniform(0.5, 1.5)):
         with server.lock:
@@ -40,7 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pdu", type=int, default=MAX_PDU_SIZE, help="largest PDU to grant, in bytes")
     parser.add_argument("--jobs", type=int, default=8, help="most jobs to grant at once")
-    parser.add_argument("--size", type=int, default=SIZE, help="of the block, in bytes")
+    parser.add_argument("--size", type=int, default=SIZE, help="size of the block, in bytes")
     parser.add_argument("--stamp-ms", type=float)
     arguments = parser.parse_args()
     server = S7Server(Address("127.0.0.1", 0), traits=Traits(arguments.pdu, arguments.jobs))

@@ -1,4 +1,4 @@
-"""Readers of a block, as a process: threads that follow every frame and decode one register each time."""
+"""A process with readers of a block: threads that follow every frame, and decode one register of each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shmio.segment import Block
 
 
 class Reader:
-    """One cursor, followed in a thread."""
+    """A thread that follows all frames with a cursor."""
 
     def __init__(self, block: Block) -> None:
         self._block = block
@@ -32,7 +32,7 @@ class Reader:
                 self.frames += 1
 
     def stop(self) -> tuple[int, int]:
-        """(frames read, frames missed)."""
+        """Stop the thread. Return the numbers of frames read and missed."""
         self._stopping = True
         self.thread.join()
         return self.frames, self._cursor.missed

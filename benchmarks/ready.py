@@ -1,4 +1,4 @@
-"""What an endpoint sends to a client that steps, kept as it came, for a bare server to send again."""
+"""Collects the messages that an endpoint sends to a client that steps, so that a bare server can send them again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ V2, SIM, OURS = "/simlog.server.SimlogAPI/", "/com.ttsnetwork.simulator3.SimServ
 
 @dataclass(frozen=True)
 class Ready:
-    """``stream``, ``call``, ``steps``: full names of the calls by which values come, and steps are asked for."""
+    """The messages of a stream: ``first`` at its start, ``step`` for each step, and the answers to the calls.
+
+    ``stream``, ``call`` and ``steps`` are the full names of the calls that deliver values, make one step and make
+    many steps.
+    """
 
     stream: str
     call: str
@@ -30,12 +34,12 @@ class Ready:
     steps_answer: bytes = b""
 
     def to_json(self) -> str:
-        """As text for a command line."""
+        """Return the messages as text for a command line."""
         return json.dumps({name: _text(value) for name, value in vars(self).items()})
 
     @classmethod
     def of(cls, text: str) -> Self:
-        """Of such a text."""
+        """Parse text that ``to_json`` returned."""
         found = json.loads(text)
         names = {"stream", "call", "steps"}
         return cls(**{name: value if name in names else _bytes(value) for name, value in found.items()})
@@ -52,7 +56,7 @@ def _bytes(value: Any) -> Any:
 
 
 def version_2(target: str, paths: Sequence[str]) -> Ready:
-    """What one stream gets with these topics and the step's marker, and SimServerAPI's step."""
+    """Collect the messages of one SimlogAPI version 2 stream with these topics and the step's marker."""
     with grpc.insecure_channel(target) as channel:
         unary: Any = channel.unary_unary
         follow: Any = channel.unary_stream(V2 + "CreateSubscriber")
@@ -69,7 +73,7 @@ def version_2(target: str, paths: Sequence[str]) -> Ready:
 
 
 def native(target: str, pattern: str) -> Ready:
-    """What a subscriber of shmio.v1 gets."""
+    """Collect the messages of a subscriber of shmio.v1."""
     with grpc.insecure_channel(target) as channel:
         follow: Any = channel.unary_stream(OURS + "Subscribe")
         call: Any = channel.unary_unary(OURS + "Step")

@@ -1,9 +1,9 @@
-"""Kills the recorder of a whole cell with SIGKILL, again and again, and says what that costs.
+"""Kills the recorder of a whole cell with SIGKILL, again and again, and prints how much data that loses.
 
-``not written``: what had been published by then and was in no file yet, by a copy made at once. ``recovered``: frames
-that ``shmio-dump recover`` makes of that copy. ``missing``: what neither its file nor the successor's has, in the end,
-once that has taken from the ring (of the ordinary size) what is still there; ``told``: how much of it is in a gap. Each
-file, and each that is recovered, is opened with the mcap library, which looks at every checksum.
+``not written``: frames published before the kill that the file did not have, by a copy made at once. ``recovered``:
+frames that ``shmio-dump recover`` finds in that copy. ``missing``: frames that are in neither the closed file nor the
+successor's, which starts with the frames still in the ring (of the ordinary size). ``told``: how many of these the
+recording reports as a gap. The mcap library opens each file and each recovered copy, and checks every checksum.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SEED = 20
 
 
 class Killed(NamedTuple):
-    """One kill: how long it had run, the last frame published by then, the frames its file had, those recovered."""
+    """One kill: how long the recorder ran, the last frame published, and the frames written and recovered."""
 
     ran_s: float
     head: int
@@ -46,7 +46,10 @@ class Killed(NamedTuple):
 
 
 def frames(file: Path, *, closed: bool) -> list[int]:
-    """Numbers of a file's frames by the mcap library; of one that was not closed, up to where it ends."""
+    """Return the numbers of a file's frames, read with the mcap library.
+
+    Of a file that was not closed, read what is there.
+    """
     found = []
     with file.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True) if closed else NonSeekingReader(stream, validate_crcs=True)
@@ -60,7 +63,7 @@ def frames(file: Path, *, closed: bool) -> list[int]:
 
 
 def one(segment: Segment, folder: Path, copies: Path, wait_s: float) -> Killed:
-    """Kill the recorder after a while; returns when its successor records."""
+    """Kill the recorder after a while, and wait until its successor records."""
     slot = segment.processes.find("recorder")
     until(lambda: slot.report.activity is Activity.RUNNING and slot.report.note.startswith("to "), "a recorder at work")
     pid, file = slot.report.pid, folder / slot.report.note.removeprefix("to ")
@@ -74,13 +77,13 @@ def one(segment: Segment, folder: Path, copies: Path, wait_s: float) -> Killed:
     new = copy.with_suffix(".recovered")
     with redirect_stdout(StringIO()):
         if dump(["recover", str(copy), "-o", str(new)]):
-            raise SystemExit(f"{copy} cannot be recovered")
+            raise SystemExit(f"shmio-dump cannot recover {copy}")
     until(lambda: slot.report.pid != pid, "its successor")
     return Killed(ran_s, head, written, frames(new, closed=True))
 
 
 def ends(folder: Path) -> list[tuple[list[int], int]]:
-    """Of each file in order: the frames in it, and how many its gaps tell."""
+    """Return, for each file in order, its frames and the number of frames that its gaps report as missing."""
     found = []
     for file in folder.iterdir():
         with Reader(file) as reader:
@@ -93,7 +96,7 @@ def ends(folder: Path) -> list[tuple[list[int], int]]:
 
 
 def rows(kills: Sequence[Killed], files: Sequence[tuple[list[int], int]]) -> list[list[str]]:
-    """What each kill has cost."""
+    """Return a line of the table for each kill."""
     found = []
     for number, (killed, (before, _), (after, told)) in enumerate(zip(kills, files, files[1:], strict=False), 1):
         late = killed.head - killed.written[-1]
@@ -108,7 +111,6 @@ def rows(kills: Sequence[Killed], files: Sequence[tuple[list[int], int]]) -> lis
 
 
 def main() -> None:
-    """Print a table."""
     count = 2 if begin("Recorder: what a kill costs") else KILLS
     chance = random.Random(SEED)
     with tempfile.TemporaryDirectory() as name:
@@ -122,7 +124,7 @@ def main() -> None:
             until(lambda: slot.report.note.startswith("to "), "the last recorder at work")
         files = ends(folder)
     if len(files) != count + 1:
-        raise SystemExit(f"{len(files)} files after {count} kills")
+        raise SystemExit(f"{len(files)} files after {count} kills; expected one more file than kills")
     headings = ["kill", "ran, s", "not written: frames", "s", "recovered", "missing: frames", "told"]
     table(headings, rows(kills, files))
 

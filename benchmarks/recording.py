@@ -1,9 +1,10 @@
-"""Recording: size of a minute, and what it costs the host.
+"""Recording: the size of a minute, and its CPU cost.
 
-Sizes are of a minute at 50 Hz as a recorder chunks it, of three kinds of data: the emulated A50 cell, whose axes move
-by sines; the same with noise on all 20 REALs, as analog inputs have it; and the cell at rest. Beside it the same frames
-without compression, and what the mcap library writes by its defaults. Of the noisy one, also what its chunks would be
-if frames were laid out otherwise. CPU is that of a recorder's process beside a source that publishes by the clock.
+Sizes are of a minute at 50 Hz, in the chunks of a recorder. There are three kinds of data: the emulated A50 cell,
+whose axes move by sines; the same with noise on all 20 REALs, as analog inputs have it; and the cell at rest. They
+are compared with the same frames without compression, and with a file of the mcap library by its defaults. For the
+data with noise, a second table has the size of the chunks under other layouts of frames. CPU is that of a recorder's
+process beside a source that publishes on schedule.
 """
 
 from __future__ import annotations
@@ -38,19 +39,19 @@ HZ = 50
 START_NS = 1_700_000_000_000_000_000
 JITTER_NS = 60_000
 SEED_MB = 7.0
-"""A minute of the seed's dumps."""
+"""Size in MB of a minute in the dumps of the program that shmio replaces."""
 LEVELS = (1, 3, 9, 19)
-"""Of zstd; 3 is what the recorder has."""
+"""Compression levels of zstd. The recorder uses 3."""
 
 Image = Callable[[int], bytes]
-"""The block at a cycle."""
+"""Returns the block at a cycle."""
 
 
 # -- data --------------------------------------------------------------------------------------------------------------
 
 
 def cell(layout: Layout, *, noise: float = 0.0, moving: bool = True) -> Image:
-    """The A50 cell; ``noise``: standard deviation of what is added to each REAL."""
+    """Return the images of the A50 cell. ``noise`` is the standard deviation of the noise added to each REAL."""
     program, chance = A50(layout), random.Random(1)
     image = bytearray(layout.size)
     axes = [register.offset for register in layout.registers if register.type == "REAL"]
@@ -66,7 +67,7 @@ def cell(layout: Layout, *, noise: float = 0.0, moving: bool = True) -> Image:
 
 
 def frames(image: Image, count: int) -> Iterator[Frame]:
-    """As a source publishes them, which wakes a little late each time."""
+    """Yield frames as a source publishes them: each a little late."""
     chance = random.Random(2)
     for cycle in range(1, count + 1):
         clock_ns = cycle * 10**9 // HZ + int(chance.expovariate(1 / JITTER_NS))
@@ -80,7 +81,7 @@ def frames(image: Image, count: int) -> Iterator[Frame]:
 
 
 class _Block:
-    """What a writer asks of a block."""
+    """The attributes of a block that a writer of recordings needs."""
 
     source, section, period_ns, stale_ns = "cell", 1, 10**9 // HZ, 10**9
 
@@ -89,7 +90,7 @@ class _Block:
 
 
 def ours(folder: Path, layout: Layout, some: Sequence[Frame]) -> int:
-    """As a recorder writes it, index and layout and all."""
+    """Return the size in bytes of the file that a recorder writes, with index and layout."""
     path, fd = create(folder, "bench")
     output = Output(path, fd, limit_bytes=1 << 30)
     writer = Writer(output, {"instance": "bench"})
@@ -106,7 +107,7 @@ def ours(folder: Path, layout: Layout, some: Sequence[Frame]) -> int:
 
 
 def library(folder: Path, some: Sequence[Frame], **options: object) -> int:
-    """The mcap library by its defaults: chunks of 1 MiB, zstd."""
+    """Return the size in bytes of the file that the mcap library writes by its defaults: zstd, chunks of 1 MiB."""
     file = folder / "library.mcap"
     with file.open("wb") as stream:
         writer = mcap.writer.Writer(cast("IO[bytes]", stream), **options)  # type: ignore[arg-type]
@@ -120,7 +121,7 @@ def library(folder: Path, some: Sequence[Frame], **options: object) -> int:
 
 
 def sizes(minutes: int) -> None:
-    """Print MB a minute."""
+    """Print the MB of one minute of recording."""
     layout = db201()
     data = {
         "emulated cell": cell(layout),
@@ -144,7 +145,10 @@ def sizes(minutes: int) -> None:
 
 
 def packed(messages: Sequence[bytes], pack: Callable[[bytes], bytes], *, turned: bool = False) -> int:
-    """Bytes of their chunks; ``turned``: first all first bytes, then all second ones, and so on."""
+    """Return the compressed size of the messages' chunks in bytes.
+
+    ``turned``: a chunk has the first bytes of all messages, then all second bytes, and so on.
+    """
     each, size = round(CHUNK_S * HZ), 0
     for at in range(0, len(messages), each):
         some = messages[at : at + each]
@@ -153,14 +157,18 @@ def packed(messages: Sequence[bytes], pack: Callable[[bytes], bytes], *, turned:
 
 
 def layouts() -> None:
-    """Print MB a minute of the chunks' data alone, with noise: all that is in the file beside them stays the same."""
+    """Print the MB a minute of the chunks' data alone, with noise. The rest of the file is the same for all layouts."""
     layout = db201()
     some = list(frames(cell(layout, noise=0.01), 60 * HZ))
     low = [register.offset + byte for byte in (3, 2, 1, 0) for register in layout.registers if register.type == "REAL"]
     order = low + sorted(set(range(layout.size)) - set(low))
 
     def message(frame: Frame, *, once: bool = True, sort: bool = False) -> bytes:
-        """``once``: times as differences, as they are written; ``sort``: the REALs' bytes in front, last ones first."""
+        """Return a frame's record.
+
+        ``once``: times are differences to the record's header, as the recorder writes them. ``sort``: the bytes of
+        all REALs come first, the least significant bytes before the others.
+        """
         header = frame.number & 0xFFFFFFFF, START_NS + frame.clock_ns, frame.source_ns
         data = encode_frame(frame._replace(raw=bytes(map(frame.raw.__getitem__, order))) if sort else frame)
         return struct.pack("<BQHIQQ", 5, 22 + len(data), 1, *header) + (differ(data, *header) if once else data)
@@ -181,7 +189,7 @@ def layouts() -> None:
 
 @contextmanager
 def recorder(segment: Segment, folder: Path) -> Iterator[int]:
-    """The recorder's process; its pid."""
+    """Start a recorder's process, and return its pid."""
     description = {
         "instance": segment.instance,
         "epoch": segment.header.epoch,
@@ -206,7 +214,7 @@ def recorder(segment: Segment, folder: Path) -> Iterator[int]:
 
 
 def publish(writer: BlockWriter, image: Image, hertz: int, duration_s: float) -> None:
-    """By the clock."""
+    """Publish frames on schedule for a duration."""
     images = [image(cycle) for cycle in range(HZ * 4)]
     begun_s = time.monotonic()
     for cycle in range(round(duration_s * hertz)):
@@ -215,7 +223,7 @@ def publish(writer: BlockWriter, image: Image, hertz: int, duration_s: float) ->
 
 
 def cpu(duration_s: float) -> None:
-    """Print what a recorder takes of a core."""
+    """Print the percentage of a core that a recorder uses."""
     layout = db201()
     rows = []
     for hertz in (50, 1000):

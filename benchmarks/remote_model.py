@@ -1,6 +1,7 @@
-"""Steps a second of a source that a program elsewhere computes, by gRPC, beside the same class in the instance.
+"""Steps a second of a source with a remote model, by gRPC, compared with the same model inside the instance.
 
-100 registers that all change with each step. Who steps and the model are processes of their own.
+The model has 100 registers, which all change with each step. The program that steps and the model are separate
+processes.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ OURS = "a model elsewhere, a program on the host steps"
 
 @contextmanager
 def elsewhere() -> Iterator[Instance]:
-    """An instance whose model is a process of its own, which has joined."""
+    """Start an instance whose model runs in another process, and wait until the model has joined."""
     with ExitStack() as stack:
         layout = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "counting.toml"
         rows = [f'"values/r{index:02}" = "LREAL"\n' for index in range(COUNT)]
@@ -47,7 +48,7 @@ def elsewhere() -> Iterator[Instance]:
 
 @contextmanager
 def here() -> Iterator[Instance]:
-    """An instance that has the model itself."""
+    """Start an instance that runs the model itself."""
     with started([], more=MODEL, clock="stepped") as running:
         yield running
 

@@ -1,8 +1,8 @@
-"""A replay: how far from its time each frame comes, and how many a second come as fast as they can.
+"""A replay: how far from its due time each frame arrives, and the frames a second of a replay without waits.
 
-The recording is made for the purpose: DB201, whose 20 REALs move with every frame. *Arrival* is when a reader of shared
-memory that waits has the frame, against the time at which the recording has it, at 1x. As fast as they can: one step of
-a second after the other, with a reader that takes every frame.
+The recording is made for the purpose: DB201, whose 20 REALs move with every frame. *Arrival* is the difference
+between the recorded time, at speed 1, and the time at which a waiting reader of the shared memory has the frame. For
+the rate, a client makes steps of a second one after the other, and a reader takes every frame.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from shmio.testing.cell import Cell
 
 CONFIG = '[instance]\nname = "{name}"\nclock = "{clock}"\n'
 FIRST_NS = 5_000_000_000
-"""The clock of the first frame."""
+"""The instance time of the first frame."""
 SETTLE_NS = 1_000_000_000
-"""So much at the beginning does not count: the processes are just starting."""
+"""Time at the beginning that does not count, because the processes are just starting."""
 PATIENCE_S = 60.0
 
 
 def record(folder: Path, period_ns: int, frames: int) -> Path:
-    """A recording of so many frames, each at its time to the ns."""
+    """Make a recording of so many frames at exact intervals."""
     layout = db201()
     places = [register.offset for register in layout.registers if register.type == "REAL"]
     image = bytearray(layout.size)
@@ -60,7 +60,7 @@ def record(folder: Path, period_ns: int, frames: int) -> Path:
 
 
 def cell(folder: Path, clock: str) -> Cell:
-    """An instance without sources of its own."""
+    """Start an instance without sources."""
     name = f"bench-{os.getpid()}"
     (folder / "supervisor.toml").write_text(CONFIG.format(name=name, clock=clock))
     return Cell(folder, name, Address("127.0.0.1", 0))
@@ -73,7 +73,7 @@ def up(instance: Cell, file: Path) -> None:
 
 
 def arrivals_us(folder: Path, file: Path) -> list[float]:
-    """Of each frame the time between when it was due and when a reader had it."""
+    """Return how late each frame arrived at a reader, in µs."""
     instance = cell(folder, "wall")
     up(instance, file)
     late_us: list[float] = []
@@ -91,7 +91,7 @@ def arrivals_us(folder: Path, file: Path) -> list[float]:
 
 
 def frames_per_s(folder: Path, file: Path, seconds: int) -> tuple[float, int]:
-    """Frames a second when time is stepped without a wait, and how many a reader has missed."""
+    """Step a replay without waits. Return the frames a second, and how many frames a reader missed."""
     instance = cell(folder, "stepped")
     up(instance, file)
     taken = missed = 0

@@ -1,7 +1,7 @@
-"""Kills each process of a whole cell with SIGKILL, under load, and says how long it is gone.
+"""Kills each process of a whole cell with SIGKILL, under load, and measures the time until its service is back.
 
-``running``: the successor has reported that it runs. ``serving``: its data flows again, seen from outside: a good frame
-in the segment for source and emulator, a value by a new gRPC call for the endpoint.
+``running``: until the successor has reported that it runs. ``serving``: until its data flows again, as seen from
+outside. For source and emulator, that is a good frame in the segment; for the endpoint, a value by a new gRPC call.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STABLE_S = 6.0  # a process that ran this long is restarted at once; sooner, it 
 
 
 def one_value(address: str) -> None:
-    """A value by a new call on a new connection."""
+    """Wait for a value by a new call on a new connection."""
     with grpc.insecure_channel(address, options=[("grpc.initial_reconnect_backoff_ms", 20)]) as channel:
         stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
         stream = stub.Subscribe(TopicDescriptor(path=AXIS), timeout=20, wait_for_ready=True)
@@ -43,7 +43,7 @@ def one_value(address: str) -> None:
 
 
 def measure(cell: Cell, segment: Segment, victim: str) -> tuple[float, float]:
-    """Kill one; (s until it runs, s until its data flows)."""
+    """Kill one process. Return the s until its successor runs, and until its data flows."""
     block, slot = segment.blocks["cell"], segment.processes.find(victim)
     pid = slot.report.pid
     killed_s, killed_ns = time.monotonic(), time.monotonic_ns()
@@ -63,7 +63,6 @@ def measure(cell: Cell, segment: Segment, victim: str) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print a table."""
     rounds = 1 if begin("Restart: how long a killed process is gone") else ROUNDS
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

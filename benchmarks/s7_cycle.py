@@ -1,7 +1,7 @@
-"""Polls of DB201 a second, of the 1,000 asked for, over a link of 1 ms: one read under way at a time, and more.
+"""Polls of DB201 a second over a link of 1 ms, where 1,000 are due, with one or more reads in progress at a time.
 
-The source's own loop polls into a segment, as in an instance. Controller (PDU 480, so a read is 5 jobs), link and
-source are processes of their own.
+The source's own loop polls into a segment, as in an instance. A read has five jobs, because the controller grants a
+PDU of 480 bytes. Controller, link and source are separate processes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Source:
         self._name = name
 
     def polls_and_overruns(self, duration_s: float) -> tuple[float, float]:
-        """Run for a while; both a second, the first 0.2 s left out."""
+        """Run for a while. Return polls and overruns a second, without the first 0.2 s."""
         clock = WallClock()
         block = self._segment.blocks[self._name]
         schedule = Schedule(self._segment.header.started_ns, block.period_ns)

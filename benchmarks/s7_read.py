@@ -1,7 +1,7 @@
-"""Reads of all of DB201 per second: shmio's S7 client beside ``db_read`` of two others, over links with growing delay.
+"""Reads of all of DB201 a second: shmio's S7 client and ``db_read`` of two others, over links of increasing delay.
 
-The others are python-snap7 and the C library snap7. Controller, link and clients are processes of their own. Each
-client keeps its session over all rounds.
+The others are python-snap7 and the C library snap7. Controller, link and clients are separate processes. Each client
+keeps its session over all rounds.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def shmio_client(
 
 
 def snap7_client(stack: ExitStack, address: Address, pdu_size: int) -> snap7.Client:
-    """Connect python-snap7's client; it takes what PDU the controller grants."""
+    """Connect python-snap7's client, which accepts the PDU size that the controller grants."""
     client = snap7.Client()
     client.set_param(Parameter.PDURequest, pdu_size)
     client.connect(address.host, 0, 1, address.port)
@@ -47,7 +47,7 @@ def snap7_client(stack: ExitStack, address: Address, pdu_size: int) -> snap7.Cli
 
 
 def reader_in_parts(client: snap7.Client, packet_size: int) -> Callable[[], bytes]:
-    """Read the block as users of ``packetSize`` have to: ``db_read`` for each part."""
+    """Make a function that reads the block as users of ``packetSize`` must: one ``db_read`` for each part."""
 
     def read() -> bytes:
         parts = [client.db_read(NUMBER, at, min(packet_size, SIZE - at)) for at in range(0, SIZE, packet_size)]
@@ -59,11 +59,14 @@ def reader_in_parts(client: snap7.Client, packet_size: int) -> Callable[[], byte
 def c_client(
     stack: ExitStack, address: Address, pdu_size: int, packet_size: int | None, packages: Path, round_s: float
 ) -> Callable[[], float]:
-    """Start the C library's client; a sampler, as ``per_second`` makes them."""
+    """Start the C library's client, and make a sampler of its reads a second."""
     arguments = (address.host, address.port, pdu_size, packet_size or 0)
     child = stack.enter_context(Child("c_snap7.py", *arguments, packages=packages))
     if child.hello != {"pdu_size": pdu_size, "block": still_block().hex()}:
-        raise SystemExit(f"C snap7: {child.hello['pdu_size']} bytes of PDU, or the block came back changed")
+        raise SystemExit(
+            f"C snap7: the PDU has {child.hello['pdu_size']} bytes where {pdu_size} are expected, "
+            "or the block that was read differs from the controller's"
+        )
     return lambda: float(child.ask(round_s))
 
 
@@ -76,7 +79,7 @@ def compare(
     round_s: float,
     packages: Path | None,
 ) -> None:
-    """Time all clients against one controller over one link."""
+    """Time all clients with one controller over one link."""
     with ExitStack() as stack:
         ours = shmio_client(stack, address, SIZE, packet_size=packet_size)
         one_by_one = shmio_client(stack, address, SIZE, packet_size=packet_size, jobs=1)
@@ -92,7 +95,7 @@ def compare(
         }
         for name, read in reads.items():
             if read() != still_block():
-                raise SystemExit(f"{name}: the block came back changed")
+                raise SystemExit(f"{name}: the block that was read differs from the controller's")
         samplers = {name: per_second(read, round_s) for name, read in reads.items()}
         if packages is not None:
             samplers["C snap7 db_read"] = c_client(stack, address, pdu_size, packet_size, packages, round_s)
@@ -100,7 +103,7 @@ def compare(
 
 
 def measure_link(links: dict[str, Address], calls: int) -> None:
-    """Show what the links add: to one request, and to eight at once, which must not cost eight round trips."""
+    """Print the delay that each link adds to one request, and to eight at once: both must be one round trip."""
     with ExitStack() as stack:
         single = {name: shmio_client(stack, address, 1, packet_size=1) for name, address in links.items()}
         eight = {name: shmio_client(stack, address, 8, packet_size=1) for name, address in links.items()}

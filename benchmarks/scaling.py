@@ -43,18 +43,18 @@ TITLES = (
 
 @dataclass(frozen=True)
 class Load:
-    """How much of everything."""
+    """The number of sources and readers, and the size of a block."""
 
     sources: int = 1
     size: int = SIZE
     processes: int = 0
-    """That read the first source."""
+    """Number of processes that read the first source."""
     threads: int = 0
-    """That read it in one process more."""
+    """Number of threads that read the first source, in one further process."""
 
 
 def block_source(folder: Path, size: int) -> Path:
-    """Write the source of a data block that is as long, and like stamped.db else."""
+    """Return the file of a data block of this size, which is stamped.db except for its length."""
     if size == SIZE:
         return HERE / "stamped.db"
     path = folder / f"block{size}.db"
@@ -64,13 +64,13 @@ def block_source(folder: Path, size: int) -> Path:
 
 
 def busy_s() -> float:
-    """Time that all cores together have not been idle, proc_stat(5)."""
+    """Return the s that the cores have been busy, summed over all cores, proc_stat(5)."""
     fields = list(map(int, Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]))
     return (sum(fields) - fields[3] - fields[4]) / os.sysconf("SC_CLK_TCK")
 
 
 class Usage:
-    """CPU of groups of processes, and of the machine, from now on."""
+    """The CPU use of groups of processes and of the machine, since the object was made."""
 
     def __init__(self, groups: Mapping[str, Sequence[int]]) -> None:
         self._groups = groups
@@ -78,7 +78,10 @@ class Usage:
         self._before = {pid: CpuTime.of(pid) for pids in groups.values() for pid in pids}
 
     def percent(self) -> dict[str, float]:
-        """Of one core, by group and ``elsewhere`` and in ``all``."""
+        """Return the use in percent of one core.
+
+        The keys are the groups, ``elsewhere`` for other programs, and ``all`` for the machine.
+        """
         taken_s, found = time.monotonic() - self._begun_s, {}
         whole = 100 * (busy_s() - self._busy_s) / taken_s
         for name, pids in self._groups.items():
@@ -88,7 +91,7 @@ class Usage:
 
 
 def delays_ms(running: Instance, names: Sequence[str], count: int) -> list[float]:
-    """From the due time of the last frames' cycles to their publishing, over all sources."""
+    """Return the ms from the due time of a cycle to its frame, for the last frames of all sources."""
     started_ns = running.segment.header.started_ns
     found: list[float] = []
     for name in names:
@@ -104,7 +107,7 @@ def delays_ms(running: Instance, names: Sequence[str], count: int) -> list[float
 
 
 def measure(load: Load, duration_s: float) -> list[str]:
-    """Run one instance under this load; the cells of its row."""
+    """Run one instance under this load. Return its row of the table."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         layout = block_source(folder, load.size)

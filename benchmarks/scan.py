@@ -1,8 +1,9 @@
-"""Which registers changed between two frames, and what they are now: shmio's scan and codecs beside other ways.
+"""Finding the registers that changed between two frames, and decoding them: shmio's scan and codecs, and other ways.
 
-Two layouts of the same 2,180 bytes: DB201 as it is, where the two areas are one register each (22 registers), and with
-every byte of them a register of its own (2,120), as in a project with named signals. The registers that change are
-spread over the block. Before anything is timed, all must find the same registers and the same values.
+There are two layouts of the same 2,180 bytes. DB201 as it is has 22 registers, because each of its two areas is one
+register. The finer layout has 2,120: each byte of the areas is a register of its own, as in a project with named
+signals. The registers that change are spread over the block. Before anything is timed, all ways must find the same
+registers and values.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ PERCENTAGES = (0, 1, 5, 100)
 
 
 def finer() -> Layout:
-    """DB201 with a register for each byte of its areas."""
+    """Return the layout of DB201 with a register for each byte of its areas."""
     members = [f"I{at:04} : Byte;" for at in range(1000)] + [f"O{at:04} : Byte;" for at in range(1100)]
     members += [f"Axis{at:02} : Real;" for at in range(20)]
     text = "DATA_BLOCK \"DB201\"\n{ S7_Optimized_Access := 'FALSE' }\nSTRUCT\n"
@@ -40,7 +41,7 @@ def finer() -> Layout:
 
 
 class Ways:
-    """All contenders for one layout; ``old`` to ``new``."""
+    """All contenders for one layout, which compare the images ``old`` and ``new``."""
 
     def __init__(self, layout: Layout) -> None:
         self.registers = layout.registers
@@ -57,7 +58,7 @@ class Ways:
     # what changed
 
     def numpy_bytes(self, old: bytes, new: bytes) -> list[int]:
-        """All bytes at once, then the registers that own those that differ."""
+        """Compare all bytes at once, then look up the registers of those that differ."""
         differ = np.frombuffer(old, np.uint8) != np.frombuffer(new, np.uint8)
         changed = np.zeros(len(self.registers), bool)
         changed[self.owner[differ]] = True
@@ -65,32 +66,32 @@ class Ways:
         return found
 
     def numpy_record(self, old: bytes, new: bytes) -> list[int]:
-        """Field by field of a structured array; as raw bytes, since a NaN differs from itself."""
+        """Compare the fields of a structured array as raw bytes, because a NaN differs from itself."""
         before, after = np.frombuffer(old, self.raw)[0], np.frombuffer(new, self.raw)[0]
         return [at for at in range(len(self.registers)) if before[at].tobytes() != after[at].tobytes()]
 
     def unpacked(self, old: bytes, new: bytes) -> list[int]:
-        """Unpack both; wrong for NaN and -0.0."""
+        """Unpack both images and compare the values, which is wrong for NaN and -0.0."""
         both = zip(self.struct.unpack(old), self.struct.unpack(new), strict=True)
         return [at for at, (before, after) in enumerate(both) if before != after]
 
     def loop(self, old: bytes, new: bytes) -> list[int]:
-        """Compare slice by slice."""
+        """Compare the slice of each register."""
         return [at for at, (start, stop) in enumerate(self.spans) if old[start:stop] != new[start:stop]]
 
     # what it is
 
     def decode_changed(self, old: bytes, new: bytes) -> list[Value]:
-        """The scan, then the codec of each register that changed."""
+        """Find the registers that changed by shmio's scan, and decode each with its codec."""
         codecs = self.codecs
         return [codecs[at].decode(new) for at in self.scan.changed(old, new)]
 
     def decode_by_codec(self, new: bytes) -> list[Value]:
-        """The codec of every register."""
+        """Decode every register with its codec."""
         return [each.decode(new) for each in self.codecs]
 
     def decode_by_loop(self, new: bytes) -> list[object]:
-        """What a short program does."""
+        """Decode every register in the way of a short script."""
         return [
             struct.unpack_from(">f", new, register.offset)[0]
             if register.type == "REAL"
@@ -101,7 +102,7 @@ class Ways:
         ]
 
     def decode_by_dtype(self, new: bytes) -> Any:
-        """A big-endian record, turned into native numbers by numpy."""
+        """Decode a big-endian record to native numbers with numpy."""
         return np.frombuffer(new, self.big).astype(self.frames.dtype)
 
 
@@ -120,7 +121,7 @@ def _big(register: Register) -> tuple[str, tuple[int, ...]]:
 
 @dataclass(frozen=True)
 class Frames:
-    """A frame, and one after it in which so many registers differ."""
+    """A frame, and a later one in which so many registers differ."""
 
     old: bytes
     new: bytes
@@ -128,7 +129,7 @@ class Frames:
 
 
 def frames(registers: Sequence[Register], size: int, percent: int) -> Frames:
-    """REALs are finite; a changed register differs in its last byte."""
+    """Make two frames. REALs are finite, and a changed register differs in its last byte."""
     draw = random.Random(percent)
     old = bytearray(draw.randbytes(size))
     for register in registers:
@@ -143,7 +144,7 @@ def frames(registers: Sequence[Register], size: int, percent: int) -> Frames:
 
 
 def compare(title: str, contenders: dict[str, Callable[[], object]], rounds: int, calls: int) -> None:
-    """Time all in turn; the slow ones with fewer calls."""
+    """Time all contenders in turn, the slow ones with fewer calls."""
     samplers = {}
     for name, call in contenders.items():
         cost_ns = min(per_call_ns(call, 3)() for _ in range(3))
@@ -165,7 +166,7 @@ def measure(layout: Layout, rounds: int, calls: int) -> None:
         }
         for name, scan in scans.items():
             if scan(pair.old, pair.new) != pair.changed:
-                raise SystemExit(f"{name}: finds other registers than were changed")
+                raise SystemExit(f"{name}: did not find exactly the registers that were changed")
         calls_of: dict[str, Callable[[], object]] = {
             name: partial(scan, pair.old, pair.new) for name, scan in scans.items()
         }

@@ -1,4 +1,4 @@
-"""A model that is served to an instance by gRPC, as a process, until standard input ends."""
+"""A process that serves a model to an instance by gRPC, until standard input ends."""
 
 from __future__ import annotations
 

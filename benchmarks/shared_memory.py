@@ -1,8 +1,8 @@
-"""Publish and snapshot of one 2,180-byte frame in shared memory: shmio's ring beside other ways to share it.
+"""Publishing and copying one 2,180-byte frame in shared memory: shmio's ring and other ways to share it.
 
-What each contender gives differs. A bare copy is the limit, and shares nothing safely. A lock or a semaphore gives one
-whole frame, as long as nobody dies while holding it, and wakes nobody. The ring gives whole frames with their history,
-time and quality, wakes whoever waits, and needs nothing from its readers.
+The contenders give different guarantees. A bare copy is the limit, and is not safe between processes. A lock or a
+semaphore gives one whole frame, as long as no process dies while it holds the lock; it wakes no reader. The ring
+gives whole frames with their history, time and quality, wakes waiting readers, and needs nothing from its readers.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ USUAL_SLOTS = 512  # 8 s at 50 Hz
 
 @dataclass(frozen=True)
 class Contender:
-    """One way to share a frame: ``publish`` makes it visible to all, ``snapshot`` takes a copy of one's own."""
+    """One way to share a frame: ``publish`` makes it visible to all readers, ``snapshot`` returns a copy."""
 
     name: str
     publish: Callable[[], object]
     snapshot: Callable[[], Any]
     image: Callable[[Any], bytes] = bytes
-    """The frame's bytes in a snapshot, to check it; not timed."""
+    """Returns the frame's bytes in a snapshot, to check it. It is not timed."""
 
 
 # -- contenders --------------------------------------------------------------------------------------------------------
@@ -46,7 +46,7 @@ class Contender:
 
 @contextmanager
 def shmio_rings(frame: bytes) -> Iterator[list[Contender]]:
-    """A ring of 8 slots, which stays in the cache as a single place does, and one of the usual length."""
+    """Yield shmio's ring with 8 slots, which stays in the cache as a single frame does, and with the usual length."""
     layout = db201()
     sizes = {"few": 1 << 15, "usual": 1 << 26}
     specs = [BlockSpec(name, layout, 20_000_000, 10**9, size) for name, size in sizes.items()]
@@ -78,7 +78,7 @@ def shmio_rings(frame: bytes) -> Iterator[list[Contender]]:
 
 @contextmanager
 def copies(frame: bytes) -> Iterator[list[Contender]]:
-    """The copy alone, and the copy under what keeps two processes apart."""
+    """Yield a bare copy, and copies under the means that keep two processes apart."""
     size = len(frame)
     memory = mmap.mmap(-1, size)
     context = multiprocessing.get_context("spawn")
@@ -128,7 +128,10 @@ def copies(frame: bytes) -> Iterator[list[Contender]]:
 
 @contextmanager
 def iceoryx(frame: bytes) -> Iterator[list[Contender]]:
-    """The two patterns of iceoryx2 that fit, in a place of their own, since it leaves files behind."""
+    """Yield the two messaging patterns of iceoryx2 that fit.
+
+    They have a folder of their own, because they leave files behind.
+    """
     prefix = f"bench-{os.getpid()}-"
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -141,9 +144,9 @@ def iceoryx(frame: bytes) -> Iterator[list[Contender]]:
 
 
 def _iceoryx_contenders(frame: bytes, prefix: str, folder: str) -> list[Contender]:
-    """The blackboard, which has a newest value as the ring does, and publish-subscribe, which is a queue.
+    """Make the blackboard, which has a newest value as the ring does, and publish-subscribe, a queue.
 
-    A queue gives each sample once, so the snapshot of publish-subscribe includes a publish.
+    A queue delivers each sample once. The snapshot of publish-subscribe therefore includes a publish.
     """
     import iceoryx2 as iox  # noqa: PLC0415 - optional
 
@@ -190,7 +193,7 @@ def measure(contenders: list[Contender], frame: bytes, rounds: int, calls: int) 
     for contender in contenders:
         contender.publish()
         if contender.image(contender.snapshot()) != frame:
-            raise SystemExit(f"{contender.name}: the frame came back changed")
+            raise SystemExit(f"{contender.name}: the frame that was read differs from the frame that was published")
     publish = {contender.name: per_call_ns(contender.publish, calls) for contender in contenders}
     snapshot = {contender.name: per_call_ns(contender.snapshot, calls) for contender in contenders}
     report("Python, publish, ns", interleave(publish, rounds), OURS, "less")

@@ -1,10 +1,13 @@
-"""A cell left alone: DB201 at 50 Hz or faster, five gRPC subscribers, a recorder. Does it grow, does it lose?
+"""Lets a cell run for long: DB201 at 50 Hz or faster, five gRPC subscribers, a recorder. Does it grow or lose frames?
 
-A reader of its own follows every frame: cycles must follow each other, quality must stay good. What the subscribers got
-is held against how often their registers changed; the recording against the frames. Memory and descriptors of each
-process are taken every few seconds; what the second half holds more than the second quarter is growth. Witnesses, a
-process on each core that only sleeps, before all others if it may, tell when the machine itself stood still: a cycle
-that was skipped then is told apart from one that was skipped by shmio, of which there must be none.
+A separate reader follows every frame: cycles must be consecutive, and quality must stay good. The number of messages
+that subscribers received is compared with the number of changes, and the recording with the frames.
+
+Every few seconds, memory and descriptors of each process are read. A process grows if it has more in the second half
+of the run than in its second quarter.
+
+On each core, a witness process only sleeps, at the highest priority that it gets. It reports when the machine itself
+stalled. Cycles skipped during a stall are counted separately; shmio itself must skip none.
 """
 
 from __future__ import annotations
@@ -32,28 +35,28 @@ from shmio.segment import Block, Quality
 
 REGISTERS = [f"Robot_800/Axs{axis}_Pos" for axis in range(1, 6)]
 FIRST_S = 1.0
-"""Overruns in the first second do not count: everybody is starting."""
+"""Time in s at the start in which overruns do not count, because all processes are starting."""
 SAMPLE_S = 5.0
 NEAR_S = 0.1
-"""A cycle that is skipped so soon after a stall was skipped by it: the device and the network catch up, too."""
+"""A cycle skipped within so many s after a stall counts as the stall's, because device and network are late, too."""
 
 
 def stolen_cpu_s() -> float:
-    """What the hypervisor has given to others of the time that this machine wanted to run, proc(5)."""
+    """Return the s in which this machine wanted to run but the hypervisor ran others, proc(5)."""
     steal = Path("/proc/stat").read_text().split("\n", 1)[0].split()[8]
     return int(steal) / os.sysconf("SC_CLK_TCK")
 
 
 @dataclass
 class Follower:
-    """Reads every frame, in a thread."""
+    """A thread's reader, which reads every frame."""
 
     block: Block
     frames: int = 0
     bad: int = 0
     skipped: int = 0
     skips: list[tuple[float, int]] = field(default_factory=list)
-    """When a frame came for which cycles had been skipped (CLOCK_MONOTONIC, s), and how many."""
+    """For each skip of cycles, the time of the next frame (CLOCK_MONOTONIC, s) and the number of cycles."""
     changes: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REGISTERS, 0))
     stopping: threading.Event = field(default_factory=threading.Event)
 
@@ -81,10 +84,10 @@ class Follower:
 
 @dataclass(frozen=True)
 class Size:
-    """What a process holds."""
+    """The memory and the descriptors of a process."""
 
     memory_kb: int
-    """Private and shared pages that are its own share (PSS), without the segment."""
+    """Its private pages and its share of shared pages (PSS), without the segment."""
     descriptors: int
 
     @classmethod
@@ -103,7 +106,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--for", dest="duration_s", type=float, default=1800.0, help="seconds (default: half an hour)")
     parser.add_argument("--period-ms", type=int, default=20, help="of the source (default: 20)")
-    parser.add_argument("--quick", action="store_true", help="5 s: does it work, not how well")
+    parser.add_argument("--quick", action="store_true", help="run for 5 s, which checks only that the benchmark works")
     parser.add_argument("--priority", type=int, help="real-time, of the source and its emulated controller")
     arguments = parser.parse_args()
     duration_s = 5.0 if arguments.quick else arguments.duration_s
@@ -125,7 +128,7 @@ def main() -> None:
 
 
 def soak(running: Instance, period_ms: int, duration_s: float) -> list[str]:
-    """Watch for so long; what is not as it should be."""
+    """Watch the instance for a duration. Return the problems found."""
     stall_ms = period_ms / 2  # a witness that comes so late tells of a stall
     slots = {slot.name: slot for slot in running.segment.processes}
     time.sleep(FIRST_S)
@@ -161,7 +164,7 @@ def soak(running: Instance, period_ms: int, duration_s: float) -> list[str]:
         if memory_kb[1] > memory_kb[0] * 1.02 + 256:
             problems.append(f"{name} grew from {memory_kb[0]:.0f} to {memory_kb[1]:.0f} kB")
         if descriptors[1] > descriptors[0]:
-            problems.append(f"{name} holds {descriptors[1]:.0f} descriptors, {descriptors[0]:.0f} before")
+            problems.append(f"{name} went from {descriptors[0]:.0f} to {descriptors[1]:.0f} descriptors")
     table(["process", "MB, 2nd quarter", "MB, 2nd half", "descriptors, 2nd quarter", "2nd half"], rows)
     overruns, failures = (after[name] - before[name] for name in ("overruns", "failures"))
     changes = sum(follower.changes.values())
@@ -195,12 +198,12 @@ def soak(running: Instance, period_ms: int, duration_s: float) -> list[str]:
             problems.append(f"{value} {name}")
     # The subscribers joined before the follower and left after it: a few frames at each end.
     if not 0 <= messages - changes <= len(REGISTERS) * 5 / (period_ms / 1000):
-        problems.append(f"{messages} messages for {changes} changes")
+        problems.append(f"subscribers received {messages} messages for {changes} changes")
     return problems
 
 
 def recorded(folder: Path) -> list[str]:
-    """What the recording is worth: all of it is read; what is not as it should be."""
+    """Read and check the whole recording. Return the problems found."""
     files = sorted(folder.glob("*.mem"))
     problems, frames, size, last = [], 0, 0, 0
     for file, whole, one in zip(files, dump("verify", files), dump("info", files), strict=True):
@@ -210,7 +213,7 @@ def recorded(folder: Path) -> list[str]:
                 problems.append(f"{file.name}: {missed} frames and events missed")
             if last and block["first_frame"] != last + 1:
                 problems.append(
-                    f"{file.name} begins with frame {block['first_frame']}, the one before ends with {last}"
+                    f"{file.name} begins with frame {block['first_frame']}, the file before it ends with {last}"
                 )
             frames, last = frames + block["frames"], block["last_frame"]
         size += one["size"]
@@ -220,7 +223,7 @@ def recorded(folder: Path) -> list[str]:
 
 
 def dump(verb: str, files: list[Path]) -> list[dict[str, Any]]:
-    """What ``shmio-dump`` says of each file."""
+    """Return the JSON output of a verb of ``shmio-dump`` for each file."""
     command = [sys.executable, "-m", "shmio.cli.dump", verb, "--json", *map(str, files)]
     found = json.loads(subprocess.run(command, capture_output=True, check=False).stdout)
     return found if isinstance(found, list) else [found]

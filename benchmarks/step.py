@@ -1,9 +1,9 @@
-"""Steps a second: a model with 100 registers that all change, stepped from another process that receives them.
+"""Steps a second: a model with 100 registers that all change, stepped by another process that receives them.
 
-Each client steps, waits for the answer, and for everything that it has subscribed to. Model, endpoint and client are
-processes of their own. They take turns; while one steps, nobody else has subscribed. A bare server has no model, and
-nothing to find out: it sends the same client the same messages, which it has ready. That is the limit, and what the
-client itself costs.
+Each client steps, waits for the answer and for everything that it has subscribed to. Model, endpoint and client are
+separate processes. The clients take turns; while one steps, no other client has subscriptions. The bare server has no
+model, and computes nothing: it sends the same client the same prepared messages. Its figure is the limit, and shows
+the cost of the client itself.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CONTENDERS = {
 
 
 def local(instance: str, duration_s: float) -> Callable[[], float]:
-    """A program on the host that steps; nobody has subscribed."""
+    """Make a sampler of a program on the host that steps without subscribers."""
 
     def sample() -> float:
         with attach(instance, writable=True) as program:
@@ -57,7 +57,7 @@ def local(instance: str, duration_s: float) -> Callable[[], float]:
 
 
 def remote(client: Child, target: str, kind: str, duration_s: float) -> Callable[[], float]:
-    """A client in a process of its own, connected anew."""
+    """Make a sampler of a client in another process, which connects for each sample."""
     return lambda: float(client.ask(f"{target} {kind} {duration_s}"))
 
 
@@ -87,7 +87,7 @@ def main() -> None:
 
 
 def _ready(target: str) -> dict[tuple[str, ...], ready.Ready]:
-    """What bare servers send, by the kinds of clients that get the same."""
+    """Collect the messages of bare servers, by the kinds of clients that receive the same."""
     return {
         ("v2",): ready.version_2(target, PATHS),
         ("v2-array",): ready.version_2(target, ["sim/row"]),

@@ -1,8 +1,7 @@
-"""A client that steps and has subscribed to what changes, as a process.
+"""A process with a client that steps, and has subscribed to the changes.
 
-An address, a kind and seconds in; steps a second out.
-
-It steps when it has received all of the step before. ``alone``: it has subscribed to nothing.
+It reads lines with an address, a kind of client and a number of seconds, and prints the steps a second. It makes a
+step when it has received everything of the step before. The kind ``alone`` has no subscription.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ from shmio.wire.simserver_pb2_grpc import SimServerAPIStub
 PATHS = [f"sim/values/r{index:02}" for index in range(COUNT)]
 PATIENCE_S = 30
 MANY = 1_000_000
-"""More than are done."""
+"""More steps than a sample can make."""
 
 
 @contextmanager
 def alone(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
-    """Nobody has subscribed."""
+    """Step without a subscription."""
     stub: Any = SimServerAPIStub(channel)  # type: ignore[no-untyped-call]
 
     def step() -> None:
@@ -47,7 +46,7 @@ def alone(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def version_2(channel: grpc.Channel, paths: list[str]) -> Iterator[Callable[[], None]]:
-    """One stream; a step is over when its marker has come, and all values of it."""
+    """Step with one SimlogAPI version 2 stream. A step is complete when all values and its marker have arrived."""
     stub: Any = V2Stub(channel)  # type: ignore[no-untyped-call]
     uuid = f"benchmark-{time.monotonic_ns()}"
     stream = stub.CreateSubscriber(v2.Subscriber(name="benchmark", uuid=uuid))
@@ -63,7 +62,7 @@ def version_2(channel: grpc.Channel, paths: list[str]) -> Iterator[Callable[[], 
             for _ in paths:
                 next(stream)
             if next(stream).header.path != "SIMLOG://step":
-                raise SystemExit("the marker is not behind the values")
+                raise SystemExit("the step's marker did not come after the step's values")
 
         yield step
     stream.cancel()
@@ -71,7 +70,7 @@ def version_2(channel: grpc.Channel, paths: list[str]) -> Iterator[Callable[[], 
 
 @contextmanager
 def native(target: str) -> Iterator[Callable[[], None]]:
-    """By shmio.v1: all that has changed in one update."""
+    """Step by shmio.v1, where one update has all changes of a step."""
     with connect(target) as client, client.subscribe("sim/values/*") as updates:
         next(updates)
 
@@ -85,7 +84,10 @@ def native(target: str) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def native_stream(target: str) -> Iterator[Callable[[], None]]:
-    """The same; steps without a call for each, each asked for when all of the one before has come."""
+    """Step by a stream of shmio.v1, in place of a call for each step.
+
+    Ask for a step when the one before has arrived.
+    """
     with connect(target) as client, client.subscribe("sim/values/*") as updates, client.steps() as steps:
         next(updates)
 
@@ -99,7 +101,7 @@ def native_stream(target: str) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def native_many(target: str) -> Iterator[Callable[[], None]]:
-    """The same; as many steps as are done, asked for at once. A step is over when all of it has come, as ever."""
+    """Step by a stream of shmio.v1 that asks for all steps at once. A step is complete when its values have arrived."""
     with connect(target) as client, client.subscribe("sim/values/*") as updates, client.steps(MANY) as steps:
         next(updates)
 
@@ -114,7 +116,7 @@ def native_many(target: str) -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def version_1(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
-    """A stream for each register, and one for the clock, each followed in a thread."""
+    """Step with a SimlogAPI version 1 stream for each register and for the clock, each followed in a thread."""
     stub: Any = V1Stub(channel)  # type: ignore[no-untyped-call]
     came: SimpleQueue[None] = SimpleQueue()
 

@@ -1,7 +1,7 @@
-"""gRPC subscribers, as a process: a connection and a SimlogAPI v1 Subscribe call for each path.
+"""A process with gRPC subscribers: a connection and a SimlogAPI v1 Subscribe call for each path.
 
-With ``--stamps``, the values are times that plc.py wrote, and each message is kept as (time of the change, instance's
-clock when the frame was published, time of arrival), all in ns; the first and the last are CLOCK_MONOTONIC.
+With ``--stamps``, the values are times that plc.py wrote. Each message is kept as (time of the change, instance's
+clock when the frame was published, time of arrival), all in ns. The first and the last are CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shmio.wire import simlog_v1_pb2_grpc as service
 
 
 class Subscriber:
-    """One stream, followed in a thread."""
+    """A thread that follows one stream."""
 
     def __init__(self, target: str, path: str, *, stamps: bool) -> None:
         options = [("grpc.use_local_subchannel_pool", 1)]  # else all channels of a process share one connection
@@ -45,7 +45,6 @@ class Subscriber:
                 raise
 
     def stop(self) -> None:
-        """End the stream."""
         self._call.cancel()
         self._thread.join()
         self._channel.close()

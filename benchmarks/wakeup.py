@@ -1,8 +1,8 @@
-"""From a publish to the return of the readers that wait for it: shmio's doorbell beside other ways to wake.
+"""The time from a publish to the return of waiting readers: shmio's doorbell compared with other ways to wake.
 
-One writer, and 1, 5 or 50 readers, all of them waiting when the writer begins: processes first, then threads of the
-writer's process. Timed are the writer's call and the arrival of the last reader. *Frame* says that every reader has got
-a copy of the 2,180 bytes by then; the others are woken and have got nothing.
+There is one writer. 1, 5 or 50 readers wait when the writer begins: first processes, then threads of the writer's
+process. The benchmark times the writer's call, and the return of the last reader. With *frame*, every reader has
+received a copy of the 2,180 bytes by then; without it, readers are only woken.
 """
 
 from __future__ import annotations
@@ -36,16 +36,19 @@ FRAME = FRAME[: db201().size]
 POLL_S = 0.001
 PAGE = 4096
 WARM_UP = 3
-"""Rounds that do not count, each time a way is begun."""
+"""Number of rounds that do not count, at the start of each way."""
 PATIENCE_NS = 10 * 10**9
 
 Wait = Callable[[], bytes | None]
-"""Returns when the writer has called, with the frame if the way carries it."""
+"""Waits until the writer has called. Returns the frame if this way transfers it, otherwise None."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """One way to wake readers: ``ring`` wakes the first n; ``waiters`` make, in each reader, what waits."""
+    """One way to wake readers:
+
+    ``ring`` wakes the first n readers; each entry of ``waiters`` makes one reader's wait.
+    """
 
     name: str
     ring: Callable[[int], object]
@@ -56,7 +59,7 @@ class Way:
 
 
 def follow(waiters: dict[str, Callable[[], Wait]], orders: Connection, arrivals: MutableSequence[int], at: int) -> None:
-    """A reader: waits as often as it is told, in the way it is told, and notes when it returned."""
+    """Run a reader: wait as often and in the way that each order says, and record when each wait returned."""
     orders.send("here")
     while (order := orders.recv()) is not None:
         name, times = order
@@ -66,13 +69,13 @@ def follow(waiters: dict[str, Callable[[], Wait]], orders: Connection, arrivals:
             frame = wait()
             arrivals[at] = time.monotonic_ns()
             if frame is not None and frame != FRAME:
-                raise SystemExit(f"{name}: the frame came changed")
+                raise SystemExit(f"{name}: the frame that a reader received differs from the frame that was published")
         del wait
         orders.send("done")
 
 
 def _process(*arguments: Any) -> None:
-    """A reader that is a process, and ends with its parent however that ends."""
+    """Run a reader in a child process, which ends when its parent ends for any reason."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -85,7 +88,7 @@ def _process(*arguments: Any) -> None:
 
 
 class Readers:
-    """All readers, who wait only when they are told to."""
+    """All readers. They wait only when an order tells them to."""
 
     def __init__(self, orders: Sequence[Connection], arrivals: MutableSequence[int]) -> None:
         self._orders = orders
@@ -94,7 +97,7 @@ class Readers:
             assert reader.recv() == "here"
 
     def measure(self, way: Way, count: int, rounds: int, rest_s: float) -> tuple[list[float], list[float]]:
-        """(the writer's call, until the last of ``count`` readers is back), in µs, for each round."""
+        """Return two times in µs for each round: of the writer's call, and until ``count`` readers have returned."""
         active = self._orders[:count]
         self._tell(active, (way.name, WARM_UP + rounds), "ready")
         calls, lasts = [], []
@@ -108,7 +111,7 @@ class Readers:
             while not all(arrivals := self._arrivals[:count]):
                 time.sleep(rest_s)
                 if time.monotonic_ns() > begun_ns + PATIENCE_NS:
-                    raise SystemExit(f"{way.name}: a reader does not come back")
+                    raise SystemExit(f"{way.name}: a reader did not return from its wait")
             calls.append((called_ns - begun_ns) / 1000)
             lasts.append((max(arrivals) - begun_ns) / 1000)
         for order in active:
@@ -125,7 +128,7 @@ class Readers:
 
 @contextmanager
 def processes(ways: Sequence[Way], count: int) -> Iterator[Readers]:
-    """Readers that are processes, as the programs of a cell are."""
+    """Start readers in processes of their own, like the programs of a cell."""
     context = multiprocessing.get_context("spawn")
     arrivals = context.RawArray("q", count)
     ends, started = [], []
@@ -146,7 +149,7 @@ def processes(ways: Sequence[Way], count: int) -> Iterator[Readers]:
 
 @contextmanager
 def threads(ways: Sequence[Way], count: int) -> Iterator[Readers]:
-    """Readers that are threads of this process."""
+    """Start readers in threads of this process."""
     arrivals = [0] * count
     ends, started = [], []
     for at in range(count):
@@ -209,7 +212,7 @@ def _polled_frame(instance: str) -> Wait:
 
 @contextmanager
 def shmio_ways(count: int) -> Iterator[list[Way]]:
-    """The frame ring, its bell alone, and the ring looked at each millisecond instead."""
+    """Yield the frame ring, its doorbell alone, and polling the ring each millisecond."""
     name = f"bench-{os.getpid()}"
     segment = Segment.create(name, [BlockSpec("cell", db201(), 20_000_000, 10**9, 1 << 26)], [ProcessSpec("cell", "")])
     try:
@@ -233,7 +236,7 @@ def shmio_ways(count: int) -> Iterator[list[Way]]:
 
 
 class Fd:
-    """A file descriptor that goes along to a process that is being started."""
+    """A file descriptor that a child process inherits at its start."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -266,7 +269,7 @@ def _socket(fd: Fd) -> Wait:
 
 @contextmanager
 def descriptors(count: int) -> Iterator[list[Way]]:
-    """What the kernel has for one waiter each: the writer goes through them one by one."""
+    """Yield the kernel's means that wake one waiter each. The writer calls them one by one."""
     with ExitStack() as stack:
         events = [os.eventfd(0) for _ in range(count)]
         pipes = [os.pipe() for _ in range(count)]
@@ -311,7 +314,7 @@ def _condition(condition: Any, generation: Any, memory: Any) -> Wait:
 
 
 def condition_way(name: str, condition: Any, count: int) -> Way:
-    """A condition variable around a copy."""
+    """Make the way of a condition variable that guards a copy of the frame."""
     context = multiprocessing.get_context("spawn")
     generation, memory = context.RawValue("q", 0), context.RawArray("B", len(FRAME))
     view = memoryview(memory).cast("B")
@@ -326,7 +329,7 @@ def condition_way(name: str, condition: Any, count: int) -> Way:
 
 
 def queue_way(count: int) -> Way:
-    """A queue for each thread; the frame is handed on, not copied."""
+    """Make the way of a queue for each thread, which hands the frame over without a copy."""
     queues: list[SimpleQueue[bytes]] = [SimpleQueue() for _ in range(count)]
 
     def put(active: int) -> None:
@@ -359,7 +362,7 @@ def _listener(prefix: str, folder: str) -> Wait:
 
 @contextmanager
 def iceoryx(count: int) -> Iterator[list[Way]]:
-    """The event of iceoryx2, in a place of its own, since it leaves files behind."""
+    """Yield the event of iceoryx2, in a folder of its own, because it leaves files behind."""
     prefix = f"bench-{os.getpid()}-"
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -377,7 +380,7 @@ def iceoryx(count: int) -> Iterator[list[Way]]:
 
 
 def compare(what: str, readers: Readers, ways: Sequence[Way], count: int, rounds: int) -> None:
-    """Print what both sides take, the ways in turn."""
+    """Print the times of writer and readers for all ways, sampled in turn."""
     rest_s, rounds = (0.002, rounds) if count < 10 else (0.01, rounds // 2)
     calls: dict[str, list[float]] = {way.name: [] for way in ways}
     lasts: dict[str, list[float]] = {way.name: [] for way in ways}
@@ -391,7 +394,7 @@ def compare(what: str, readers: Readers, ways: Sequence[Way], count: int, rounds
 
 
 def measure_native(counts: Sequence[int], rounds: int) -> None:
-    """Compile and run native/wakeup.c: the same without Python."""
+    """Compile and run native/wakeup.c, which measures the same without Python."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         print("\nthe figures of the C core are left out: there is no C compiler")

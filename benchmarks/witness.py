@@ -1,8 +1,9 @@
-"""What the machine itself does to a loop: python witness.py LATE_MS CORE.
+"""Measures how late the machine itself makes a loop: python witness.py LATE_MS CORE.
 
-A process that does nothing but sleep to an absolute schedule, on one core, before all others if the host lets it have
-a real-time priority: then only the kernel and a hypervisor can make it late. It tells in the end whether it had that,
-and when (CLOCK_MONOTONIC, s) it came ``LATE_MS`` late or more, and by how much: no loop fares better there.
+The process only sleeps to an absolute schedule, on one core. It has real-time priority if the host allows it: then
+only the kernel and a hypervisor can make it late. When it ends, it reports whether it had that priority. It also
+reports when (CLOCK_MONOTONIC, s) it woke ``LATE_MS`` late or more, and by how much. No other loop on that core can do
+better.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import threading
 import time
 
 LOOKS = 4
-"""How often in the time that counts as late: a stall between two looks is seen nearly whole."""
+"""Number of wake-ups in ``LATE_MS``. A stall is therefore measured to a quarter of that time."""
 
 
 def main() -> None:

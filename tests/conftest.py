@@ -184,7 +184,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 NEW_PROCESS = {"os.exec", "os.fork", "os.forkpty", "os.posix_spawn", "os.system", "subprocess.Popen"}
-"""Audit events of the interpreter."""
+"""Audit events that the interpreter raises when a process is started."""
 
 
 class NoProcesses:
@@ -200,7 +200,7 @@ class NoProcesses:
             self._testing and event in NEW_PROCESS and arguments[:1] != ("lscpu",)
         ):  # numpy.testing before 2 runs it when imported
             self._started.append(f"{event} {arguments[0] if arguments else ''}")
-            raise RuntimeError("a test of the fast tier may start no process")
+            raise RuntimeError("a test of the fast tier must not start a process")
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self) -> Iterator[None]:
@@ -328,7 +328,7 @@ def shared_instance() -> Iterator[str]:
 
 @pytest.fixture(params=["mosquitto", "embedded"])
 def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Run the test with both brokers: mosquitto, and the embedded one as if that were missing."""
+    """Run the test twice: with mosquitto, and with the embedded broker, as if mosquitto were not installed."""
     if request.param == "mosquitto":
         if reason := missing():
             pytest.skip(reason)

@@ -21,7 +21,7 @@ from shmio.testing.ports import reserved_port
 
 LAYOUT = Path(__file__).parents[2] / "db201.db"
 AT: Final = "cell/Outputs/100"
-"""A byte that the emulated controller leaves alone."""
+"""Path of a byte that the emulated controller's program does not write."""
 DRIFT: Final = {"name": "drift", "target": AT, "operation": "set", "value": 5}
 
 EXTRA: Final = """

@@ -72,7 +72,7 @@ class TestModbus(WriteConformance):
 
     @pytest.mark.parametrize("at", [0, 2, 5, 6, 7, 8])
     def test_an_answer_with_any_wrong_byte_in_its_header_is_dropped(self, run: Run, rig: ModbusRig, at: int) -> None:
-        """Transaction, protocol, length, unit, function and byte count: each must be that of the request."""
+        """Transaction, protocol, length, unit, function and byte count must all match the request."""
         run.good()
         rig.proxy.edit(lambda frame: frame[:at] + bytes((frame[at] ^ 0x11,)) + frame[at + 1 :])
         run.bad()

@@ -64,10 +64,10 @@ class MqttRig:
 
 
 class Late:
-    """What differs for a connector whose device sends values by itself."""
+    """Overrides for a connector whose device sends values by itself."""
 
     def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Rig) -> None:
-        """A message has no answer of its own: what is late on an old connection is never seen on the next."""
+        """There are no requests. A late message on an old connection must not be seen on the next connection."""
         run.good()
         rig.proxy.hold()
         run.bad()
@@ -120,7 +120,7 @@ class TestMosquitto(Late, WriteConformance):
         assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
 
     def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """A message has no bits of a number: the write is refused, and changes nothing."""
+        """A message cannot carry a single bit of a number: the write is refused, and changes nothing."""
         writer.written(Write(rig.spare, 0, b"\x0f"))
         end = writer.write(Write(rig.spare, 1, b"\0"))
         assert "write the whole register" in end.text

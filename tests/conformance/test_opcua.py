@@ -81,7 +81,7 @@ class TestOpcUa(WriteConformance):
         assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
 
     def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """OPC UA has no bits of a number: the write is refused, and changes nothing."""
+        """OPC UA cannot write a single bit of a number: the write is refused, and changes nothing."""
         writer.written(Write(rig.spare, 0, b"\x0f"))
         end = writer.write(Write(rig.spare, 1, b"\0"))
         assert "write the whole register" in end.text

@@ -1,7 +1,6 @@
 """The common conformance suites, run with the ros2 connector and a node made with cyclonedds.
 
-DDS has no connection that a proxy could break: the node itself leaves, dies, or is frozen. Faults of
-a connection are replaced by those of a node.
+DDS has no connection that a proxy could break. In place of connection faults, the node leaves, dies, or is frozen.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ COUNTS = 20
 
 
 class NodeFaults:
-    """Does to a node what the suite does to a connection."""
+    """The suite's interface for connection faults, which it carries out on the node."""
 
     def __init__(self, peer: Peer) -> None:
         self._peer = peer
@@ -58,7 +57,7 @@ class NodeFaults:
 
 
 class Ros2Rig:
-    """The node."""
+    """The node that the suites read and write."""
 
     proxy: Any
 
@@ -132,7 +131,7 @@ class TestRos2(WriteConformance):
         run.good()
 
     def test_reset(self, run: Run, rig: Ros2Rig) -> None:  # type: ignore[override]
-        """A node dies, and another one takes its place: values go on."""
+        """A node dies and another node takes its place: the values of the new node arrive."""
         run.until(rig.counted)
         rig.peer.kill()
         run.until(lambda frame: not rig.counted(frame))
@@ -163,7 +162,7 @@ class TestRos2(WriteConformance):
         run.until(lambda frame: rig.counted(frame) and rig.generation(frame.raw) > last)
 
     def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Ros2Rig) -> None:  # type: ignore[override]
-        """What a frozen node publishes late is newer than what was seen before: the fixture checks that."""
+        """A frozen node publishes late. The fixture ``run`` checks that counts never go back."""
         run.until(rig.counted)
         for _ in range(2):
             rig.proxy.freeze()
@@ -178,7 +177,7 @@ class TestRos2(WriteConformance):
         assert rig.peer.ask("commanded") == list(b"ab\0\0\x42\0\0\0")
 
     def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """A message has no bits of a number: the write is refused, and changes nothing."""
+        """A message cannot carry a single bit of a number: the write is refused, and changes nothing."""
         writer.written(Write(rig.spare, 0, b"\x0f"))
         end = writer.write(Write(rig.spare, 1, b"\0"))
         assert "write the whole register" in end.text
@@ -203,7 +202,7 @@ class TestRos2(WriteConformance):
             connector.close()
 
     def test_a_late_confirmation_is_not_taken_for_the_next(self, run: Run, writer: Writer, rig: Ros2Rig) -> None:  # type: ignore[override]
-        """A frozen node acknowledges nothing: the outcome is unknown, and the next one is its own."""
+        """A frozen node acknowledges nothing, so the outcome is unknown. The next write gets its own outcome."""
         rig.proxy.freeze()
         end = writer.write(Write(rig.spare, 0, b"late"))
         assert "did not acknowledge" in end.text
@@ -212,7 +211,7 @@ class TestRos2(WriteConformance):
 
     @pytest.mark.parametrize("count", [1])
     def test_lost_in_mid_write(self, run: Run, writer: Writer, rig: Ros2Rig, count: int) -> None:  # type: ignore[override]
-        """A node leaves, and is back: the next write that succeeds reaches it."""
+        """A node leaves and returns: the next write that succeeds reaches it."""
         rig.proxy.refuse()
         run.bad()
         rig.proxy.admit()

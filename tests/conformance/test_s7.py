@@ -49,7 +49,7 @@ class Shared:
 
 
 class S7Rig:
-    """The emulated PLC, running this program."""
+    """The emulated PLC, which runs the program ``Shared``."""
 
     def __init__(self, proxy: FaultProxy, plc: Emulator, size: int) -> None:
         self.proxy = proxy
@@ -65,9 +65,9 @@ class S7Rig:
         return S7Connector(S7Options(host=address.host, port=address.port, timeout=200, dbNumber=7), self.layout)
 
     def generation(self, raw: bytes) -> int:
-        """Return the cycle that the frame was read in.
+        """Return the PLC's cycle in which the frame was read.
 
-        A read of one PDU is of one cycle of the PLC; one of several PDUs may span a few cycles.
+        A frame that fits into one PDU is of one cycle. A frame of several PDUs may span a few cycles.
         """
         found = generations(raw[:-TAIL])
         assert len(found) == 1 or not self.one_pdu, f"mixed cycles {found}"
@@ -98,7 +98,7 @@ class TestS7(WriteConformance):
             yield S7Rig(proxy, plc, size)
 
     def test_a_reply_with_a_wrong_reference_is_never_accepted(self, run: Run, rig: S7Rig) -> None:
-        """A reply with a number that matches no open request drops the connection."""
+        """A reply whose number matches no open request makes the connector drop the connection."""
         run.good()
         rig.proxy.rewrite_reference(lambda reference: reference + 1000, frames=1)
         run.until(lambda frame: frame.quality is Quality.BAD)
@@ -106,7 +106,7 @@ class TestS7(WriteConformance):
         run.good()
 
     def test_a_confirmation_with_a_wrong_reference_confirms_nothing(self, run: Run, writer: Writer, rig: S7Rig) -> None:
-        """It confirms nothing: the write's outcome is unknown, and the connection is dropped."""
+        """The write's outcome is unknown, and the connection is dropped."""
 
         def rename(frame: bytes) -> bytes:
             return frame[:11] + bytes((frame[11] ^ 0x40,)) + frame[12:] if frame[19:20] == b"\x05" else frame
@@ -120,9 +120,9 @@ class TestS7(WriteConformance):
         run.good()
 
     def test_stop_makes_values_uncertain(self, run: Run, rig: S7Rig) -> None:
-        """The image is correct but no longer changes.
+        """While the PLC is stopped, its block is readable, but no longer changes.
 
-        It is uncertain, with the remedy as reason, until the PLC runs again.
+        The image is uncertain, with the remedy as reason, until the PLC runs again.
         """
         run.good()
         peer = snap7.Client()

@@ -20,7 +20,7 @@ from tests.faults.suite import Record, Suite
 
 SHM_SIZE = "384m"
 STEPPED = 0.2
-"""Share of a run in which the stepped instance is tested."""
+"""Share of a run's duration in which the instance with stepped time is tested."""
 
 
 def main() -> int:
@@ -69,7 +69,7 @@ def main() -> int:
 
 
 def _have_own_shm() -> None:
-    """Start again in a mount name space with a small /dev/shm that may be filled. Needs root."""
+    """Restart this program in a mount namespace with a small /dev/shm, which faults may fill. This needs root."""
     space = ["unshare", "--mount", "--propagation", "private"]
     if OWN_SHM in os.environ or os.geteuid() or subprocess.run([*space, "true"], check=False).returncode:
         return

@@ -1,7 +1,7 @@
-"""A chain over one word: two clients inject below a declared injection, and end one by one.
+"""Tests a chain of injections over one word: two clients inject beneath a declared injection, and end one by one.
 
-The inner client gives multiples of 4. The outer client has a higher priority, and gives the value
-that it receives plus 1. Both use shmio.v1, because no further program may attach with write access.
+The inner client gives multiples of 4. The outer client has a higher priority, and gives the value that it receives
+plus 1. Both clients use shmio.v1, because only one program may be attached with write access.
 """
 
 from __future__ import annotations
@@ -111,11 +111,11 @@ class Chaining:
         Args:
             source: The source.
             check: The check of this chain.
-            clients: The clients that are not to end yet.
+            clients: The clients that must still be alive.
             section: The block's section when the pair started.
 
         Returns:
-            Whether the block is no longer the one of ``section``.
+            Whether the block has been replaced since the pair started.
         """
         self._checker.stopping.wait(PAUSE_S)
         self._awake.look()

@@ -19,15 +19,15 @@ from tests.faults.truth import Truth, Words, generations, places
 Complain = Callable[[str], None]
 
 HELD_UP_NS = 4_000_000_000
-"""Maximum delay between a cycle's due time and its frame, because the schedule pauses processes."""
+"""Maximum ns between a cycle's due time and its frame; large, because faults pause processes."""
 
 FOREIGN = 60_000
-"""Maximum difference between generations in one image, for a PLC without a truth."""
+"""Maximum difference between generations in one image, if the PLC's history is not recorded as a :class:`Truth`."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A source as the checks know it. ``truth`` is None if its PLC records none."""
+    """What the checks know of a source. ``truth`` records what the PLC really had; None if nothing records it."""
 
     name: str
     size: int
@@ -41,9 +41,9 @@ class Source:
     guarded: Truth | None = None
     """Values written into the word ``guarded``, over whose ``/in`` injections are laid."""
     given: Truth | None = None
-    """Values that clients were going to inject into the words ``shown`` and ``guarded``."""
+    """Values that clients recorded before they injected them into the words ``shown`` and ``guarded``."""
     chained: Truth | None = None
-    """Values that clients were going to inject into the word ``chained``.
+    """Values that clients recorded before they injected them into the word ``chained``.
 
     The inner client gives multiples of 4, the outer client one more.
     """
@@ -63,7 +63,7 @@ class Counts:
     missed: int = 0
     values: int = 0
     since_ns: int = 0
-    """CLOCK_MONOTONIC when the PLC got the newest good value; without a truth, when it was read."""
+    """CLOCK_MONOTONIC when the PLC got the newest good value. Without a truth: when the source read that value."""
 
 
 @dataclass
@@ -84,7 +84,7 @@ class FrameCheck:
         self._places = places(self._own)
 
     def begin(self, started_ns: int) -> None:
-        """Begin a stream of an instance that started at ``started_ns``. Values must not go back."""
+        """Begin a stream from an instance that started at ``started_ns``. Values must not be older than before."""
         self._last = None
         self._started_ns = started_ns
 
@@ -94,7 +94,7 @@ class FrameCheck:
         Args:
             frame: The frame.
             missed: Number of frames that the reader missed before it.
-            now_ns: CLOCK_MONOTONIC when the reader had it.
+            now_ns: CLOCK_MONOTONIC when the reader received the frame.
         """
         self.counts.frames += 1
         self.counts.missed += missed
@@ -173,9 +173,9 @@ class FrameCheck:
             self.counts.since_ns = max(self.counts.since_ns, since_ns)
 
     def _injected(self, frame: Frame, given: Truth) -> None:
-        """Check words under injections: the PLC has 0 there.
+        """Check the words over which clients inject, where the PLC itself always has 0.
 
-        Consumers see 0, or a value that an injection had given by then.
+        Consumers must see 0, or a value that a client had recorded before the frame was published.
         """
         places = (SHOWN_AT, DECLARED_AT, CHAINED_AT)
         for raw in (word_at(frame.raw, place) for place in places):

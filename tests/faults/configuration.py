@@ -13,7 +13,10 @@ SIZES: Final = {"fast": 408, "block": 2192, "demo": 408}
 PERIODS_MS: Final = {"fast": 5, "block": 20, "demo": 20}
 STALE_MS: Final = {"fast": 300, "block": 500, "demo": 500}
 NAMES: Final = ("rest", "other")
-"""Names of the array after the first word. Another name is another layout of the same size."""
+"""Names between which reloads switch the array after the first word.
+
+Each name makes another layout of the same size.
+"""
 INJECTED: Final = ("fast", "block")
 """Sources with declared injections."""
 EXTRA: Final = "extra"
@@ -55,7 +58,7 @@ DECLARED: Final = (7 + 5) * 3
 CHAINED: Final = 1 << 32
 """Offset that the chain's declared injection, the outermost, adds."""
 PRIORITY: Final = 10
-"""Priority of that injection, higher than any client's."""
+"""Priority of the chain's declared injection, higher than any client's."""
 _INJECTIONS = """
 [[injection]]
 name = "{name}_times"
@@ -98,7 +101,7 @@ backlog_mb = 1
 
 
 class Configuration:
-    """supervisor.toml and layouts. ``ports``: addresses of devices, by source, and of listeners."""
+    """Writes supervisor.toml and layouts. ``ports``: addresses of devices, by source, and of listeners."""
 
     def __init__(self, folder: Path, instance: str, ports: Mapping[str, Address]) -> None:
         self.file = folder / "supervisor.toml"
@@ -116,7 +119,7 @@ class Configuration:
 
     @property
     def names(self) -> dict[str, str]:
-        """Present name of the array after the first word, by source."""
+        """The present name of the array after the first word, by source."""
         texts = {source: (self._folder / f"{source}.db").read_text() for source in SIZES}
         return {source: next(name for name in NAMES if f" {name} :" in text) for source, text in texts.items()}
 

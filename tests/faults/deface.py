@@ -1,4 +1,4 @@
-"""Makes the next slot of a ring half-written, and detects such a slot, by the documented format."""
+"""Makes the next slot of a ring half-written, and detects such a slot. Uses only the documented format."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def torn(memory: memoryview, source: str) -> bool:
 
 
 def deface(memory: memoryview, source: str, seed: int) -> None:
-    """Leave the next slot as a writer that dies in it: begun, and half filled with random bytes."""
+    """Leave the next slot as a writer that dies while it writes: marked as begun, and half filled with random bytes."""
     slot = next_slot(memory, source)
     struct.pack_into("<Q", memory, slot.offset, 2 * slot.number + 1)
     rubbish = random.Random(seed).randbytes(slot.size // 2)

@@ -60,7 +60,7 @@ token_file = "token"
 
 @dataclass
 class Seen:
-    """Results of a flood. ``open_calls``, ``fresh_calls``: calls tried, and calls answered."""
+    """Results of a flood. ``open_calls`` and ``fresh_calls`` are pairs: calls tried, and calls answered."""
 
     flooded: int = 0
     lost: int = 0
@@ -74,7 +74,7 @@ class Seen:
 
     @property
     def faults(self) -> list[str]:
-        """Broken promises."""
+        """The promises that the endpoint broke, as text."""
         promises = {
             "the endpoint was restarted": not self.restarted,
             "the kept injection is gone": self.injected,
@@ -170,7 +170,9 @@ def main() -> int:
     """Start a cell and flood it; return 1 if a promise was broken."""
     parser = argparse.ArgumentParser(description="flood a cell with calls to unknown methods")
     parser.add_argument("--for", dest="for_s", type=float, default=60.0, metavar="SECONDS")
-    parser.add_argument("--window", type=int, default=WINDOW, metavar="CALLS", help="most open calls of a connection")
+    parser.add_argument(
+        "--window", type=int, default=WINDOW, metavar="CALLS", help="maximum number of open calls of a connection"
+    )
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         plc, plain, secure = (stack.enter_context(reserved_port()) for _ in range(3))

@@ -1,4 +1,4 @@
-"""The invariants of injections: nothing passes one, and it ends with its client."""
+"""The invariants of injections: no value bypasses an injection, and an injection ends with its client."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class GuardCheck:
             value: The value.
             kind: The outcome.
             text: Text of the outcome.
-            stood: Whether an injection covered the word all the time.
-            free: Whether no injection can have covered the word.
+            stood: Whether an injection covered the word during the whole write.
+            free: Whether it is certain that no injection covered the word during the write.
         """
         self._known[value] = kind
         self.counts.values += 1
@@ -76,12 +76,12 @@ class LifeCheck:
     _told: bool = False
 
     def look(self, now_ns: int, *, stands: bool, awake_since_ns: int, slack_ns: int, renewed: bool = False) -> None:
-        """Check whether the injection may or must still be there.
+        """Check whether the injection may or must still exist.
 
         Args:
             now_ns: CLOCK_MONOTONIC.
-            stands: Whether it is there.
-            awake_since_ns: Since when all processes that must lift it run without a pause.
+            stands: Whether the injection exists.
+            awake_since_ns: CLOCK_MONOTONIC since which all processes that must lift it run without a pause.
             slack_ns: Additional time on a loaded machine.
             renewed: Whether the block was replaced or the instance ended; both end kept injections.
         """
@@ -132,7 +132,7 @@ class ChainCheck:
             shown: The value of the word.
             publish_ns: CLOCK_MONOTONIC when the frame was published.
             now_ns: CLOCK_MONOTONIC.
-            standing: The injections when the frame was read; None: they changed meanwhile.
+            standing: The injections when the frame was read; None if they changed during the read.
         """
         if standing is None or standing != self._standing:
             self._standing, self._since_ns, self._relayed = standing, now_ns, False
@@ -159,7 +159,7 @@ class ChainCheck:
             laid: The injections whose clients are alive.
             standing: The injections that exist.
             now_ns: CLOCK_MONOTONIC.
-            undisturbed_ns: Since when no fault hit the processes that keep them.
+            undisturbed_ns: CLOCK_MONOTONIC since which no fault has hit the processes that keep the injections.
         """
         self._missed_ns = {part: at_ns for part, at_ns in self._missed_ns.items() if part in laid - standing}
         for part in laid - standing:

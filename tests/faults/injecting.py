@@ -1,4 +1,4 @@
-"""Runs injecting clients one after the other, and checks their injections during and after that."""
+"""Runs injecting clients one after the other, and checks their injections while they run and after they end."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ class Injecting:
             self._after(target, order, ended_ns, section)
 
     def _after(self, target: Target, order: Order, ended_ns: int, section: int) -> None:
-        """Check that the injection ends or is kept, lift it, and check that readers see the PLC."""
+        """Check that the injection ends or is kept. Lift it, and check that readers see the PLC's value."""
         life = LifeCheck(
             f"{order.name} of {order.word}/{order.direction}", order.keep, ended_ns, self._checker.complain
         )

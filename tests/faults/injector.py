@@ -30,8 +30,8 @@ WAYS = ("local", "v1", "shmio")
 class Order:
     """The order to a client.
 
-    Over ``/out`` it gives values from ``first`` on, each ``step`` above the last. With ``relay`` it
-    gives instead the value that it receives from injections further in, plus 1.
+    Over ``/out``, the client injects ``first``, ``first + step`` and so on. With ``relay``, it injects instead the
+    value that it receives from injections of lower priority, plus 1.
     """
 
     instance: str
@@ -43,7 +43,7 @@ class Order:
     name: str
     first: int
     given: str
-    """Path of the truth file for the values that it is about to give."""
+    """Path of the truth file in which the client records each value before it injects it."""
     register: str
     """Name of the word under the injection."""
     step: int = 1
@@ -61,7 +61,7 @@ class Order:
 
 
 class Client:
-    """The common part of all ways: values, which are recorded before they are given."""
+    """What clients share, whichever way they inject: they record each value before they inject it."""
 
     def __init__(self, order: Order) -> None:
         self.order = order
@@ -70,7 +70,7 @@ class Client:
         self.when_told(self.stopping.set, sys.stdin.read)
 
     def when_told(self, act: Callable[[], object], told: Callable[[], object] | None = None) -> None:
-        """Call ``act`` in a thread when the client is to end, or when ``told`` returns."""
+        """Call ``act`` in a thread when ``told`` returns; without ``told``, when the client is to end."""
 
         def wait() -> None:
             (told or self.stopping.wait)()
@@ -79,7 +79,7 @@ class Client:
         threading.Thread(target=wait, daemon=True).start()
 
     def stands(self) -> None:
-        """Print that the injection is laid."""
+        """Print the line that says that the injection is laid."""
         print("stands", flush=True)
 
     def numbers(self) -> Iterator[int]:

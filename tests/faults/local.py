@@ -36,7 +36,7 @@ def started_ns(attachment: Attachment) -> int:
 
 
 def follow(checker: Checker, source: Source, *, slow: bool) -> None:
-    """Read every frame once; with ``slow``, those that are left in the ring."""
+    """Read every frame once. With ``slow``, sleep in between, and read only the frames that the ring still has."""
     check = FrameCheck(source, checker.complain, checker.counts(f"{'slow' if slow else 'stream'} {source.name}"))
 
     def work(attachment: Attachment) -> None:

@@ -1,4 +1,4 @@
-"""MQTT subscribers of all sources at the instance's broker, connected again when they lose it."""
+"""MQTT subscribers of all sources at the instance's broker. They connect again when they lose the broker."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KEEPALIVE_S = 5
 
 
 def late(message: MQTTMessage) -> bool:
-    """Return whether the bridge kept a message for an absent broker. Only these have a time."""
+    """Return whether the bridge kept a message while the broker was absent. Only such messages carry a time."""
     given: list[tuple[str, str]] = getattr(message.properties, "UserProperty", [])
     return any(name == "source_time" for name, _ in given)
 

@@ -14,9 +14,9 @@ from tests.faults.checks import Counts
 
 MODULES: Final = ("local", "remote", "mqtt", "churn", "writing", "injecting", "chaining", "recorded")
 LATE: Final = ("slow", "recorded", "injected")
-"""Name prefixes of the counters of checkers that see values late, or one source after the other."""
+"""Name prefixes of checkers that see values late, or check one source after the other."""
 END_S: Final = 200.0
-"""Maximum time for a checker to end: that of the recordings first reads the remaining files."""
+"""Maximum s for a checker to end. The checker of the recordings first reads the remaining files."""
 
 
 class Panel:

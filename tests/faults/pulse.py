@@ -15,7 +15,7 @@ LEAST_NS: Final = 20_000_000
 
 
 class Pulse:
-    """Measures the load for its process. One thread calls :meth:`beat`; others may read."""
+    """Measures the load of the machine as this process feels it. One thread calls :meth:`beat`; others may read."""
 
     def __init__(self) -> None:
         self._held_up_ns: deque[int] = deque([0], maxlen=REMEMBERED)

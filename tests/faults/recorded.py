@@ -1,6 +1,6 @@
-"""Checks the recordings: compares every file that has ended, even by a kill, with the truth.
+"""Checks the recordings: compares every file with the truth once its recorder has closed it or was killed.
 
-Checked files are removed, except the newest, which a new recorder reads to continue.
+Checked files are removed, except the newest, from which a new recorder continues.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class BlockCheck:
         self._frames = FrameCheck(self.source, self.complain, self.counts)
 
     def begin(self, epoch: str, started_ns: int, away_ns: int) -> None:
-        """Begin a file. ``away_ns``: maximum time before it in which nothing was recorded."""
+        """Begin a file. ``away_ns``: maximum time in ns, before the file, in which nothing was recorded."""
         self._away_ns = away_ns
         self._epoch, self._started_ns = epoch, started_ns
 

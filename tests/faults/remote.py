@@ -19,7 +19,7 @@ BREAKS = {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED, grpc.StatusCod
 CALL_S = 20.0
 """Maximum duration of a stream, so that a frozen server does not block its client for ever."""
 UNDER_WAY_NS = 3_000_000_000
-"""Additional delay of values.
+"""Additional ns that a value may be late.
 
 A paused endpoint delivers old messages when it continues, and messages of v1 have no quality.
 """

@@ -22,7 +22,7 @@ WORDS: Final = ("stamp", "command", "remote", "shown", "guarded", "declared", "c
 
 
 def retained(address: Address, prefix: str) -> dict[str, bytes]:
-    """Return the retained messages by topic, without the prefix; none without a broker."""
+    """Return the retained messages by topic, without the prefix. The result is empty without a broker."""
     found: dict[str, bytes] = {}
     client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5, reconnect_on_failure=False)
     quiet = False
@@ -54,7 +54,10 @@ def retained(address: Address, prefix: str) -> dict[str, bytes]:
 def wrong(
     found: Mapping[str, bytes], sources: Sequence[Source], names: Mapping[str, str], slowness: float
 ) -> list[str]:
-    """Return what is wrong. ``names``: present name of each source's array after the first word."""
+    """Describe what is wrong with the retained messages.
+
+    ``names``: present name of each source's array after the first word.
+    """
     return list(_wrong(found, sources, names, round((SLACK_NS + UNDER_WAY_NS) * slowness)))
 
 

@@ -33,11 +33,11 @@ OTHERS: Final = ("plc", "grpc", "mqtt")
 MARK: Final = "SHMIO_FAULTS"
 """Environment variable that identifies every process of a run."""
 TOLERANCE_MS: Final = 100
-"""Time that a loaded machine and the network may add to an age."""
+"""Time in ms that a loaded machine and the network may add to the age of a value."""
 
 
 class Device:
-    """An emulated PLC in a separate process behind a proxy. ``truth``: what its block had."""
+    """An emulated PLC in a separate process behind a proxy. ``truth`` records what its block had."""
 
     def __init__(self, name: str, folder: Path, address: Address, environment: dict[str, str]) -> None:
         self._file = folder / f"{name}.truth"

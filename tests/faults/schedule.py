@@ -40,7 +40,7 @@ RENEWING: Final = {"relayout"}
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault. It begins ``after_s`` after its round. Faults with a duration last ``for_s``."""
+    """A fault. It begins ``after_s`` after its round begins. Faults with a duration last ``for_s``."""
 
     kind: str
     target: str
@@ -63,7 +63,10 @@ class Round:
 
 
 def rounds(seed: int) -> Iterator[Round]:
-    """Yield a seed's rounds, endlessly. A round's targets differ; the supervisor is hit alone."""
+    """Yield a seed's rounds, endlessly.
+
+    The faults of a round have different targets. A fault of the supervisor is the only one in its round.
+    """
     chance = random.Random(seed)
     kinds, weights = list(WEIGHTS), list(WEIGHTS.values())
     while True:

@@ -39,7 +39,7 @@ class Follow(Model):
 PARTICIPANTS: Final = ("lead", "follow", "panel")
 DISPATCHERS: Final = ("grpc", "recorder")
 NAMED: Final = re.compile(rf"\b({'|'.join(PARTICIPANTS + DISPATCHERS)})\b|another program \(pid \d+\)")
-"""Causes that a failed step may name: a process that did not complete it, or the owner of time."""
+"""Causes that a failed step may name: a process that did not complete the step, or the owner of time."""
 
 
 class Answer(NamedTuple):

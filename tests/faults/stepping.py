@@ -1,4 +1,4 @@
-"""The second run: faults of an instance with stepped time, and of the program that steps it."""
+"""The second run: faults of an instance with stepped time, and of the program that steps the instance."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Moving:
         self.done: defaultdict[str, set[int]] = defaultdict(set)
         """Numbers of the steps that were done, by the instance's epoch."""
         self.failed: defaultdict[str, set[int]] = defaultdict(set)
-        """Numbers of the steps that failed, by epoch; 0 for a call that left no step undone."""
+        """Numbers of the steps that failed, by epoch; 0 for a failed call that left no step incomplete."""
         self._start()
 
     def _start(self) -> None:
@@ -99,7 +99,7 @@ class Moving:
         return self._popen.pid
 
     def replace(self) -> None:
-        """Kill the program, and start a successor that steps the other way."""
+        """Kill the program, and start a successor that steps the other way: attached, or through the endpoint."""
         self._popen.kill()
         self._end()
         self._start()
@@ -211,9 +211,9 @@ class Stepping(Run):
         return False
 
     def _contend(self, moving: Moving) -> None:
-        """Check that a second program is refused, and is told the owner of time.
+        """Check that a second program is refused, and that the message names the owner of time.
 
-        Only if the first one is attached: the endpoint releases time when its clients pause.
+        It checks only while the first program is attached: the endpoint releases time when its clients pause.
         """
         if moving.way != "local":
             return

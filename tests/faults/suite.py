@@ -29,7 +29,7 @@ LOOK_S: Final = 0.02
 SEEN_S: Final = 90.0
 """Maximum time after the last fault for the checkers to see enough."""
 MOST_CHANGES: Final = 30
-"""Number of blocks changed by reloads after which the instance is restarted; it has room for 40."""
+"""Number of blocks changed by reloads after which the instance is restarted. Its memory has room for 40."""
 HISTORY: Final = 20
 MOST_VIOLATIONS: Final = 10
 """Maximum number of violations that are kept; further ones are only counted."""

@@ -32,7 +32,7 @@ SIZE = 72
 PERIOD_NS, STALE_NS, TOLERANCE_NS = 20 * MS, 500 * MS, 50 * MS
 STARTED_NS = 1_000 * MS
 FIRST = 50
-"""The PLC has generation g from g times 10 ms on; the last generation is 2 * FIRST - 1."""
+"""Number of a generation. Generation g begins at g times 10 ms; the last one is 2 * FIRST - 1."""
 
 
 @pytest.fixture
@@ -225,7 +225,7 @@ def test_who_does_not_need_the_broker_goes_on(found: list[str]) -> None:
 
 
 def test_good_beyond_its_age_is_found(check: FrameCheck, found: list[str]) -> None:
-    """The frame is recent, but its value is too old, because the answer was delayed."""
+    """The frame is recent, but the value in it is too old, because the PLC's answer was delayed."""
     one = frame(10, FIRST)
     feed(check, (one, 0))
     assert found == []

@@ -32,7 +32,7 @@ def check(data: bytes) -> None:
 
 
 def check_sources(data: bytes) -> None:
-    """Sources give a consistent layout, or an error with a position."""
+    """Check that sources give a consistent layout, or an error with a position."""
     sources = [Source(f"{index}.db", part) for index, part in enumerate(data.split(SPLIT, 3))]
     compiled = _outcome(sources)
     if isinstance(compiled, LayoutError):
@@ -54,7 +54,7 @@ def _outcome(sources: list[Source]) -> Compiled | LayoutError:
 
 
 def check_document(data: bytes) -> None:
-    """The JSON of a layout is accepted or refused; an accepted layout works."""
+    """Check that the JSON of a layout is refused, or gives a layout that works."""
     try:
         layout = load_layout(data)
     except LayoutError:
@@ -65,7 +65,7 @@ def check_document(data: bytes) -> None:
 
 
 def check_values(data: bytes) -> None:
-    """Decode raw bytes and parse user text as a scalar and as an array; byte 0 chooses the type."""
+    """Decode raw bytes, and parse user text, as a scalar and as an array. Byte 0 chooses the type."""
     layout = _every_type()
     which, body = (data[0] if data else 0), data[1:] or b"\0"
     frame = (body * (layout.size // len(body) + 1))[: layout.size]

@@ -118,7 +118,7 @@ def seeds() -> list[bytes]:
 
 
 class Mutator:
-    """Yields inputs, equal for equal seeds: some valid, some nearly valid, some garbage."""
+    """Yields inputs: some valid, some nearly valid, some garbage. Equal seeds give equal inputs."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
@@ -146,7 +146,7 @@ class Mutator:
         return b"\3" + bytes([rng.randrange(256)]) + (text.encode() if rng.random() < 0.5 else rng.randbytes(64))
 
     def _declarations(self) -> bytes:
-        """A data block, or a function block with an instance, valid but for random errors."""
+        """Return a data block, or a function block with an instance, which is valid except for random errors."""
         rng = self._random
 
         def members(name: str) -> str:
@@ -170,7 +170,7 @@ class Mutator:
         return f'\0{KNOWN}FUNCTION_BLOCK "f" {sections} END_FUNCTION_BLOCK DATA_BLOCK "b" "f" {begin}'.encode()
 
     def _nested(self) -> bytes:
-        """Types that each use the next one several times, up to the depth limit."""
+        """Return types that each use the next one several times, up to the depth limit."""
         rng = self._random
         count = rng.randrange(1, 34)
         text = ""
@@ -191,7 +191,7 @@ class Mutator:
         return f'\0{text}DATA_BLOCK "b" STRUCT a : "t{first}"{given}; END_STRUCT; BEGIN END_DATA_BLOCK'.encode()
 
     def _blocks(self) -> bytes:
-        """Many blocks of one large type."""
+        """Return many blocks of one large type."""
         rng = self._random
         count, length = rng.choice(((1, 2000), (3, 250), (30, 60), (120, 1)))
         text = f'TYPE "t" STRUCT s : Array[1..{length}] of Struct a : Byte; b : "e"; END_STRUCT; END_STRUCT; END_TYPE\n'
@@ -200,7 +200,7 @@ class Mutator:
         return b"\0" + text.encode()
 
     def _fragments(self) -> bytes:
-        """Fragments in random order, in a frame that often makes them valid."""
+        """Return fragments of source text in random order, in a frame that often makes them valid."""
         rng = self._random
         words = " ".join(rng.choices(FRAGMENTS, k=rng.randrange(1, 40)))
         shape = rng.choice(SHAPES)

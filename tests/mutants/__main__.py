@@ -1,8 +1,8 @@
 """Breaks lines of the core at random, one at a time, and reports the faults that no test notices.
 
-It works on a copy of the project. One process collects the tests there and forks for each fault, so
-that modules need not be imported again. Faults in C, and in code that runs while a module is
-imported, need a new process each. A fault counts as caught only if a test fails twice with it.
+It works on a copy of the project. One process collects the tests there and forks for each fault, because importing
+the modules for each fault would take too long. Faults in C, and in code that runs while a module is imported, need a
+new process each. A fault counts as caught only if a test fails twice with it.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _in_a_copy(group: str, options: argparse.Namespace) -> int:
 
 
 def _drawn(root: Path, group: str, options: argparse.Namespace) -> list[Mutant]:
-    """Return a random fault of each line, in random order; with ``--only``, all of those lines."""
+    """Return a random fault of each line, in random order. With ``--only``, return all faults of those lines."""
     lines: dict[tuple[Path, int], list[Mutant]] = defaultdict(list)
     for path in expand(root, GROUPS[group].sources):
         for mutant in mutants(root, path.relative_to(root)):

@@ -1,4 +1,4 @@
-"""Changes functions of a running program to those of a changed source, without a new import."""
+"""Replaces functions of a running program by those of a changed source file, without a new import."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from types import CodeType, FunctionType
 
 @dataclass(frozen=True)
 class Change:
-    """The one outermost function that differs between two sources."""
+    """The one outermost function in which two versions of a source file differ."""
 
     old: CodeType
     new: CodeType
@@ -25,7 +25,7 @@ class Change:
         return range(self.old.co_firstlineno, max(_lines(self.old)) + 1)
 
     def apply(self, path: Path) -> bool:
-        """Replace the function's code wherever it is used; return False if it is not found."""
+        """Replace the function's code wherever it is used. Return False if the function is not found."""
         gc.unfreeze()
         done = False
         for function in gc.get_objects():
@@ -36,7 +36,7 @@ class Change:
 
 
 def change(old: str, new: str, path: Path) -> Change | None:
-    """Return the function that differs; None if the difference is not in one function."""
+    """Return the function in which two sources differ. Return None if they differ elsewhere or in several functions."""
     olds, news = _functions(compile(old, path, "exec")), _functions(compile(new, path, "exec"))
     pairs = [(before, after) for before, after in zip(olds, news, strict=False) if before != after]
     if len(pairs) != 1 or pairs[0][0].co_freevars != pairs[0][1].co_freevars:
@@ -45,7 +45,7 @@ def change(old: str, new: str, path: Path) -> Change | None:
 
 
 def watch(sources: Iterable[Path]) -> set[tuple[str, int]]:
-    """Record calls: each outermost function adds its file and first line to the returned set."""
+    """Record calls: each outermost function that runs adds its file and first line to the returned set."""
     called: set[tuple[str, int]] = set()
     vars(builtins)["_mutants_called"] = called.add
     watched: dict[tuple[str, str, int], CodeType] = {}

@@ -41,7 +41,7 @@ class Known:
     passed: bool = True
     starts_processes: bool = False
     calls: set[tuple[str, int]] = field(default_factory=set)
-    """File and first line of each function of the core that it called."""
+    """File and first line of each function of the core that the test called."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Judge:
         self._known: dict[str, Known] = {}
 
     def learn(self, items: Sequence[pytest.Item], sources: Iterable[Path]) -> list[str]:
-        """Run all tests once without a fault; return those that fail, which are left out."""
+        """Run all tests once without a fault. Return those that fail, which are then left out."""
         self._items = {item.nodeid: item for item in items}
         files = [self._tree / source for source in sources if source.suffix == ".py"]
         log = self._forked(list(self._items), lambda: None, 3600.0, files)
@@ -146,7 +146,7 @@ class Judge:
 
     @staticmethod
     def _first_failure(log: Iterable[str]) -> str:
-        """Return the first test that failed or did not end; empty: all passed."""
+        """Return the first test that failed or did not end. An empty result means that all passed."""
         begun = ""
         for line in log:
             kind, _, name = line.partition(" ")
@@ -290,11 +290,11 @@ class _Told:
         self._write(f"begin {name}\n")
 
     def audit(self, event: str, _arguments: object) -> None:
-        """Note an audit event of the interpreter: whether the test starts a process."""
+        """Handle an audit event of the interpreter: note whether the test starts a process."""
         self._starts |= event in STARTS
 
     def flush(self) -> None:
-        """Log what is known at the end of a test."""
+        """Write what is known to the log at the end of a test."""
         if self._starts:
             self._starts = False
             self._write("starts\n")

@@ -34,7 +34,7 @@ _ARITHMETIC: Final[dict[type[ast.operator], type[ast.operator]]] = {
     ast.RShift: ast.LShift,
 }
 _UNTOUCHED: Final = {"log", "logging", "warnings"}
-"""Calls on these names only log or warn, so they are not changed."""
+"""Names of objects whose methods only log or warn. Calls on them are not changed."""
 
 _C_SWAPS: Final = (
     (r"<=", "<"),
@@ -126,7 +126,7 @@ def _faults(tree: ast.Module) -> Iterator[tuple[ast.expr | ast.stmt, ast.expr | 
 
 
 def _parts(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the parts of a node that may be changed: no annotations, decorators or messages."""
+    """Yield the parts of a node that may be changed. Annotations, decorators and messages may not."""
     skipped: list[ast.AST | None] = []
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
         skipped += [node.returns, *node.decorator_list]

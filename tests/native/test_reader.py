@@ -99,7 +99,7 @@ def image(values: Mapping[str, object] = VALUES) -> bytes:
 
 
 class Running:
-    """A running reader that has attached."""
+    """A running reader, which has attached to an instance."""
 
     def __init__(self, program: Path, writer: BlockWriter, instance: str, path: str, *arguments: str) -> None:
         command = [str(program), instance, path, *arguments]
@@ -267,7 +267,7 @@ def test_an_unfinished_segment_is_an_error(reader: Path, instance: str) -> None:
 
 
 def places(whole: bytes) -> list[int]:
-    """Return the offsets of the words that lead a reader: header, section table, ring headers."""
+    """Return the offsets of the words that tell a reader where to read: header, section table, ring headers."""
     (table,) = struct.unpack_from("<Q", whole, 56)
     (count,) = struct.unpack_from("<I", whole, 52)
     found = [0, *range(8, 90, 4)]
@@ -280,7 +280,7 @@ def places(whole: bytes) -> list[int]:
 
 
 def test_hostile_bytes_never_crash_it(reader: Path, instance: str) -> None:
-    """Random words in the header, section table and ring headers never crash the reader."""
+    """The test writes random words into the header, section table and ring headers."""
     with segment(instance, ring_bytes=1 << 12) as made:
         writer = made.writer("device")
         for cycle in range(20):
@@ -334,7 +334,7 @@ def test_hostile_bytes_never_crash_it(reader: Path, instance: str) -> None:
 
 
 def test_hostile_rings_never_crash_it(reader: Path, instance: str) -> None:
-    """Corrupt slots of the ring (sequence, sizes, texts) at random while the C reader follows: it does not crash."""
+    """The test corrupts slots of the ring (sequence, sizes, texts) at random while the reader follows."""
     chance = random.Random(2)
     with segment(instance, ring_bytes=1 << 12) as made:
         writer = made.writer("device")

@@ -1,4 +1,4 @@
-"""Stress tests of the C core under sanitizers, and exhaustive models of it."""
+"""Stress tests of the C core under sanitizers, and models that run through all its interleavings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_sanitizers_find_nothing(name: str, sanitizers: str, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", ["relay_model", "ring_orders"])
 def test_the_models_find_no_error(name: str, tmp_path: Path) -> None:
-    """No interleaving loses a ring or keeps a stopped relay running; memory orders suffice."""
+    """No interleaving loses a wake-up or keeps a stopped relay running, and the memory orders suffice."""
     source, program = Path(__file__).with_name(f"{name}.c"), tmp_path / name
     command = [COMPILER, "-std=gnu11", "-D_GNU_SOURCE", "-O1", "-Wall", "-Wextra", "-Werror", str(source)]
     subprocess.run([*command, "-o", str(program)], check=True, capture_output=True, text=True)

@@ -14,4 +14,4 @@ writable = ["Outputs"]
 host = "127.0.0.1"
 port = {plc.port}
 """
-"""Another source for the same controller."""
+"""Configuration of another source of the same controller, without injections toward the controller."""

@@ -90,7 +90,7 @@ Streams = dict[str, list[bytes]]
 
 
 class Campaign:
-    """The clients of one campaign, with a running instance that has not been stepped yet."""
+    """The clients of one campaign. They start with a running instance that has not been stepped yet."""
 
     def __init__(self, instance: str, channel: grpc.aio.Channel, slow: grpc.aio.Channel, pause_s: float) -> None:
         self._instance = instance

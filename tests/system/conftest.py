@@ -51,7 +51,7 @@ def make_shared_cell(tmp_path_factory: pytest.TempPathFactory, shared_instance: 
 
 @pytest.fixture
 def cell(make_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell, running."""
+    """Start the A50 cell."""
     cell = make_cell()
     cell.up()
     return cell

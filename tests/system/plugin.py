@@ -13,7 +13,7 @@ PATIENCE_S = 110.0
 
 
 class Environment:
-    """A virtual environment with one more package than that of the tests, which it can import, too."""
+    """A virtual environment that has one package more than the environment of the tests, and can import theirs."""
 
     def __init__(self, folder: Path, package: Path) -> None:
         """Make the environment in a folder, and install a copy of the package."""

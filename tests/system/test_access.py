@@ -41,7 +41,7 @@ def guarded(make_cell: Callable[..., Cell]) -> Cell:
 
 
 def subscribe(cell: Cell, address: str, *options: str) -> subprocess.CompletedProcess[str]:
-    """Run the example as its user does."""
+    """Run examples/subscribe.py as its user does."""
     command = [sys.executable, str(ROOT / "examples/subscribe.py"), "--count", "2", *options, address, TOPIC]
     return subprocess.run(command, cwd=cell.folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
@@ -90,7 +90,7 @@ def test_a_reload_adds_and_removes_tokens(guarded: Cell) -> None:
 
 
 def test_failed_handshakes_log_nothing(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
-    """By default, gRPC prints a line for each of them."""
+    """By default, gRPC prints a line for each failed handshake."""
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     words = [
         "openssl",

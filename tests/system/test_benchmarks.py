@@ -81,7 +81,7 @@ def printed(benchmark: str) -> str:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_each_table_lists_all_contenders(benchmark: str, row: re.Pattern[str], tables: dict[str, int]) -> None:
-    """Each table has all contenders; shmio's row is first, or part of it, and has no ratio."""
+    """Each table has all contenders. shmio's row has no ratio, because the other rows are compared with it."""
     found = [match.groups("") for match in row.finditer(printed(benchmark))]
     assert all(float(value) > 0 for _, *values, _ in found for value in values)
     assert {name: sum(name == other for other, *_ in found) for name in tables} == tables

@@ -24,7 +24,7 @@ from tests.system.armed import ARMED
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell; each test uses other bytes, from 100 on, which the PLC's program ignores."""
+    """Start the A50 cell. Each test uses other bytes, from 100 on, which the PLC's program ignores."""
     cell = make_shared_cell(config=ARMED.replace('["Outputs"]', '["Outputs[*]"]'))
     cell.up()
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")

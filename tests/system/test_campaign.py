@@ -90,7 +90,7 @@ def start(cell: Cell) -> None:
 
 @contextmanager
 def campaign(cell: Cell, *options: str) -> Iterator[list[str]]:
-    """Run ``shmio inject --file``; yield its first lines, and after the block all its lines."""
+    """Run ``shmio inject --file``. Yield its first lines in a list, which has all its lines after the context ends."""
     command = [str(BIN / "shmio"), "inject", "--file", "campaign.toml", *options]
     with subprocess.Popen(command, cwd=cell.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as popen:
         try:
@@ -110,11 +110,11 @@ def event(events: Cursor[Event], kind: EventKind, name: str = "noise") -> Event:
     while (found := events.next(PATIENCE_S)) is not None:
         if found.kind == kind and found.text == name:
             return found
-    raise AssertionError(f"no event {kind} of {name}")
+    raise AssertionError(f"no event {kind} of {name} has arrived")
 
 
 def noise_of(cell: Cell, local: Attachment, seed: int) -> dict[int, tuple[object, object]]:
-    """Return what consumers see in a run of the campaign, by cycles since its noise began."""
+    """Return what consumers see in a run of the campaign, by number of cycles since its noise began."""
     local.write({"cell/Outputs/98": 0, "cell/Outputs/99": 0, "cell/Outputs/100": 100, "cell/Outputs/101": 100})
     block = local.block("cell")
     frames, events = block.cursor(), block.events.cursor()

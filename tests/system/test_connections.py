@@ -1,4 +1,4 @@
-"""More connections than the endpoint has descriptors for; the limit is lowered at run time."""
+"""More connections than the endpoint has descriptors for. The test lowers the limit of descriptors at run time."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ BURN = "while True: pass"
 
 @pytest.fixture
 def cell(make_cell: Callable[..., Cell]) -> Cell:
-    """Models, noise and a memory, with time at 0; not running."""
+    """Write a cell with models, noise and a memory, with time at 0. It is not running."""
     cell = make_cell(config=CONFIG)
     (cell.folder / "panel.toml").write_text(PANEL)
     (cell.folder / "noisy.py").write_text(NOISY)
@@ -38,7 +38,7 @@ def campaign(
     before: Callable[[Cell], None] = lambda _: None,
     beside: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> Streams:
-    """Start the cell, run the campaign, stop the cell."""
+    """Start the cell, run the campaign, and stop the cell. Return the messages of each stream."""
     cell.up()
     until(lambda: good(cell), "good quality")
     before(cell)

@@ -1,4 +1,4 @@
-"""Every command in the README runs as shown, in a shell of its own, while the demo is running."""
+"""Runs every command in the README as shown, in a separate shell, while the demo is running."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Injections in the A50 cell, by command and by program, until their client ends."""
+"""Injections in the A50 cell, by command and by program, which end with their client."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ POSITION = "cell/Robot_800/Axs1_Pos"
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell, armed; a second source, not armed; and a memory.
+    """Start the A50 cell with injections toward the controller, a second source without them, and a memory.
 
     Each test lifts its injections.
     """

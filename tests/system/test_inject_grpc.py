@@ -38,9 +38,9 @@ PLACE = "cell/Outputs/100"  # the controller's program ignores it
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell, armed; another source, not armed; and a memory with existing clients' joints.
+    """Start the A50 cell with injections toward the controller, a second source without them, and a memory.
 
-    Each test lifts its injections.
+    The memory has the joints that existing clients use. Each test lifts its injections.
     """
     cell = make_shared_cell(config=(ARMED + UNARMED + MEMORY).replace("[grpc]\n", '[grpc]\ndefault_source = "sim"\n'))
     (cell.folder / "joints.toml").write_text(JOINTS)
@@ -57,7 +57,7 @@ def local(cell: Cell) -> Iterator[Attachment]:
 
 @contextmanager
 def client(cell: Cell) -> Iterator[tuple[Any, Any]]:
-    """Both versions, over a connection of their own."""
+    """Yield stubs of both versions, over a separate connection."""
     with grpc.insecure_channel(str(cell.grpc), [("grpc.use_local_subchannel_pool", 1)]) as channel:
         grpc.channel_ready_future(channel).result(PATIENCE_S)
         yield SimlogAPIStub(channel), SimlogV2Stub(channel)  # type: ignore[no-untyped-call]

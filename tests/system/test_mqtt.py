@@ -1,4 +1,4 @@
-"""A cell with its own broker, as MQTT clients and the user of the cell see it."""
+"""A cell with its own broker: what MQTT clients and the user of the cell see."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_accounts_can_do_only_what_their_roles_allow(
 
 
 def connected(broker: Address, client_id: str, **account: str) -> int:
-    """Return the broker's MQTT 3.1.1 return code for a client; 0: accepted."""
+    """Return the return code that the broker sends to an MQTT 3.1.1 client. 0 means accepted."""
     who = b"".join(len(text).to_bytes(2, "big") + text.encode() for text in (client_id, *account.values()))
     flags = 0xC2 if account else 2
     variable = b"\0\x04MQTT\x04" + bytes([flags]) + b"\0\x3c" + who

@@ -1,4 +1,4 @@
-"""A whole instance that reads a device at its own broker, which is killed and comes back, beside another source."""
+"""A whole instance that reads a device at its own broker and another source. The broker is killed and comes back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two configurations with one instance name: the other's file cannot reach the running plant."""
+"""Two configurations with one instance name: commands with the other file cannot reach the running plant."""
 
 from __future__ import annotations
 

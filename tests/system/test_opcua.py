@@ -1,4 +1,4 @@
-"""A cell with an OPC UA endpoint, as node-opcua's client, which shares no code with ours, sees it."""
+"""A cell with an OPC UA endpoint, seen by node-opcua's client, which shares no code with ours."""
 
 from __future__ import annotations
 

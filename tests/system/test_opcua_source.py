@@ -71,7 +71,10 @@ def test_a_server_is_read_written_lost_and_back(make_cell: Callable[..., Cell]) 
 
 
 def test_an_optimized_block_is_for_opc_ua(make_cell: Callable[..., Cell]) -> None:
-    """There is a warning for a source of S7, and none for one that reads it by names; paths are those of the file."""
+    """An optimized block causes a warning for a source of S7, but not for one that reads it by names.
+
+    The paths of the registers are those of the file.
+    """
     config = CONFIG.replace("URL", "opc.tcp://127.0.0.1:4840").replace("press.toml", "data.db")
     cell = make_cell(config=config)
     (cell.folder / "data.db").write_text(OPTIMIZED)

@@ -29,7 +29,7 @@ def test_systemd_verifies_the_unit(tmp_path: Path) -> None:
     [("success", True), ("timeout", True), ("signal", False), ("watchdog", False), ("oom-kill", False)],
 )
 def test_only_a_stop_clears_remaining_processes(result: str, cleared: bool) -> None:
-    """After a crash the processes continue, for the restart to take over."""
+    """After a crash of the supervisor, the processes continue, and the restarted supervisor takes them over."""
     (line,) = [line for line in UNIT.read_text().splitlines() if line.startswith("ExecStopPost=")]
     script = line.partition("-c ")[2].strip("'").replace("%i", "a50").replace(">/dev/null 2>&1", "")
     ran = subprocess.run(
@@ -43,5 +43,5 @@ def test_only_a_stop_clears_remaining_processes(result: str, cleared: bool) -> N
 
 
 def test_out_of_memory_ends_one_process_only() -> None:
-    """By systemd's default it would stop the whole service."""
+    """By systemd's default, a process that runs out of memory would stop the whole service."""
     assert "OOMPolicy=continue" in UNIT.read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Time that an instance's endpoint plays, also when the endpoint's process ends."""
+"""Time that an instance's endpoint plays, also after the endpoint's process has ended."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.timeout(240)
 
 @pytest.fixture
 def cell(make_cell: Callable[..., Cell]) -> Cell:
-    """Models, noise and a memory, with time at 0."""
+    """Start a cell with models, noise and a memory, with time at 0."""
     cell = make_cell(config=CONFIG)
     (cell.folder / "panel.toml").write_text(PANEL)
     (cell.folder / "noisy.py").write_text(NOISY)

@@ -1,4 +1,4 @@
-"""A cell is recorded, killed and inspected by commands only."""
+"""A cell is recorded, killed and inspected, all by commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A drive model computed by a client: as the page shows it, repeated, killed and rejoined."""
+"""A drive model computed by a client: run as the page shows it, run again, killed, and joined again."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def served(cell: Cell, tremble: float = 0.0) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.fixture
 def make_drive(make_cell: Callable[..., Cell], tmp_path: Path) -> Callable[[str], Cell]:
-    """Return a function that makes an instance, not yet running."""
+    """Return a function that writes an instance, which is not running yet."""
     for name, text in (("drive.toml", TABLE), ("line.py", MODEL), ("serve.py", SERVE)):
         (tmp_path / name).write_text(text)
     return lambda drive: make_cell(config=CONFIG.replace("DRIVE", drive))
@@ -200,7 +200,7 @@ def test_a_kill_during_a_step_fails_it_and_the_next_step_works(make_drive: Calla
     cell.up()
 
     def failing(killed: Callable[[], None]) -> str:
-        """Kill a process during a step; return the error of the step."""
+        """Kill a process during a step. Return the message of the failed step."""
         put(cell, "drive/speed", "5000")
         with (
             subprocess.Popen([BIN / "shmio", "step"], cwd=cell.folder, stderr=subprocess.PIPE, text=True) as command,

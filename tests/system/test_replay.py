@@ -1,4 +1,4 @@
-"""A cell is recorded and replayed in its place: clients see no difference but the provenance."""
+"""A cell is recorded, and then replayed in its place. Clients see the same data with another provenance."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ PLACE = "cell/Outputs/100"
 
 
 class Streams:
-    """What clients of all interfaces receive until the instance ends."""
+    """Reads what clients of all interfaces receive, until the instance ends."""
 
     def __init__(self, cell: Cell, broker: Address) -> None:
         self._stack = ExitStack()
@@ -78,7 +78,7 @@ class Streams:
         until(lambda: len(self.native) >= count, f"{count} frames")
 
     def close(self) -> None:
-        """Join the readers; call it after the instance has ended, which ends the streams."""
+        """Wait for the readers. Call it after the instance has ended, which ends the streams."""
         for thread in self._threads:
             thread.join(PATIENCE_S)
             assert not thread.is_alive()
@@ -186,7 +186,7 @@ def test_a_replay_gives_the_same_recording_and_the_same_streams(
 
 
 def same_events(cell: Cell, first: Path, second: Path) -> None:
-    """Assert that the replay has all recorded events in order, and the writes that it refused."""
+    """Assert that the replay has all recorded events in order, and in addition the writes that it refused."""
     with shmio.open_dump(first) as one, shmio.open_dump(second) as other:
         told, again = (
             [

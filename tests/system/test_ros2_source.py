@@ -1,4 +1,4 @@
-"""A whole instance that reads a node of ROS 2, which freezes, dies and comes back, beside another source."""
+"""A whole instance that reads a node of ROS 2 and another source. The node freezes, dies and comes back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A whole instance that reads a rosbridge server, which freezes, dies and comes back, beside another source."""
+"""A whole instance that reads a rosbridge server and another source. The server freezes, dies and comes back."""
 
 from __future__ import annotations
 

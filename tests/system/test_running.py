@@ -13,7 +13,7 @@ from tests.system.test_cell import AXIS, five_values
 
 @pytest.fixture(scope="module")
 def running(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell, for tests that change nothing."""
+    """Start the A50 cell, for tests that change nothing."""
     cell = make_shared_cell()
     cell.up()
     return cell

@@ -109,7 +109,7 @@ def shared_line(make_shared_cell: Callable[..., Cell]) -> Cell:
 
 @pytest.fixture
 def line(shared_line: Cell) -> Cell:
-    """An instance with time stopped at some step; from the next step on, the belt's speed is 1."""
+    """Return an instance whose time is stopped. From the next step on, the belt's speed is 1."""
     with shmio.attach(shared_line.instance, writable=True) as cell:
         cell.write({"belt/speed": 1.0})
         cell.step()

@@ -87,7 +87,7 @@ def test_only_changed_or_frozen_processes_are_replaced(cell: Cell) -> None:
 
 
 def test_take_over_reports_the_current_state(cell: Cell) -> None:
-    """A reload has made the segment larger; the endpoint is no longer in the configuration."""
+    """Before the take-over, a reload has made the segment larger and removed the endpoint from the configuration."""
     file = cell.folder / "supervisor.toml"
     first = cell.status()["segment_bytes"]
     file.write_text(file.read_text().replace("period_ms = 20", "period_ms = 25"))

@@ -27,7 +27,7 @@ def broker() -> Iterator[Address]:
 
 @pytest.fixture
 def folder(tmp_path: Path, instance: str, broker: Address) -> Iterator[Path]:
-    """The examples, with names and a port of this test."""
+    """Copy the examples to a folder, with names and a port of this test."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     for cell in CELLS:
         file = tmp_path / "examples/two-cells" / cell / "supervisor.toml"

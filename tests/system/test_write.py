@@ -27,7 +27,7 @@ PLACE = "cell/Outputs/100"  # the controller's program ignores bytes from here o
 
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell with writable outputs, running and good; each test writes to other places."""
+    """Start the A50 cell with writable outputs, and wait until it is good. Each test writes to other places."""
     cell = make_shared_cell(config=WRITABLE)
     cell.up()
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")

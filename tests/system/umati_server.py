@@ -1,6 +1,6 @@
 """An OPC UA server with the nodes of a machine tool, built from the tables of OPC 40501-1.
 
-Usage: umati_server.py PORT. It writes "ready", and ends when its standard input closes.
+Usage: umati_server.py PORT. It prints "ready", and ends when its standard input closes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ HAS_ADD_IN = 17604
 
 
 async def build(server: Server) -> None:
-    """Add the machine below Objects/Machines."""
+    """Add the machine to the server, below Objects/Machines."""
     device, machinery, tool, own = [await server.register_namespace(uri) for uri in URIS]
 
     async def value(parent: Any, space: int, name: str, kind: ua.VariantType, content: Any) -> None:

@@ -1,4 +1,4 @@
-"""Clients cannot fill the log by causing the same line repeatedly."""
+"""Clients that cause the same line repeatedly cannot fill the log."""
 
 from __future__ import annotations
 

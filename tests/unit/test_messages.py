@@ -1,4 +1,4 @@
-"""Conversion of values and declarations to wire messages and back."""
+"""Conversion of values and declared injections to wire messages and back."""
 
 from __future__ import annotations
 

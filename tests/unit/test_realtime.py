@@ -1,4 +1,4 @@
-"""Real-time priority: taken where allowed, refused with the remedy elsewhere."""
+"""Real-time priority: set where the host allows it, and refused with the remedy elsewhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every child process does, as its supervisor sees it, with a real process and segment."""
+"""What every child process does, seen by its supervisor, with a real process and segment."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 class Started:
-    """A worker process; it is killed at the end of the test."""
+    """A worker process, which is killed at the end of the test."""
 
     def __init__(self, segment: Segment, folder: Path, do: str, **changes: Any) -> None:
         self.log = folder / "cell.log"

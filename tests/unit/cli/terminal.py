@@ -1,4 +1,4 @@
-"""A command on a pseudo-terminal."""
+"""Runs a command on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class Terminal:
         self._data = b""
 
     def until(self, pattern: str) -> str:
-        """Return the output up to the pattern; fail if the pattern never comes."""
+        """Return the output up to the pattern; fail if the command does not print it in time."""
         while not (found := re.search(pattern, text := self._data.decode(errors="ignore"), re.DOTALL)):
             try:
                 self._data += os.read(self._master, 65536)
             except OSError:  # the command has ended
-                raise AssertionError(f"no {pattern!r} in {text!r}") from None
+                raise AssertionError(f"the command did not print {pattern!r}, but {text!r}") from None
         self._data = text[found.end() :].encode()
         return text[: found.end()]
 

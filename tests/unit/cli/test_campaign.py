@@ -60,7 +60,7 @@ def test_faulty_file_injects_nothing(
 
 
 class Still:
-    """An instance whose time is paused, and whose campaigns are over at once."""
+    """An instance whose time is paused, and whose campaigns end at once."""
 
     clock = Clock(ClockMode.VIRTUAL, time_ns=3_000_000_000)
     declared = ()

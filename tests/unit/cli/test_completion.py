@@ -31,7 +31,7 @@ PROMPT = "READY> "
 
 @pytest.fixture(autouse=True)
 def running(instance: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A running instance, and a folder with a recording and another file."""
+    """Create a running instance, and a folder with a recording and another file."""
     monkeypatch.chdir(tmp_path)
     varied(tmp_path / "kept.mem")
     Path("kept.txt").touch()

@@ -41,7 +41,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def said(capsys: pytest.CaptureFixture[str]) -> Output:
-    """Lines on standard output and standard error since the last call."""
+    """Return the lines on standard output and standard error since the last call."""
 
     def lines() -> tuple[list[str], list[str]]:
         captured = capsys.readouterr()
@@ -52,7 +52,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> Output:
 
 @pytest.fixture
 def file(segment: Segment, tmp_path: Path) -> str:
-    """A recording of good and bad frames, a command, a change of layout and a gap."""
+    """Make a recording of good and bad frames, a command, a change of layout and a gap."""
     work = recorder(segment, tmp_path / "dumps")
     cell = segment.writer("cell")
     for value in (7, 7, 8):
@@ -106,7 +106,7 @@ def test_info_on_an_empty_recording(segment: Segment, tmp_path: Path, said: Outp
 
 
 def test_info_folds_equal_lines(segment: Segment, tmp_path: Path, said: Output) -> None:
-    """Each reload gives the source another block with the same contents."""
+    """Each reload gives the source another block with the same contents, so ``info`` prints one line for all."""
     work = recorder(segment, tmp_path / "dumps")
     for turn in range(3):
         publish(segment.writer("cell"), 1, first=turn)
@@ -276,7 +276,7 @@ def test_unclosed_recording_is_read_and_reported(file: str, said: Output) -> Non
 
 @pytest.fixture
 def damaged(segment: Segment, tmp_path: Path, file: str) -> tuple[str, str]:
-    """Recordings of 30 frames of press in three chunks: undamaged, and damaged in the second."""
+    """Make two recordings of 30 frames in three chunks: an undamaged one, and one with damage in the second chunk."""
     work = recorder(segment, tmp_path / "steady", selection=Selection(["press"]), start=StartPositions(first=False))
     for turn in range(3):
         publish(segment.writer("press"), 10, first=10 * turn)
@@ -347,7 +347,7 @@ def test_cat_continues_after_a_damaged_chunk_and_reports_the_loss(damaged: tuple
 
 
 def test_damaged_channel_description_affects_no_other_channel(segment: Segment, tmp_path: Path, said: Output) -> None:
-    """Damaged are all chunks that describe channels, and the first of their copies in the index."""
+    """The damage is in all chunks that describe channels, and in the first copy in the index."""
     work = recorder(segment, tmp_path / "two")
     for turn in range(3):
         for source in ("cell", "press"):

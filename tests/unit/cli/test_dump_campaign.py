@@ -78,7 +78,7 @@ def test_declaration_before_its_start_is_unchanged(derive: Derive) -> None:
 
 
 def test_start_and_end_come_from_the_recorded_events(derive: Derive) -> None:
-    """A period is 20 ms."""
+    """A cycle takes 20 ms."""
     keys = {name: DRIFT[name] for name in ("name", "target", "operation", "value", "seed")}
     [one] = derive((10, declared(5, keys)), (60, lifted(5)))
     assert one == keys | {"start_s": 0.200000001, "end_s": 1.200000001}

@@ -41,7 +41,7 @@ Diff = Callable[..., tuple[int, dict[str, Any]]]
 
 
 def counting(file: str, change: Callable[[Build, int], bool] = lambda _work, _number: False, last: int = 50) -> None:
-    """Record a counter; ``change`` may write a frame itself and then returns True."""
+    """Record a counter. ``change`` may write a frame itself; it then returns True, and no other frame is written."""
     with build(Path(file)) as work:
         work.block("cell")
         for number in range(1, last + 1):

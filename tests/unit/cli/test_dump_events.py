@@ -155,7 +155,7 @@ def test_a_table_of_events(form: str, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_events_have_the_paths_of_their_own_block(capsys: pytest.CaptureFixture[str]) -> None:
-    """A reload gives the source another block with other registers."""
+    """Events before a reload keep their paths, although the source's new block has other registers."""
     with build(Path("a.mem")) as work:
         work.block("cell")
         work.tell(accepted(Write(0, 0, b"\0\5")))

@@ -48,7 +48,7 @@ VALUES: dict[str, Any] = {
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a recording of three frames of many types.
+    """Make a folder with a recording of three frames of many types.
 
     The first frame is good, the second has no image, the third has a NaN and an invalid time of day.
     """
@@ -131,7 +131,7 @@ def test_mcap_for_viewers(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_registers_named_like_other_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each such register has a column, and replaces none of the frame's own columns."""
+    """Each such register has a column, which replaces none of the frame's own columns."""
     names = ("time", "source_time", "number", "cycle", "quality", "provenance", "what", "frame/number")
     layout = Layout("DB2", 2, 16, False, tuple(Register(n, "INT", (), 2 * i, None, 2, 1) for i, n in enumerate(names)))
     with build(tmp_path / "names.mem") as work:
@@ -210,7 +210,7 @@ def test_refused_export_leaves_nothing(
 
 @pytest.mark.parametrize("output", ["new/deep", "there", "new.csv", "new.mcap"])
 def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str) -> None:
-    """The signal comes after some of the frames are written."""
+    """Ctrl-C comes after some of the frames are written."""
     varied(tmp_path / "a.mem")
     Path("there").mkdir()
     before = sorted(tmp_path.rglob("*"))
@@ -290,7 +290,7 @@ def test_as_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_single_file_needs_one_block_with_frames_in_the_time_range(capsys: pytest.CaptureFixture[str]) -> None:
-    """A block with events but no frames in that range does not count."""
+    """A block that has only events in that range does not count."""
     with build(Path("a.mem")) as work:
         work.block("cell")
         work.block("press", section=2)

@@ -27,7 +27,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, set[bytes]]:
-    """A recording, and the images in it."""
+    """Make a recording. Return its bytes, and the images in it."""
     file = varied(tmp_path_factory.mktemp("original") / "a.mem")
     with shmio.open_dump(file) as dump:
         images = {image for e in dump.items() if isinstance(e.item, Frame) for image in (e.item.raw, e.item.image)}

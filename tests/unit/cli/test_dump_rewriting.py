@@ -37,7 +37,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def contents(*files: Path) -> list[tuple[int, str, object]]:
-    """Return everything in recorded order; gaps without their block's number, which differs by file."""
+    """Return everything in recorded order. Gaps lack their block's number, which differs between files."""
     with shmio.open_dump(files) as dump:
         return [
             (
@@ -250,7 +250,7 @@ NEW = [("cut", "new.mem"), ("merge", "new.mem"), ("recover", "new.mem"), ("expor
 
 
 def options(verb: str, output: str) -> list[str]:
-    """Return the further options that ``export`` needs to make one file."""
+    """Return the additional options by which ``export`` writes one file."""
     return ["--format", "mcap" if output == "new.mcap" else "csv", "--source", "cell"] if verb == "export" else []
 
 
@@ -271,7 +271,7 @@ def test_full_disk_is_reported_and_leaves_no_file(
 
 @contextmanager
 def signal_handler(sign: signal.Signals, handler: Any) -> Iterator[None]:
-    """Handle a signal by another handler within the context."""
+    """Replace the handler of a signal until the context ends."""
     before = signal.signal(sign, handler)
     try:
         yield
@@ -310,7 +310,7 @@ def test_signal_leaves_no_file(
 
 
 def test_ignored_hang_up_does_not_end_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """nohup ignores SIGHUP."""
+    """nohup makes a command ignore SIGHUP."""
     file = varied(tmp_path / "a.mem")
     monkeypatch.setattr(Progress, "at", lambda *_: signal.raise_signal(signal.SIGHUP))
     with signal_handler(signal.SIGHUP, signal.SIG_IGN):

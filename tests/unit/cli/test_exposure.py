@@ -1,4 +1,4 @@
-"""Tests of the line in which ``up`` says what other users of this host may do to the instance."""
+"""The line in which ``up`` says what other users of this host may do to the instance."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ Test = Callable[[Output, Output, Plant], None]
 
 
 def both(segment: Segment, capsys: pytest.CaptureFixture[str], test: Test) -> None:
-    """Run a test with two functions that call a verb: by ``--host`` and locally."""
+    """Run a test with two functions that call a command: with ``--host`` and locally."""
 
     async def run(served: Endpoint, device: Plant) -> None:
         def verb(*words: str) -> tuple[int, str, str]:
@@ -143,7 +143,7 @@ def without_signals(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def lines(out: str) -> list[tuple[str, ...]]:
-    """Return the words of each line without what differs from run to run."""
+    """Return the words of each line, without those that differ from run to run."""
     return [tuple(re.sub(r"^.*?(?=\w+: )", "", line).split()) for line in out.splitlines()]
 
 

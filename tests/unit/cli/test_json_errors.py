@@ -40,7 +40,10 @@ FAILING: dict[Main, dict[str, list[str]]] = {
         "logs": NOT_THERE,
     },
 }
-"""Arguments with which each verb that has ``--json`` fails; ``list`` of instances never fails."""
+"""Arguments with which each verb that has ``--json`` fails.
+
+Here ``list`` has an instance: without one it lists the instances, which never fails.
+"""
 
 
 def verbs_with_json(parser: argparse.ArgumentParser) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""``--mode replay``: how it changes the configuration."""
+"""How ``--mode replay`` changes the configuration."""
 
 from __future__ import annotations
 

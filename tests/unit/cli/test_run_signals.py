@@ -1,4 +1,4 @@
-"""Signals that stop commands without an end of their own."""
+"""Signals that stop commands which would otherwise run for ever."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ Edit = Callable[[str, str], None]
 
 
 def unplaced(text: str) -> str:
-    """Return messages without their line numbers."""
+    """Remove the line numbers from messages."""
     return re.sub(r"^(\w+\.toml):[0-9]+: ", r"\1: ", text, flags=re.MULTILINE)
 
 
@@ -48,7 +48,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def example(capsys: pytest.CaptureFixture[str]) -> Edit:
-    """Writes the A50 example to this folder; a call replaces one text in it by another."""
+    """Write the A50 example to this folder. A call of the result replaces one text in it by another."""
     assert main(["init"]) == 0
     capsys.readouterr()
     file = Path("supervisor.toml")
@@ -168,7 +168,7 @@ def test_block_with_types_in_other_files(order: list[str], capsys: pytest.Captur
 
 
 def test_a_block_without_a_number_in_its_name(capsys: pytest.CaptureFixture[str]) -> None:
-    """TIA Portal's default: the source has the name of the block, but not its number."""
+    """By default, TIA Portal exports a source that has the name of the block but not its number."""
     Path("cell.db").write_text(block('"Cell"', "Int"))
     Path("plc.ini").write_text("host=10.76.0.12\ndbNumber=7\n")
     assert main(["init", "cell.db", "-c", "bare.toml"]) == 0
@@ -222,7 +222,7 @@ def test_emulated_block_without_a_number_needs_dbnumber(example: Edit, capsys: p
 
 
 def test_an_idle_emulator_plays_all_blocks_of_its_files(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
-    """So several sources can read one emulator, each its own block."""
+    """Several sources can then read one emulator, each its own block."""
     Path("two.db").write_text(block("DB7", "Int") + Path("db201.db").read_text())
     example('layout = "db201.db"\nprogram = "a50"', 'layout = "two.db"')
     assert main(["check"]) == 0
@@ -253,7 +253,7 @@ def test_an_idle_emulator_needs_a_number_for_each_block(example: Edit, capsys: p
 
 
 def test_init_proposes_an_unused_name(instance: str) -> None:
-    """No running instance has the name, and no configuration in this or a neighbouring folder."""
+    """No running instance has the name, and no configuration in this folder or its neighbours has it."""
     file = Path("plants/new/supervisor.toml")
     for folder in (file.parent, Path("plants/old")):
         folder.mkdir(parents=True)
@@ -873,7 +873,7 @@ def test_status_of_a_stopped_instance_as_json(instance: str, capsys: pytest.Capt
 
 
 def documented(page: str, heading: str) -> list[str]:
-    """Return the names in the first column of the table below a line of the reference page."""
+    """Return the names in the first column of the table that follows a line of the reference page."""
     table = page.partition(f"\n{heading}\n\n")[2].partition("\n\n")[0]
     return [name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split(" | ")[0])]
 

@@ -174,7 +174,7 @@ def test_emulated_block_without_a_number_is_read(cell: Cell) -> None:
 
 
 def moved(text: str) -> str:
-    """Return the configuration with emulator and broker on other ports."""
+    """Replace the ports of emulator and broker in the configuration."""
     return re.sub(r'listen = "127\.0\.0\.1:\d+"', lambda _: f'listen = "127.0.0.1:{free_port()}"', text)
 
 
@@ -262,7 +262,7 @@ def test_leftover_segment_does_not_hide_a_port_in_use(cell: Cell) -> None:
 
 
 def test_port_of_another_instances_broker_is_attributed_to_it(cell: Cell) -> None:
-    """The broker's process may start another program that listens there."""
+    """The listener may be a child of that broker's process."""
     serve_on(cell, f"127.0.0.1:{free_port()}")
     cell.run("up", "--detach", status=0)
     text = (cell.folder / "supervisor.toml").read_text()

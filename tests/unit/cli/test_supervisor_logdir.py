@@ -1,4 +1,4 @@
-"""Configured folders on a full disk."""
+"""Folders of the configuration that are on a full disk."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ def test_bridge_and_broker_have_logs(instance_logs: Path, capsys: pytest.Capture
 def test_running_process_that_is_not_configured_has_logs(
     instance_logs: Path, instance: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """``--mode replay`` adds such a source."""
+    """``--mode replay`` adds a source that the configuration does not have."""
     (instance_logs / "arm.log").write_text(stamped(3, "arm plays"))
     assert main(["logs", "arm"]) == 1
     assert capsys.readouterr().err.startswith("no process 'arm'; ")

@@ -1,4 +1,4 @@
-"""``shmio``: the instance that it chooses, and how it ends. tests/system has its output."""
+"""``shmio``: how it chooses the instance, and how it ends. Tests of its output are in tests/system."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_faulty_file_in_the_current_folder_names_the_instance(running: str, caps
 
 
 def test_instance_of_an_unknown_file_is_reached_only_by_name(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its segment does not name the configuration file."""
+    """The segment of such an instance does not name its configuration file."""
     Path("supervisor.toml").write_text(f'[instance]\nname = "{instance}"\n')
     with Segment.create(instance, [], []) as segment:
         assert main(["list"]) == 1
@@ -103,7 +103,7 @@ def test_step_size_and_rate_have_limits(
 
 
 class Keyboard(io.StringIO):
-    """Standard input from a terminal."""
+    """A stand-in for standard input from a terminal."""
 
     def isatty(self) -> bool:
         return True

@@ -1,4 +1,4 @@
-"""Both clients for tests with asyncio: each call of the synchronous client runs in a thread."""
+"""Both clients behind one asyncio interface: each call of the synchronous client runs in a thread."""
 
 from __future__ import annotations
 
@@ -67,4 +67,4 @@ def _connect(address: str, **options: Any) -> Any:
 
 Connect = Callable[..., Any]
 BOTH: Final = pytest.mark.parametrize("connects", [_connect, connect_aio], ids=["threads", "asyncio"])
-"""Runs a test with each client: ``async with connects(address) as cell``."""
+"""Runs a test with each client. The test connects with ``async with connects(address) as cell``."""

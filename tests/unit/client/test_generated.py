@@ -1,4 +1,4 @@
-"""The synchronous client is up to date: the script generates it from the asynchronous one."""
+"""The synchronous client equals what the script generates from the asynchronous client."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The section ``[opcua]``: what is refused, and what is not."""
+"""The section ``[opcua]``: what it accepts, and what it refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The file of a UNIX socket: what stands in its place, its permissions, and its removal."""
+"""The file of a UNIX socket: other files at its path, its permissions, and its removal."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def source_segment(instance: str, *blocks: BlockSpec) -> Iterator[Segment]:
 
 
 class SourceRig:
-    """The block of source cell, its events, and two clients that write to it."""
+    """The block of the source ``cell``, its events, and two clients that write to the block."""
 
     def __init__(self, segment: Segment) -> None:
         self.segment = segment

@@ -1,4 +1,4 @@
-"""Peers that do not speak the protocol, or do so to do harm."""
+"""Peers that do not speak the protocol, or speak it to do harm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Behaviour = Callable[[socket.socket], None]
 
 @contextmanager
 def peer(behave: Behaviour) -> Iterator[Address]:
-    """Listen, and treat each client like this."""
+    """Listen, and treat each client as ``behave`` does."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve() -> None:
@@ -43,11 +43,11 @@ def silence(client: socket.socket) -> None:
 
 
 def closes(client: socket.socket) -> None:
-    """Close at once."""
+    """Close the connection at once."""
 
 
 def sends(data: bytes) -> Behaviour:
-    """Answer the first bytes with these, then never again."""
+    """Answer the client's first bytes with ``data``, and then never again."""
 
     def behave(client: socket.socket) -> None:
         client.recv(65536)
@@ -58,7 +58,7 @@ def sends(data: bytes) -> Behaviour:
 
 
 def endless(data: bytes, first: bytes = b"") -> Behaviour:
-    """Answer the first bytes with ``first``, and then send the same without end."""
+    """Answer the client's first bytes with ``first``, and then send ``data`` without end."""
 
     def behave(client: socket.socket) -> None:
         client.recv(65536)
@@ -70,7 +70,7 @@ def endless(data: bytes, first: bytes = b"") -> Behaviour:
 
 
 def trickle(data: bytes, pause_s: float = 0.05) -> Behaviour:
-    """Answer the first bytes with these again and again, a byte at a time."""
+    """Answer the client's first bytes with ``data`` again and again, a byte at a time."""
 
     def behave(client: socket.socket) -> None:
         never = threading.Event()

@@ -1,4 +1,4 @@
-"""Commands: judged at once, carried out once a cycle, each with a true outcome."""
+"""Commands: each is judged at once, carried out in the next cycle, and gets a true outcome."""
 
 from __future__ import annotations
 
@@ -243,7 +243,7 @@ def test_lost_connection_leaves_the_outcome_unknown(bench: Bench) -> None:
 
 
 def test_each_item_of_a_lost_batch_has_its_known_outcome(bench: Bench) -> None:
-    """Items are written, refused, under way at the loss, never sent, or superseded."""
+    """The items are written, refused, under way at the loss, never sent, or superseded."""
     first = bench.accepted(Write(0, 0, b"\0\0"), Write(6, 0, b"a"), Write(8, 0, b"b"), Write(10, 0, b"c"))
     second = bench.accepted(Write(10, 0, b"d"), Write(2, 1, b"\1"), Write(2, 2, b"\2"))
 
@@ -264,7 +264,7 @@ def test_each_item_of_a_lost_batch_has_its_known_outcome(bench: Bench) -> None:
 
 
 def test_partly_written_item_is_unknown_not_expired(bench: Bench) -> None:
-    """The first two bytes are written; a later item, which is not sent, supersedes the others."""
+    """The first two bytes are written. A later item, which is not sent, supersedes the other bytes."""
     bench.accepted(Write(6, 0, b"abcd"))
     bench.accepted(Write(8, 0, b"xy"))
 
@@ -364,7 +364,10 @@ def test_size_of_waiting_commands_is_bounded(
 def test_a_connection_lost_while_a_command_is_being_accepted(
     bench: Bench, writer: BlockWriter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command, judged but not queued at the loss, expires and is not carried out later."""
+    """The command is judged but not yet queued when the connection is lost.
+
+    It expires, and is not carried out later.
+    """
     tell = writer.event
 
     def told(record: Record) -> int:
@@ -396,7 +399,7 @@ def test_refusal_of_the_later_value_applies_to_the_superseded_one(bench: Bench) 
 
 
 def test_writes_keep_the_order_of_acceptance(bench: Bench) -> None:
-    """Data are written before their strobe, though the strobe has a lower offset."""
+    """Data are written before their strobe, although the strobe has a lower offset."""
     bench.accepted(Write(100, 0, b"DATA"))
     bench.accepted(Write(2, 1, b"\1"))
     bench.accepted(Write(104, 0, b"MORE"))

@@ -94,7 +94,7 @@ def test_invalid_injections_are_refused() -> None:
 
 
 def has(parts: list[Write], at: int, mask: int, byte: int) -> bool:
-    """Return whether these writes contain the bit with its value."""
+    """Return whether the writes contain this bit with the value that it has in ``byte``."""
     return any(
         offset <= at < offset + len(part) and (bits or 0xFF) & mask and (part[at - offset] ^ byte) & mask == 0
         for offset, bits, part in parts

@@ -1,4 +1,4 @@
-"""Injections in a source's process: laid, fed and lifted by commands, shown by frames and events."""
+"""Injections in a source's process: commands lay, feed and lift them; frames and events show them."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ Shown = tuple[int, bytes, bytes | None]
 
 
 def played(instance: str, trouble: Callable[[int], None]) -> list[Shown]:
-    """Run two models for ten steps of 50 ms; return the frames of the one under the campaign."""
+    """Run two models for ten steps of 50 ms. Return the frames of the model to which the campaign applies."""
     declared = [msgspec.convert({"name": name, **keys}, Declaration) for name, keys in CAMPAIGN.items()]
     attributes = Attributes("simulation", ("given",), stepped=True)
     blocks = [

@@ -35,7 +35,7 @@ flags = "WORD"
 "axis/2" = "REAL"
 """)
 FIRST: list[Value] = [True, *[False] * 9]
-"""Lamps of which only the first is on."""
+"""Values of ten lamps, of which only the first is on."""
 
 
 def declaration(name: str, target: str | list[str], operation: str, **keys: Any) -> Declaration:
@@ -65,7 +65,7 @@ class Rig(SourceRig):
         assert not self._thread.is_alive()
 
     def give(self, values: Mapping[str, Value]) -> None:
-        """Set values of the device."""
+        """Set values in the device."""
         for path, value in values.items():
             codec(LAYOUT.registers[LAYOUT.by_path[path]], LAYOUT.byte_order).encode_into(value, self.image)
 

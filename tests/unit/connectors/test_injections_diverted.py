@@ -1,4 +1,4 @@
-"""Values diverted to injections: through chains of injections, and as a stream for programs."""
+"""Values diverted to injections: through chains of injections, and to programs as a stream."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.unit.connectors.test_injections import LAYOUT, Rig
 
 segment = test_injector.segment
 GUEST = 0
-"""The command queue of the only guest."""
+"""Number of the command queue of the only program outside the instance."""
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def local(rig: Rig) -> Iterator[Attachment]:
 
 
 def diverted_to(rig: Rig, number: int, until: EventKind) -> list[tuple[int, bytes]]:
-    """Return (offset, data) of what is diverted to an injection until the next event of a kind."""
+    """Return (offset, data) of the writes diverted to an injection before the next event of a kind."""
     found = []
     while (event := rig.events.next(20)) is None or event.kind != until:
         assert event is not None

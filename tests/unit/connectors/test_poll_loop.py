@@ -474,7 +474,7 @@ def test_frame_has_the_delay_of_the_device(segment: Segment) -> None:
 
 
 def test_frames_after_the_outcome_of_a_write_show_it(segment: Segment) -> None:
-    """Several cycles are under way."""
+    """Several cycles are under way at once."""
 
     class Register(Pipe):
         can_write = True

@@ -1,4 +1,4 @@
-"""Finding connectors: the built-in ones, and those of installed packages."""
+"""How connectors are found: the built-in ones, and those of installed packages."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_package_offers_a_connector(offer: Offer, check: Check) -> None:
 
 
 def test_a_package_with_the_name_of_a_built_in_connector(offer: Offer, check: Check) -> None:
-    """It never replaces the built-in one, and ``check`` says so."""
+    """The package never replaces the built-in connector, and ``check`` reports that."""
     offer("alpha", "modbus")
     error = check("modbus", 'host = "127.0.0.1"')
     assert "source[0].connector: 'modbus' is a connector of shmio, and alpha offers another one" in error

@@ -1,4 +1,4 @@
-"""A segment with one source, which only the test publishes."""
+"""A segment with one source. Only the test publishes its frames."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def soon_stale(instance: str) -> Iterator[Segment]:
-    """A segment for tests about age: its frames soon turn stale."""
+    """Create a segment for tests about age: its frames soon become stale."""
     with _segment(instance, SOON_STALE_NS) as segment:
         yield segment
 
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no command expire because the host is busy."""
+    """Prevent commands from expiring because the host is busy."""
     monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""A gRPC endpoint over real sockets: a segment on one side, a client on the other."""
+"""A gRPC endpoint over real sockets: the test publishes into a segment, and a client receives."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ LAYOUT = Layout(
 )
 WRITABLE = ("axis", "running", "inputs", "step", "bits", "name", "long")
 STALE_NS = 60_000_000_000
-"""So long that no source turns stale because the host is busy."""
+"""Age in ns after which frames are stale: so long that a busy host does not make a source stale."""
 SOON_STALE_NS = 300_000_000
 TIMEOUT_S = 60
-"""Time-out of a test; no test waits for it to pass."""
+"""Time-out of a test in s. No test needs so long if it succeeds."""
 LOOK_S = 0.001
 
 
 LOOPBACK = Listener(Address("127.0.0.1", 0), ListenerAccess(Keys()))
-"""Address with all rights for every program of this host."""
+"""A listener that gives all rights to every program of this host."""
 
 
 def image(
@@ -86,7 +86,7 @@ class Endpoint:
 
     @cached_property
     def writer(self) -> BlockWriter:
-        """Writer of the source ``cell``."""
+        """Return the writer of the source ``cell``."""
         return self.segment.writer("cell")
 
     def publish(self, raw: bytes, quality: Quality = Quality.GOOD) -> None:
@@ -113,7 +113,7 @@ class Endpoint:
         return int(answer.status)
 
     async def until(self, condition: Callable[[], Awaitable[bool]]) -> None:
-        """Wait until a condition holds that another thread brings about."""
+        """Wait until another thread has made a condition true."""
         async with asyncio.timeout(TIMEOUT_S):
             while not await condition():  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(LOOK_S)  # gives the other thread the interpreter

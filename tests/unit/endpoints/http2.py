@@ -1,4 +1,4 @@
-"""A gRPC client on the level of HTTP/2 frames, which can stop within any of them (RFC 9113)."""
+"""A gRPC client that sends single HTTP/2 frames, and can stop within any of them (RFC 9113)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Connection:
 
     @classmethod
     async def open(cls, port: int, *, deaf: bool = False) -> Self:
-        """Connect, and wait until the server speaks HTTP/2.
+        """Connect, and wait until the server has sent its HTTP/2 settings.
 
         ``deaf``: keep the flow-control windows closed, so that no data can arrive.
         """
@@ -73,7 +73,7 @@ class Connection:
         await self._writer.drain()
 
     async def until_end(self, stream: int) -> None:
-        """Read until a call has its status."""
+        """Read until a call's status arrives."""
         async with asyncio.timeout(TIMEOUT_S):
             while True:
                 head = await self.reader.readexactly(9)

@@ -1,4 +1,4 @@
-"""A source that accepts commands, with its device; the test decides when cycles happen."""
+"""A source that accepts commands, with its device. The test decides when a cycle runs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Plant:
         )  # fmt: skip
         self.commands.open()
         self.cycles = 0
-        """Number of cycles so far."""
+        """Number of cycles run so far."""
         self._stop = threading.Event()
         self._threads = [threading.Thread(target=self.commands.run)]
         self._threads[0].start()

@@ -1,4 +1,4 @@
-"""Every call that clients can make, and a check that misbehaving clients leave nothing."""
+"""A list of all calls that clients can make, and a check that misbehaving clients leave nothing behind."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Call(NamedTuple):
     """A call, and how it behaves.
 
     Attributes:
-        many: It takes a stream of messages.
-        stays: After its message it stays open until its client ends it.
-        first: Its first message is required, and differs from the others.
-        ends: Its status if it succeeds.
+        many: Whether it takes a stream of messages.
+        stays: Whether it stays open after its message until its client ends it.
+        first: The first message, if the call requires one that differs from the others.
+        ends: The status with which it succeeds.
     """
 
     method: str
@@ -147,10 +147,9 @@ class Polite:
     async def alone(self, *, connected: bool = False) -> None:
         """Wait until nothing is left of other clients.
 
-        That is calls, streams, topics, commands, bytes and injections.
+        That is, none of their calls, streams, topics, commands, bytes and injections exists.
 
-        ``connected``: the other client is still connected, so the injection of version 2 may
-        remain.
+        ``connected``: the other client is still connected, so its injection of version 2 may remain.
         """
         served, feed = self._served, self._served.feeds["cell"]
 
@@ -171,7 +170,7 @@ class Polite:
 
 @asynccontextmanager
 async def polite(served: Endpoint, device: Plant) -> AsyncIterator[Polite]:
-    """Run a well-behaved client that has its first values."""
+    """Run a well-behaved client, and yield when it has received its first values."""
     await served.until(_good(served))
     first, second = served.subscribe("cell/step"), await served.subscriber("polite", "cell/step")
     assert await value(first) == "0"
@@ -200,7 +199,7 @@ def connect(served: Endpoint) -> grpc.aio.Channel:
 
 
 def begin(channel: grpc.aio.Channel, call: Call, timeout_s: float = TIMEOUT_S) -> Any:
-    """Open a call without sending anything; its messages are bytes."""
+    """Open a call of raw bytes without sending a message."""
     return channel.stream_stream(call.method)(timeout=timeout_s)
 
 

@@ -1,4 +1,4 @@
-"""Sources on the instance's clock: threads that publish a frame for each step."""
+"""Sources that use the instance's clock: threads that publish a frame for each step."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _FAR_NS = 10_000_000_000
 
 
 class Model:
-    """A source that counts steps; ``reached`` follows ``goal`` one step after it was written."""
+    """A source that counts steps. ``reached`` takes the value of ``goal`` one step after ``goal`` was written."""
 
     def __init__(self, segment: Segment, source: str) -> None:
         self.image = bytearray(LAYOUT.size)
         self.mute = False
-        """True if steps are not answered."""
+        """True while steps are not answered."""
         self.failure = ""
         self.writer = segment.writer(source)
         self.output = Output(self.writer)

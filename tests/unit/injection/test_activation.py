@@ -11,7 +11,7 @@ A, W, O = State.ACTIVE, State.WAITING, State.OVER  # noqa: E741
 
 
 def states(window: Window, conditions: str, step_ns: int = 10) -> list[State]:
-    """Return the states at times 0, 10, …; a ``#`` in ``conditions`` is a true condition."""
+    """Return the states at times 0, ``step_ns`` and so on. A ``#`` in ``conditions`` is a true condition."""
     activation = Activation(window)
     found = []
     for cycle, mark in enumerate(conditions):

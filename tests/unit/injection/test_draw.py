@@ -1,4 +1,4 @@
-"""Random numbers that depend only on a seed and a place."""
+"""Random numbers that depend only on a seed and a position."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ places = st.integers(0, 2**40)
 
 
 def test_numbers_are_the_same_in_every_version() -> None:
-    """A campaign recorded with one version repeats with the next."""
+    """A campaign recorded with one version of shmio can be repeated with the next version."""
     words = SeededRandom(7, "drift").words(1, 12, Purpose.VALUE, 3)
     assert [f"{word:016x}" for word in words.tolist()] == ["c5b32a2bd6d0f3ce", "20657407695298c2", "a78378d3780506af"]
 

@@ -57,7 +57,7 @@ def value_of(path: str, image: np.ndarray[Any, np.dtype[np.uint8]]) -> Value:
 
 
 def becomes(path: str, value: Value, operation: str, place: int = 0, /, **keys: Any) -> Value:
-    """Return the value of a register after an operation on its covered bits."""
+    """Return a register's value after an operation on the bits that ``path`` covers."""
     found = program(path, operation, **keys)
     image = image_of({path: value})
     before = image.copy()
@@ -159,7 +159,7 @@ moments = st.lists(st.integers(0, 3), min_size=1, max_size=40)
 
 
 def walk(operation: Operation, steps: list[int]) -> list[tuple[int, int]]:
-    """Return (device's value, shown value) of each image; ``steps``: cycles between images."""
+    """Return (device's value, shown value) of each image. ``steps`` has the number of cycles between images."""
     seen = []
     cycle = 0
     for number, step in enumerate(steps):
@@ -273,7 +273,7 @@ places = st.lists(st.tuples(st.integers(0, 3), st.binary(min_size=LAYOUT.size, m
 def test_accepted_operation_runs_on_any_bytes(
     operation: tuple[str, dict[str, Any]], targets: list[str], images: list[tuple[int, bytes]]
 ) -> None:
-    """A failing operation would end the source's process. In tests, warnings are errors."""
+    """An exception in an operation would end the source's process. In tests, warnings are errors."""
     name, keys = operation
     try:
         found = program([f"t/{target}" for target in targets], name, **keys)

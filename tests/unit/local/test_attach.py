@@ -63,7 +63,7 @@ def test_every_method_reports_a_stopped_instance(instance: str, writer: BlockWri
 
 
 def test_a_program_reads_only_the_layouts_that_it_needs(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of a large cell would take it long."""
+    """Reading all layouts of a large cell would take long."""
     read: list[int] = []
 
     def counting(data: bytes) -> Layout:

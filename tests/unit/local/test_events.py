@@ -1,4 +1,4 @@
-"""The events of a local instance: their fields, losses, restarts and reloads."""
+"""The events of a local instance: their fields, and what happens at losses, restarts and reloads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A source that gives each register a status, as a local program sees it."""
+"""What a local program sees of a source that gives each register a status."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Status as read from the segment alone."""
+"""The status of an instance, read from the segment alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HOUR_NS = 3600 * 1_000_000_000
 
 
 class Cell:
-    """A segment with a source and an endpoint, both played by the process of the test."""
+    """A segment with a source and an endpoint. The test plays the processes of both."""
 
     def __init__(self, instance: str) -> None:
         specs = [ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]

@@ -1,4 +1,4 @@
-"""Local subscriptions in situations that a running cell does not produce at will."""
+"""Local subscriptions in situations that a running cell does not reliably produce."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps of virtual time: requested, answered, delivered or failed. Participants are threads."""
+"""Steps of virtual time: requested, answered, delivered or failed. The participants are threads."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def built(instance: str, *blocks: BlockSpec, stepped: bool = True) -> Iterator[S
 
 
 class Participant:
-    """A source that answers each step with the reason from ``answer``, or, for None, not at all."""
+    """A source that answers each step with the reason that ``answer`` returns. For None it does not answer."""
 
     def __init__(self, instance: str, name: str, answer: Callable[[Clock], str | None] = lambda _: "") -> None:
         self.segment = Segment.open(instance, writable=True)
@@ -231,7 +231,7 @@ def test_take_over_continues_from_a_frame_ahead_of_the_schedule(instance: str) -
 
 
 def test_take_over_continues_from_a_cycle_under_way(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Time is paused first, so that no more cycles begin; a cycle under way still counts."""
+    """Time is paused first, so that no further cycle begins. A cycle under way still counts."""
     with built(instance, spec("a"), stepped=False) as segment:
         writer, write = segment.writer("a"), segment.clock.write
         modes: list[ClockMode] = []

@@ -27,7 +27,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def source(segment: Segment) -> Iterator[dict[int, str]]:
-    """A source that answers every step; a reason under a step's number makes it fail."""
+    """Run a source that answers every step. A reason in the yielded dict makes the step of that number fail."""
     failures: dict[int, str] = {}
     writer, bell = segment.writer("sim"), segment.clock.slot_bell(0)
     over = threading.Event()
@@ -101,7 +101,7 @@ def test_playing_program_can_release_time(instance: str) -> None:
 
 
 def test_play_keeps_the_rate(cell: Attachment) -> None:
-    """Never faster than asked for; how much slower depends on the machine."""
+    """Time is never faster than asked for. How much slower it is depends on the machine."""
     begun_ns = cell.block().clock.read().time_ns
     watch = threading.Event()
     cell.play(rate=1, dt_s=3600)

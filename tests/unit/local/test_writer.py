@@ -1,4 +1,4 @@
-"""A writing program: values by path, and their true outcomes."""
+"""A program that writes: values by path, and their true outcomes."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ Answer = Callable[[BlockWriter, Command], None]
 
 @pytest.fixture
 def source(writer: BlockWriter) -> Iterator[list[Answer]]:
-    """A source that answers each command with the next function of the list."""
+    """Run a source that answers each command with the next function of the list."""
     answers: list[Answer] = []
     stop = threading.Event()
 
@@ -164,7 +164,7 @@ def test_a_local_program_writes_as_a_guest(writer: BlockWriter, source: list[Ans
 
 
 def test_a_register_that_is_given_twice_is_refused(writer: BlockWriter, instance: str) -> None:
-    """The values are refused before anything is sent: no source would answer here."""
+    """The command is refused before it is sent: no source runs here that could answer."""
     twice = {"cell/count": 1, "count": 2}
     with shmio.attach(instance, writable=True) as cell:
         source_writer = SourceWriter(writer.block, 5)
@@ -196,6 +196,6 @@ def test_read_only_attachment_cannot_write(writer: BlockWriter, instance: str) -
 
 @pytest.mark.parametrize(("text", "complaint"), [("", "0"), ("ü" * 129, "258")], ids=["empty", "long"])
 def test_length_of_a_note_is_limited(writer: BlockWriter, instance: str, text: str, complaint: str) -> None:
-    """The note is refused before it is sent: no source would answer here."""
+    """The note is refused before it is sent: no source runs here that could answer."""
     with shmio.attach(instance, writable=True) as cell, pytest.raises(ValueRangeError, match=rf"256 .*{complaint}"):
         cell.note(text, "cell")

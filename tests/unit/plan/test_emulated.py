@@ -1,4 +1,4 @@
-"""What the emulators of a configuration serve: their own layouts, or what the sources read from them."""
+"""What the emulators of a configuration serve: their own layouts, or the layouts of the sources that read them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What sources ask of their devices, compared with what connectors then send."""
+"""The requests that a source makes of its device, as planned and as the connector then sends them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def table(addresses: Mapping[str, str], kind: str = "INT", **more: object) -> La
 
 
 def of(connector: str, layout: Layout, *writable: str, **options: Any) -> Source:
-    """Return a source whose options are complete, as after a check."""
+    """Return a source with complete options, as the check of a configuration makes it."""
     whole = msgspec.to_builtins(registry.convert_options(connector, options))
     return Source(
         name="cell", connector=connector, layout="cell.db", period_ms=20, writable=list(writable), options=whole

@@ -1,4 +1,4 @@
-"""The processes that are started for a configuration."""
+"""The processes that the supervisor starts for a configuration."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_process_gets_its_configuration(tmp_path: Path) -> None:
 
 
 def test_tokens_do_not_change_the_identity_of_the_process(tmp_path: Path) -> None:
-    """A reload does not restart the endpoint for new tokens; one that starts later gets them."""
+    """A reload with new tokens does not restart the endpoint. An endpoint that starts later uses the new tokens."""
 
     def job(**changes: Any) -> Job:
         changed = config(tmp_path)

@@ -1,4 +1,4 @@
-"""An instance without a supervisor; the tests publish for its sources."""
+"""An instance without a supervisor. The tests publish for its sources."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.unit.recorder.harness import publish, recorder, spec
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """Two sources, with rings of 512 frames, and a process slot for the recorder."""
+    """Create a segment of two sources with rings of 512 frames, and a process slot for the recorder."""
     processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
     with Segment.create(instance, [spec("cell"), spec("press")], processes) as segment:
         yield segment
@@ -22,7 +22,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def recording(segment: Segment, tmp_path: Path) -> bytes:
-    """The bytes of a file with several chunks."""
+    """Return the bytes of a recording with several chunks."""
     work = recorder(segment, tmp_path / "whole")
     writer = segment.writer("cell")
     for turn in range(4):

@@ -52,7 +52,7 @@ def recorder(
 
 
 def read(file: Path) -> list[Message]:
-    """Return all messages but those about processes."""
+    """Return all messages except those about processes."""
     return [message for message in everything(file) if not isinstance(message.item, ProcessChange)]
 
 
@@ -84,10 +84,10 @@ def gaps(file: Path) -> list[Gap]:
 
 
 class Process:
-    """The recorder's process; it is killed at the end of the test."""
+    """The recorder as a process, which is killed at the end of the test."""
 
     def __init__(self, segment: Segment, folder: Path, *, before: str = "", **config: object) -> None:
-        """Start it. ``before``: Python code that its interpreter runs first."""
+        """Start the recorder. ``before``: Python code that its interpreter runs first."""
         self.slot = segment.processes.find("recorder")
         self.folder = folder / "dumps"
         self.log = folder / "recorder.log"
@@ -113,18 +113,18 @@ class Process:
 
     @property
     def file(self) -> Path:
-        """Path of its file, from its last report without a problem."""
+        """Path of the recorder's file, from the last report without a problem."""
         report = self.slot.report
         if report.pid == self.popen.pid and report.note.startswith("to "):
             self._file = self.folder / report.note.removeprefix("to ")
         return self._file
 
     def counts(self, name: str) -> int:
-        """Return one of its counters, from its last report."""
+        """Return a counter of the recorder, from its last report."""
         return self.slot.counters[name] if self.slot.report.pid == self.popen.pid else 0
 
     def stop(self) -> int:
-        """Stop it; return its exit status."""
+        """Stop the recorder. Return its exit status."""
         self.popen.terminate()
         return self.popen.wait(30)
 

@@ -1,4 +1,4 @@
-"""The file that a recording goes to."""
+"""The output of a recording to a file: writes, fsync, and their failures."""
 
 from __future__ import annotations
 

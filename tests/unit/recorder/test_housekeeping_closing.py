@@ -1,4 +1,4 @@
-"""Files that a killed recorder left: the next recorder closes them, however they end."""
+"""Files that a killed recorder left. The next recorder closes them, wherever they end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CHUNKS = 4
 
 @pytest.fixture
 def whole(segment: Segment, tmp_path: Path) -> Path:
-    """A closed recording of several chunks."""
+    """Make a closed recording of several chunks."""
     files = [AttachedFile("config/supervisor.toml", "application/toml", b"[instance]\n", 5)]
     work = recorder(segment, tmp_path, attachments=lambda source, _: [] if source else files)
     for turn in range(CHUNKS):
@@ -39,13 +39,13 @@ def whole(segment: Segment, tmp_path: Path) -> Path:
 
 
 def records(file: Path, opcode: int) -> list[tuple[int, int]]:
-    """Return where records of a kind begin and end."""
+    """Return where each record of a kind begins and ends."""
     with Reader(file) as reader:
         return [(found.start, found.at + found.size) for found in reader.records.walk() if found.opcode == opcode]
 
 
 def messages(file: Path) -> list[tuple[str, int, bytes]]:
-    """Return the messages that the mcap library reads, with the index and every checksum."""
+    """Return the messages that the mcap library reads through the index, with a check of every checksum."""
     with file.open("rb") as stream:
         reader = mcap.reader.make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
@@ -66,7 +66,7 @@ def messages(file: Path) -> list[tuple[str, int, bytes]]:
 
 
 def expected(content: bytes, folder: Path, size: int) -> list[tuple[str, int, bytes]]:
-    """Return the messages that are whole if the file ends at ``size``, read from front to back."""
+    """Return the messages that are complete if the file ends at ``size`` bytes, read from front to back."""
     part = folder / "part"
     part.write_bytes(content[:size])
     with part.open("rb") as stream:
@@ -94,7 +94,7 @@ def test_the_closed_file_equals_the_recorders_own(whole: Path, tmp_path: Path) -
 def test_a_file_cut_anywhere_after_its_last_chunk_began_is_closed(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file may also end within a summary whose writer was killed, too."""
+    """The file may also end within a summary, because the process that wrote the summary was killed, too."""
     monkeypatch.setattr(os, "fsync", lambda _: None)  # too slow for a thousand files
     content = whole.read_bytes()
     last, end = records(whole, Opcode.CHUNK)[-1]
@@ -200,7 +200,7 @@ def test_the_successor_closes_the_file_of_a_killed_recorder(segment: Segment, tm
 
 
 def test_a_full_disk_leaves_the_file_unchanged_with_a_log_line(segment: Segment, tmp_path: Path) -> None:
-    """A limit on the file's size stands for the full disk; the index needs more than is left."""
+    """A limit on the file's size plays the full disk. The index needs more room than the limit leaves."""
     writer = segment.writer("cell")
     with Process(segment, tmp_path) as first:
         publish(writer, 20)

@@ -24,7 +24,7 @@ SEED = 20
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """A segment with a ring sized for a far faster source, so that it lasts for minutes."""
+    """Create a segment with a ring sized for a far faster source, so that it keeps frames for minutes."""
     processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
     with Segment.create(instance, [BlockSpec("cell", LAYOUT, 500_000, 10**9, 1 << 27)], processes) as segment:
         yield segment
@@ -32,7 +32,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 def frames(file: Path) -> list[int]:
-    """Return the frame numbers that the mcap library reads, with the index and every checksum."""
+    """Return the frame numbers that the mcap library reads through the index, with a check of every checksum."""
     with file.open("rb") as stream:
         messages = mcap.reader.make_reader(stream, validate_crcs=True).iter_messages(topics=["cell/frames"])
         return [message.sequence for _, _, message in messages]
@@ -40,7 +40,7 @@ def frames(file: Path) -> list[int]:
 
 @pytest.mark.timeout(600)
 def test_a_kill_at_any_moment_loses_no_frame_and_leaves_intact_files(segment: Segment, tmp_path: Path) -> None:
-    """The successor takes from the ring what the killed recorder had not written."""
+    """The successor reads from the ring the frames that the killed recorder had not written."""
     writer, over, chance = segment.writer("cell"), threading.Event(), random.Random(SEED)
 
     def source() -> None:

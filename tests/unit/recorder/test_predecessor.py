@@ -1,4 +1,4 @@
-"""Finding where the previous recorder ended, in files that are damaged or large."""
+"""How a recorder finds where the previous one ended, in files that are damaged or large."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MB = 1 << 20
 
 @pytest.fixture
 def file(segment: Segment, tmp_path: Path) -> Path:
-    """A previous recorder's file: two chunks with 10 frames of each source, and one of press."""
+    """Make a previous recorder's file: two chunks with 10 frames of each source, and one chunk of press."""
     work = recorder(segment, tmp_path)
     for turn, sources in enumerate((("cell", "press"), ("cell", "press"), ("press",))):
         for source in sources:
@@ -67,7 +67,7 @@ def test_of_many_files_the_last_by_name_are_searched(
 
 
 def test_the_heartbeat_continues_during_a_search_past_damage(segment: Segment, file: Path) -> None:
-    """A power failure leaves such a file: the rest is zeros."""
+    """After a power failure, the rest of the file may be zeros."""
     end = chunks(file)[0]
     with file.open("rb+") as stream:
         stream.truncate(end.at + end.size)
@@ -79,7 +79,7 @@ def test_the_heartbeat_continues_during_a_search_past_damage(segment: Segment, f
 
 @pytest.mark.parametrize("what", ["many small records", "chunks that unpack to much"])
 def test_the_heartbeat_continues_whatever_the_file_contains(segment: Segment, file: Path, what: str) -> None:
-    """Such files may have few messages, or few bytes."""
+    """A search takes long if there are many records, or much data when unpacked, although the file is small."""
     begin = chunks(file)[0].start
     content = file.read_bytes()
     strange = struct.pack("<BQ", 0x80, 0) * 20_000
@@ -95,7 +95,7 @@ def test_the_heartbeat_continues_whatever_the_file_contains(segment: Segment, fi
 
 
 def test_a_damaged_beginning_does_not_hide_where_it_ended(segment: Segment, file: Path) -> None:
-    """Both descriptions of one channel are damaged, too, so its frames cannot be read any more."""
+    """Both descriptions of one channel are damaged, too, so that the channel's frames cannot be read any more."""
     expected, _ = look(segment, file.parent)
     content = bytearray(file.read_bytes())
     with Reader(file) as reader:
@@ -113,7 +113,7 @@ def test_a_damaged_beginning_does_not_hide_where_it_ended(segment: Segment, file
 
 
 def test_a_damaged_end_affects_only_the_blocks_in_it(segment: Segment, file: Path) -> None:
-    """Frames that cannot be read any more are recorded again, as far as the ring has them."""
+    """Frames that cannot be read any more are recorded again, if the ring still has them."""
     expected, _ = look(segment, file.parent)
     last = chunks(file)[-1]
     content = bytearray(file.read_bytes())

@@ -1,4 +1,4 @@
-"""The recorder's process: killed, restarted, on a full disk. The files are checked."""
+"""The recorder's process, which is killed, restarted, or has a full disk. The tests check its files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.unit.recorder.harness import OTHER, RING, Process, gaps, numbers, pub
 
 
 def written(process: Process) -> list[int]:
-    """Return the numbers of the frames in its file so far."""
+    """Return the numbers of the frames in the recorder's file so far."""
     return numbers(process.file) if process.file.is_file() and process.file.stat().st_size else []
 
 
@@ -160,7 +160,7 @@ def test_a_replaced_block_is_not_mistaken_for_the_earlier_one(segment: Segment, 
 
 
 def by_section(file: Path) -> dict[int, list[int]]:
-    """Return the numbers of the frames of cell in a file, by block."""
+    """Return the numbers of the frames of the source ``cell`` in a file, by section of the block."""
     found: dict[int, list[int]] = {}
     for channel, _, item in read(file):
         if isinstance(item, Frame) and channel.source == "cell":
@@ -228,7 +228,7 @@ def test_a_file_that_is_not_a_recording_is_ignored(segment: Segment, tmp_path: P
 
 
 def test_files_of_other_users_are_ignored(segment: Segment, tmp_path: Path) -> None:
-    """A recording that claims all frames up to the tenth, but is not this user's file."""
+    """The folder has a recording of another user that claims all frames up to the tenth."""
     if os.geteuid() != 0:
         pytest.skip("only root can give a file away")
     writer = segment.writer("cell")
@@ -276,7 +276,7 @@ def test_a_file_of_another_user_is_refused_when_it_is_opened(tmp_path: Path) -> 
 
 
 def test_without_room_it_reports_that_and_continues_once_there_is_room(segment: Segment, tmp_path: Path) -> None:
-    """A limit on the file's size stands for the full disk, as any user can set one."""
+    """A limit on the file's size plays the full disk, because any user can set one."""
     writer = segment.writer("cell")
     with Process(segment, tmp_path, buffer_mb=0.02) as process:
         publish(writer, 10)
@@ -322,7 +322,7 @@ os.fsync = broken
 def test_after_a_failed_fsync_it_continues_in_a_new_file(
     segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: int
 ) -> None:
-    """The process's fsync stands for the disk; it fails once."""
+    """A replaced fsync fails once, as if the disk had failed."""
     writer = segment.writer("cell")
     synced = tmp_path / "synced"
     with Process(segment, tmp_path, before=BROKEN_DISK.format(folder=str(tmp_path)), fsync_s=0.001) as process:

@@ -1,4 +1,4 @@
-"""Everything published is recorded in order, or is in an exact gap."""
+"""Everything that is published is recorded in order, or is within an exact gap."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_frames_and_events_survive_a_round_trip(segment: Segment, tmp_path: Path
 
 
 def test_frames_and_events_of_busy_sources_are_in_order(segment: Segment, tmp_path: Path) -> None:
-    """Threads publish while it records; numbers and references give the true order."""
+    """Threads publish while the recorder works. Numbers and references give the true order."""
     recording = recorder(segment, tmp_path)
     writers = [segment.writer(source) for source in ("cell", "press")]
 

@@ -1,4 +1,4 @@
-"""Rotation of files, and the retention of old ones."""
+"""Rotation of files, and the removal of old ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DAY_S = 86_400
 
 
 def tend(work: RotatingRecorder) -> None:
-    """Wait until the previous file is written, then rotate."""
+    """Wait until the previous file is complete on disk, then rotate."""
     work.recorder._writer.flush()
     until(lambda: all(old.output.ended for old in work._ending), "the previous file")
     work.tend()
@@ -81,7 +81,7 @@ def test_rotation_neither_loses_nor_repeats_a_frame(segment: Segment, tmp_path: 
 
 
 def test_a_gap_at_the_end_of_a_file_is_in_that_file(segment: Segment, tmp_path: Path) -> None:
-    """For example, the writer died, and no later frame has shown what the ring lost."""
+    """An example is a writer that died, so that no later frame shows which frames the ring lost."""
     work = series(segment, tmp_path, rotate_mb=0.001)
     publish(segment.writer("cell"), 100)
     work.turn()
@@ -191,7 +191,7 @@ def test_a_file_is_written_only_after_the_previous_one(tmp_path: Path) -> None:
 def test_a_file_stays_empty_if_the_previous_one_could_not_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the second file alone, the first one's frames would be in no file and in no gap."""
+    """If only the second file had frames, the first file's frames would be in no file and in no gap."""
     monkeypatch.setattr(Output, "_put", lambda *_: False)
     outputs: list[Output] = []
     for name in ("one", "two"):
@@ -207,7 +207,7 @@ def test_a_file_stays_empty_if_the_previous_one_could_not_be_written(
 def test_rotation_writes_no_file_after_one_that_could_not_be_written(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk is slow when the new file is started, and then accepts no more of the old one."""
+    """The disk is slow when the new file is started, and then accepts no more data of the old file."""
     answered, put = threading.Event(), Output._put
     work = series(segment, tmp_path, rotate_mb=0.001)
     first = work.recorder.output
@@ -274,7 +274,7 @@ def test_retention_by_size_deletes_the_oldest_first(segment: Segment, tmp_path: 
 
 
 def test_a_file_that_is_being_played_is_not_deleted(segment: Segment, tmp_path: Path) -> None:
-    """A source that plays it would not find it after a restart."""
+    """A replay of the file would not find it after a restart."""
     old, older = recorded(segment, tmp_path, 8), recorded(segment, tmp_path, 9)
     with Recording([old]):
         assert keep(segment, tmp_path, keep_days=7) == {old}

@@ -24,7 +24,7 @@ STEPS = 3 * RING
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """A segment with stepped time and a source that answers each step."""
+    """Create a segment with stepped time, and run a source that answers each step."""
     block = BlockSpec("sim", LAYOUT, 20 * MS, 60_000 * MS, 1 << 22, Attributes("simulation", stepped=True))
     processes = [ProcessSpec("sim", "source"), ProcessSpec("recorder", "recorder")]
     with Segment.create(instance, [block], processes, stepped=True) as segment:
@@ -68,7 +68,7 @@ def ready(process: Process) -> bool:
 
 
 def test_a_fast_run_is_recorded_whole(segment: Segment, tmp_path: Path) -> None:
-    """Without waiting, the rings would wrap several times between two looks of the recorder."""
+    """If steps did not wait for the recorder, the rings would wrap several times between two of its reads."""
     with Process(segment, tmp_path) as process:
         until(lambda: ready(process), "its file")
         coordinator = Coordinator(segment)

@@ -29,9 +29,9 @@ S = 1_000_000_000
 
 
 class Bench:
-    """A triggered recording of the cell.
+    """A triggered recording of the source ``cell``.
 
-    It has one frame a second, and the tenth has the value 10.
+    The source has one frame a second. The tenth frame has the value 10.
     """
 
     def __init__(
@@ -45,9 +45,9 @@ class Bench:
         buffer_mb: float = 16,
         **trigger: object,
     ) -> None:
-        """Set it up.
+        """Start the recording.
 
-        ``begin_s``: time of the frames' start, in seconds after the instance's start.
+        ``begin_s``: time of the first frame, in seconds after the instance's start.
         """
         self.folder = folder
         self._begin_ns = segment.header.started_ns + begin_s * S
@@ -71,11 +71,11 @@ class Bench:
         self.work.tend()
 
     def writes(self) -> bool:
-        """Return whether it is writing a file."""
+        """Return whether the recording is writing a file."""
         return self.work.file is not None
 
     def close(self) -> list[list[int]]:
-        """Close it; return the numbers of the frames in each file."""
+        """Close the recording. Return the numbers of the frames in each file."""
         assert self.work.close() == []
         found = files(self.folder)
         for file in found:
@@ -146,7 +146,7 @@ def test_two_files_do_not_overlap(segment: Segment, tmp_path: Path) -> None:
 
 
 def test_a_rising_edge_and_a_bad_frame(segment: Segment, tmp_path: Path) -> None:
-    """A condition on a frame of bad quality is never true."""
+    """A condition is never true on a frame of bad quality."""
     bench = Bench(segment, tmp_path, when="rising(cell/count >= 5) or cell/count = 9", before_s=0, after_s=0)
     bench.publish(8)
     bench.publish(1, quality=Quality.BAD)
@@ -214,7 +214,7 @@ def test_without_a_folder_it_reports_that_and_keeps_waiting(segment: Segment, tm
 def test_the_waiting_data_are_bounded_while_the_disk_fails(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Each trigger starts a file; the data that wait for the disk are limited in total."""
+    """Each trigger starts a file. The total size of the data that wait for the disk is limited."""
     full = True
 
     def pwrite(fd: int, data: bytes, offset: int, write: Callable[[int, bytes, int], int] = os.pwrite) -> int:

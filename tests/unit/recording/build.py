@@ -1,4 +1,4 @@
-"""Builds recordings with the recorder's own writer; the test sets every byte and time."""
+"""Builds recordings with the recorder's own writer. The test sets every byte and time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def image(count: int, speed: float = 0.0, *, on: bool = False) -> bytes:
 
 
 class Build:
-    """Builds one file. A message's time follows from its cycle."""
+    """Builds one file. The time of a message follows from its cycle."""
 
     def __init__(self, file: Path, *, epoch: str = "00" * 8, first: int = 1) -> None:
         fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
@@ -86,7 +86,7 @@ class Build:
         self.writer.frame(self.blocks[source], Frame(**(fields | other)), START_NS + clock_ns + late_ns)
 
     def event(self, number: int, after: int, text: str = "", source: str = "cell", *, cycle: int | None = None) -> None:
-        """Add an event after a frame, with its number as cycle, or another cycle."""
+        """Add an event after a frame. Its cycle is by default its number."""
         self.events[source] = number
         cycle = after if cycle is None else cycle
         clock_ns = cycle * PERIOD_NS
@@ -133,7 +133,7 @@ class Build:
 
 @contextmanager
 def build(file: Path, **options: Any) -> Iterator[Build]:
-    """Build a file, and close it at the end."""
+    """Open a file to build, and close it at the end."""
     work = Build(file, **options)
     try:
         yield work
@@ -143,7 +143,7 @@ def build(file: Path, **options: Any) -> Iterator[Build]:
 
 
 def plain(file: Path, first: int = 1, last: int = 100, chunk: int = 10) -> Path:
-    """Build a file with counting frames of one source, with this many in a chunk."""
+    """Build a file with counting frames of one source; ``chunk`` is the number of frames in a chunk."""
     with build(file, first=first) as work:
         work.block("cell")
         for number in range(first, last + 1):
@@ -154,7 +154,7 @@ def plain(file: Path, first: int = 1, last: int = 100, chunk: int = 10) -> Path:
 
 
 def varied(file: Path, first: int = 1) -> Path:
-    """Build a file with two sources and every kind of message; ``first``: begin later."""
+    """Build a file with two sources and every kind of message. ``first`` is the number of the first frame."""
     with build(file, first=first) as work:
         work.block("cell", after_event=(first - 1) // 15)
         work.block("press", section=2)

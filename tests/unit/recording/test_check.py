@@ -1,4 +1,4 @@
-"""The check of recordings with changed bytes: it reports the damage, and the rest is read."""
+"""The check of recordings with changed bytes: it reports the damage, and reads the rest."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def by_chunk(file: Path) -> list[list[Message]]:
 
 @pytest.fixture
 def file(recording: bytes, tmp_path: Path) -> Path:
-    """A recording of several chunks with a gap, undamaged."""
+    """Make an undamaged recording of several chunks with a gap."""
     path = tmp_path / "x.mem"
     path.write_bytes(recording)
     return path
@@ -132,7 +132,7 @@ def test_a_wrong_length_affects_only_its_own_chunk(file: Path, recording: bytes,
 
 @pytest.mark.parametrize("field", [0, 8])
 def test_times_of_a_chunk_that_differ_from_its_messages_are_reported(file: Path, recording: bytes, field: int) -> None:
-    """The times in the chunk's header are not covered by a CRC."""
+    """No CRC covers the times in the chunk's header."""
     chunk = records(file, Opcode.CHUNK)[1]
     changed = bytearray(recording)
     changed[chunk.at + field] ^= 1

@@ -176,7 +176,7 @@ def test_a_source_must_be_named_and_known(tmp_path: Path) -> None:
 
 
 def test_files_of_one_run_form_one_dump(tmp_path: Path) -> None:
-    """In any order; frames that two files have come once; frames that no file has are a gap."""
+    """The files may be in any order. Frames in two files appear once, and frames in no file are a gap."""
     files = [
         plain(tmp_path / "c.mem", 71, 100),
         plain(tmp_path / "a.mem", 1, 40),
@@ -327,7 +327,7 @@ KINDS: list[dict[str, Any]] = [
 def test_batches_equal_frames_for_any_order_of_messages(
     tmp_path: Path, runs: list[tuple[list[tuple[int, int]], int]], chunk: int
 ) -> None:
-    """Frames of equal patterns are read in one batch, so patterns repeat and then change."""
+    """Batches have frames of equal patterns. The test therefore repeats patterns and then changes them."""
     sources = ["cell", "press", "saw"]
     numbers = dict.fromkeys(sources, 0)
     with build(tmp_path / "a.mem") as work:

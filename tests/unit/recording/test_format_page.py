@@ -20,7 +20,7 @@ LAST = b"\x12\x34"
 
 @pytest.fixture
 def content(segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
-    """A recording of 11 frames."""
+    """Return the bytes of a recording of 11 frames."""
     monkeypatch.chdir(tmp_path)
     work = recorder(segment, tmp_path / "dumps")
     writer = segment.writer("cell")

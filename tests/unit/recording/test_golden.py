@@ -39,7 +39,7 @@ from shmio.recording.reading.reader import Reader
 GOLDEN = Path(__file__).parents[2] / "golden/dump"
 FILES = ["closed.mem", "killed.mem"]
 DIFFERENCES = "differences.mem"
-"""The content of ``closed.mem``, with frames of the second version."""
+"""Name of a file with the content of ``closed.mem``, but frames in the second version of the encoding."""
 CODECS: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes]]] = {
     FRAME: (decode_frame, encode_frame),
     EVENT: (decode_event, encode_event),
@@ -111,7 +111,7 @@ def test_open_dump_reads_the_same_content(name: str) -> None:
 
 
 def test_frames_of_the_second_version_are_equal() -> None:
-    """As messages, as frames, and as batches."""
+    """The files are compared as messages, as frames, and as batches."""
     expected = json.loads((GOLDEN / "closed.json").read_text())
     found = described(GOLDEN / DIFFERENCES)
     for part in ("closed", "layouts", "messages"):
@@ -126,7 +126,7 @@ def test_frames_of_the_second_version_are_equal() -> None:
 
 
 def test_frames_of_the_second_version_are_encoded_to_the_same_bytes() -> None:
-    """The mcap library reads both files; frames of the first version are converted."""
+    """The mcap library reads both files, and frames of the first version are converted."""
     messages: list[list[tuple[Any, ...]]] = []
     for name in ("closed.mem", DIFFERENCES):
         with (GOLDEN / name).open("rb") as stream:

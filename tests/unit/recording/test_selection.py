@@ -33,7 +33,7 @@ IMAGE = bytes.fromhex("11223344ff550102")
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """A segment with two sources of this layout."""
+    """Create a segment with two sources of this layout."""
     blocks = [BlockSpec(name, LAYOUT, 20_000_000, 60_000_000_000, 1 << 20) for name in ("cell", "press")]
     processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
     with Segment.create(instance, blocks, processes) as segment:

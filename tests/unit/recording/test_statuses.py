@@ -16,7 +16,7 @@ from tests.unit.statuses import COUNT, LAYOUT, ROW, SOURCE_NS, SPEED, first_imag
 
 
 def recording(file: Path, *bad: int) -> Path:
-    """Record three frames; in the second one these registers are bad."""
+    """Record three frames. In the second frame, the registers ``bad`` are bad."""
     with build(file) as work:
         work.block("plant", LAYOUT)
         for at in (1, 2, 3):

@@ -23,7 +23,7 @@ from shmio.segment.block import Cursor
 LAYOUT = Layout("DB1", 1, 4, False, (Register("speed", "REAL", (), 0, None, 4, 1),))
 PERIOD_NS = 20_000_000
 STALE_NS = 3600 * 10**9
-"""Longer than any test takes."""
+"""Age in ns after which frames are stale, longer than any test takes."""
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def writer(segment: Segment) -> BlockWriter:
 def publish(
     writer: BlockWriter, quality: Quality = Quality.GOOD, reason: str = "", *, old: bool = False, count: int = 1
 ) -> None:
-    """Publish frames; with ``old``, they are already stale."""
+    """Publish frames. With ``old``, the frames are already stale."""
     now_ns = time.monotonic_ns()
     at = Stamp(now_ns - 2 * STALE_NS, now_ns) if old else None
     for _ in range(count):

@@ -1,4 +1,4 @@
-"""The clock page: its owner writes it, other processes read it."""
+"""The clock page, which its owner writes and other processes read."""
 
 from __future__ import annotations
 

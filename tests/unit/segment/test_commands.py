@@ -56,7 +56,7 @@ def test_invalid_commands_are_refused(record: bytes) -> None:
 
 @given(st.lists(st.one_of(st.binary(max_size=120), st.none()), max_size=60))
 def test_a_queue_returns_its_records_in_order(actions: list[bytes | None]) -> None:
-    """Bytes are pushed, None pops; a list is the model. The small queue wraps and fills."""
+    """Bytes are pushed, and None pops. A list is the model. The small queue wraps and fills up."""
     capacity = 256
     memory = bytearray(QUEUE_HEADER_SIZE + capacity)
     expected: list[bytes] = []

@@ -35,7 +35,7 @@ class WaitingLoop:
         self._poll.register(relay.descriptor, select.POLLIN)
 
     def told(self, timeout_ms: int = GIVE_UP_MS) -> bool:
-        """Wait for a wake-up and acknowledge it."""
+        """Wait for a wake-up, and acknowledge it. Return whether one came."""
         told = bool(self._poll.poll(timeout_ms))
         if told:
             self._relay.heard()
@@ -54,7 +54,7 @@ def test_the_relay_wakes_the_loop_at_first_and_at_each_ring(segment: Segment) ->
 
 
 def test_no_ring_is_lost_however_busy_the_loop_is(segment: Segment, instance: str) -> None:
-    """A reader that looks at each wake-up has seen the last frame in the end."""
+    """A reader that looks once for each wake-up has seen the last frame in the end."""
     writer = segment.writer("cell")
     with Segment.open(instance) as reader:  # a read-only mapping
         block = reader.blocks["cell"]
@@ -84,7 +84,7 @@ def test_the_relay_wakes_the_loop_periodically_without_a_ring(segment: Segment) 
 
 @pytest.mark.parametrize("rings", [0, 1, 2])
 def test_a_stopped_relay_ends_and_closes_its_descriptor(segment: Segment, rings: int) -> None:
-    """It waits for a ring, for the acknowledgement of one, or for the loop after two."""
+    """The relay waits for a ring, or for the loop to acknowledge one ring or two."""
     relay = Relay(segment.clock.bell, "relay", 50_000_000)
     loop = WaitingLoop(relay)
     assert loop.told()
@@ -125,7 +125,7 @@ def test_join_repeats_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_after_the_stop_the_descriptor_is_not_read(segment: Segment) -> None:
-    """The descriptor's number may belong to another file by then."""
+    """By then, the descriptor's number may belong to another file."""
     relay = Relay(segment.clock.bell, "relay", LONG_NS)
     loop = WaitingLoop(relay)
     assert loop.told()

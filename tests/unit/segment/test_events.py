@@ -1,4 +1,4 @@
-"""Events and frames of a block form one order."""
+"""Events and frames of a block have one common order."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_an_event_survives_a_round_trip(writer: BlockWriter) -> None:
 
 
 def test_frames_and_events_refer_to_each_other(writer: BlockWriter) -> None:
-    """Two threads write; a reader finds one order by merging frames and events by their numbers."""
+    """Two threads write. A reader finds one order when it merges frames and events by their numbers."""
 
     def events() -> None:
         for item in range(300):
@@ -96,7 +96,7 @@ def test_the_largest_data_of_one_event(writer: BlockWriter) -> None:
 
 @given(st.binary(min_size=EVENT_SIZE, max_size=EVENT_SIZE), st.integers(0, 255))
 def test_any_bytes_decode_to_a_valid_event(raw: bytes, quality: int) -> None:
-    """The bytes come from another process; invalid ones must not cause a read out of bounds."""
+    """The bytes come from another process. Invalid bytes must not cause a read out of bounds."""
     event = decode_event((5, 1, 2, 3, 4, 1, quality, 0, 9, 0, "", raw, None))
     assert len(event.data) <= EVENT_DATA_SIZE
     assert event.quality in Quality

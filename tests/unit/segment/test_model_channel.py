@@ -1,4 +1,4 @@
-"""The channel between a block and its remote model, with two mappings of one segment."""
+"""The channel between a block and its remote model. Two mappings of one segment play both processes."""
 
 from __future__ import annotations
 

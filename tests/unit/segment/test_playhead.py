@@ -1,4 +1,4 @@
-"""The position of a playhead: every reader computes the same one, forward and backward."""
+"""The position of a playhead: every reader computes the same position, forward and backward."""
 
 from __future__ import annotations
 
@@ -49,7 +49,6 @@ def test_it_ends_loops_or_pauses() -> None:
 
 @given(st.binary(max_size=2560), st.integers(0, 2559))
 def test_any_bytes_are_a_valid_playhead_none_or_refused(data: bytes, at: int) -> None:
-    """Any bytes are read as a playhead, as none, or refused."""
     memory = bytearray(2560)
     memory[at : at + len(data)] = data[: 2560 - at]
     from shmio.segment.playhead import Playhead

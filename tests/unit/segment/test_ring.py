@@ -1,4 +1,4 @@
-"""The ring and the cells, by the extension's Python functions."""
+"""The ring and the cells, used by the extension's Python functions."""
 
 from __future__ import annotations
 

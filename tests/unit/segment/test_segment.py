@@ -1,4 +1,4 @@
-"""Building, opening and refusing segments."""
+"""Segments: they are built, opened and refused."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_a_second_supervisor_is_refused_with_the_pid_of_the_first(instance: str)
 def test_a_new_segment_that_another_supervisor_has_locked_is_given_up(
     instance: str, monkeypatch: pytest.MonkeyPatch, cleared: bool
 ) -> None:
-    """The other supervisor comes between creation and lock, and may have removed the name."""
+    """The other supervisor comes between creation and lock. It may have removed the segment's name."""
     create = SharedObject.create
     others = []
 

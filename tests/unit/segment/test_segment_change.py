@@ -127,9 +127,9 @@ def test_a_change_cut_off_by_the_supervisors_death_is_completed(
 def test_the_successor_wakes_readers_wherever_the_supervisor_died(
     segment: Segment, monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
-    """It dies after the new block's entry, after the old one's end, or before its first ring.
+    """The supervisor dies after it wrote the new block's entry, after it ended the old block, or before it first rang.
 
-    All waits are without a time-out.
+    All readers wait without a time-out.
     """
     steps = 0
 
@@ -171,7 +171,7 @@ def test_the_successor_wakes_readers_wherever_the_supervisor_died(
 
 
 def test_a_partly_ended_block_is_ended_by_the_successor(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some readers look only at the flag of their own section."""
+    """The flag of the block's own section must be set, too, because some readers look only at that flag."""
     store = _atomics.store64
 
     def die(memory: memoryview, offset: int, value: int) -> None:
@@ -194,7 +194,7 @@ def test_a_partly_ended_block_is_ended_by_the_successor(segment: Segment, monkey
 def test_a_lost_ring_leaves_no_reader_waiting(
     segment: Segment, timeout_s: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A reader that waits long or for ever also looks periodically."""
+    """A reader that waits long or for ever looks periodically, too."""
     monkeypatch.setattr("shmio.segment.segment.wake", lambda *_: None)
     with shmio.attach(segment.instance) as reader:
         held = reader.block("cell")
@@ -243,7 +243,7 @@ def test_the_number_of_changes_is_limited(segment: Segment) -> None:
 
 
 def test_readers_during_changes(segment: Segment) -> None:
-    """A reader that opens or refreshes sees complete tables only, though the object grows."""
+    """A reader that opens or refreshes the segment sees only complete tables, although the segment grows."""
     stop = threading.Event()
     problems: list[BaseException] = []
 

@@ -78,7 +78,7 @@ signal.pause()
 
 @pytest.mark.parametrize("field", ["abi", "version"])
 def test_processes_of_another_version_are_found_without_its_format(instance: str, field: str) -> None:
-    """They run a module of shmio and have mapped the segment for writing; others are left alone."""
+    """Such processes run a module of shmio and have mapped the segment for writing. Other processes are left alone."""
     with Segment.create(instance, [], [ProcessSpec("cell", "source")]) as segment:
         if field == "abi":
             segment.memory[8:12] = (7).to_bytes(4, "little")
@@ -108,7 +108,7 @@ def test_processes_of_another_version_are_found_without_its_format(instance: str
 def test_a_process_that_does_not_end_is_named_and_keeps_the_segment(
     instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A process that waits in the kernel does not end, not even by SIGKILL."""
+    """Not even SIGKILL ends a process that waits in the kernel."""
     monkeypatch.setattr("shmio.segment.stale_segment.GRACE_S", 0.2)
     command = [sys.executable, "-c", SUPERVISOR, instance, ORPHAN.format(stubborn=False)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as supervisor:

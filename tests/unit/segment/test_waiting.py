@@ -1,6 +1,6 @@
-"""Threads wait in the extension while the segment is closed or the interpreter ends.
+"""Threads that wait in the extension while the segment is closed or the interpreter ends.
 
-Also run on a sanitized build: scripts/test-sanitized.
+These tests also run on a sanitized build: scripts/test-sanitized.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 class Waiting:
-    """A thread that waits repeatedly until stopped, and the error that ended it."""
+    """A thread that waits repeatedly until it is stopped. It keeps the error that ended it."""
 
     def __init__(self, wait: Callable[[], object], stopping: threading.Event) -> None:
         self.begun = threading.Event()
@@ -47,7 +47,7 @@ class Waiting:
 
 
 def waiting(segment: Segment, pause_ns: int) -> list[Callable[[], object]]:
-    """Return each way to wait for something in a segment."""
+    """Return a function for each way to wait for something in a segment."""
     page, block = segment.clock, segment.blocks["sim"]
     frames, events, commands = block.ring, block.events.ring, block.commands
     waits: list[Callable[[], object]] = [
@@ -62,7 +62,7 @@ def waiting(segment: Segment, pause_ns: int) -> list[Callable[[], object]]:
 
 
 def test_a_segment_is_closed_while_threads_wait(segment: Segment, instance: str) -> None:
-    """The mapping stays while they wait; a thread that waits again gets an error."""
+    """The mapping remains while threads wait. A thread that waits again gets an error."""
     for turn in range(20):
         reader, stopping = Segment.open(instance), threading.Event()
         waits = waiting(reader, (-1, 100_000)[turn % 2])

@@ -1,4 +1,4 @@
-"""The model of docs/how-to/write-a-model.md, exactly as on the page."""
+"""The model on the page docs/how-to/write-a-model.md runs exactly as shown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Structures of numbers, read and written in one operation, behave like their single members."""
+"""A structure of numbers that is read and written in one operation gives the same values as its single members."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKED = struct.Struct("<dhxxfd")
 
 
 class Told(Model):
-    """Writes ``tells``, and stores what it read in ``seen``."""
+    """A model that writes ``tells``, and stores in ``seen`` what it read."""
 
     tells: Any = None
     seen: Any = None

@@ -14,8 +14,7 @@ from tests.unit.simulation.plant import Belt
 class Still(Model):
     """A model that computes nothing."""
 
-    def step(self, time_s: float, dt_s: float) -> None:
-        """Change nothing."""
+    def step(self, time_s: float, dt_s: float) -> None: ...
 
 
 def test_the_layout_has_the_declared_registers_in_their_order() -> None:

@@ -14,7 +14,7 @@ from shmio.simulation.loopback import Loopback
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Path]:
-    """A folder for modules; modules imported from it are unloaded afterwards."""
+    """Make a folder for modules. Modules imported from it are unloaded afterwards."""
     modules, path = set(sys.modules), list(sys.path)
     yield tmp_path
     sys.path[:] = path

@@ -166,7 +166,7 @@ def test_the_same_steps_and_seed_give_the_same_bytes() -> None:
 
 
 class Fragile(Model):
-    """A model that fails in the way that ``how`` chooses."""
+    """A model that fails in the way that ``how`` names."""
 
     how = Input("INT")
     value = Output("INT", 5)
@@ -230,7 +230,7 @@ def test_a_failing_start_is_reported_likewise() -> None:
 
 
 class Counting(Model):
-    """A model whose start continues from the image."""
+    """A model that continues its count from the image when it starts."""
 
     count = Output("DINT")
     given = Input("DINT")
@@ -303,7 +303,7 @@ def test_a_layout_that_does_not_fit_is_refused(changes: dict[str, Any], message:
 
 
 class Types(Model):
-    """A model whose outputs get numpy values."""
+    """A model that sets its outputs to numpy values."""
 
     count = Output("INT")
     row = Output("ARRAY[0..1, 0..2] OF REAL")

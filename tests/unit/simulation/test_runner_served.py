@@ -1,4 +1,4 @@
-"""A model's class run by a client's ``simulate``: it gives the same bytes as in the instance."""
+"""A model's class that a client's ``simulate`` runs. It gives the same bytes as within the instance."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Given(Mapping[str, Any]):
 
 
 class Joined:
-    """A joined source whose registers have these values."""
+    """A source that the model has joined, whose registers have these values."""
 
     source = "belt"
 
@@ -50,7 +50,7 @@ def values(runner: ModelRunner, image: bytes) -> dict[str, Any]:
 
 
 def split(every: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return inputs and outputs of a belt."""
+    """Return the inputs and the outputs among a belt's values."""
     both = {"drives/main", "raw"}
     inputs = {"speed", "stop"} | both
     return (

@@ -13,7 +13,7 @@ from tests.unit.supervisor.harness import CELL, Job, Launch, Launched
 
 @pytest.fixture
 def launch(instance: str, tmp_path: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Launch]:
-    """Start an instance with the given jobs and limits."""
+    """Return a function that starts an instance with the given jobs and limits."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     launched: list[Launched] = []
 

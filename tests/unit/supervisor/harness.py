@@ -1,4 +1,4 @@
-"""Instances of fake workers, supervised in a separate process."""
+"""Instances of fake workers under a supervisor in a separate process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CELL: list[Job] = [("plc", "emulator", ["good"]), ("cell", "source", ["good"]), 
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition that has no doorbell, such as a line of the process table."""
+    """Wait for a condition that no doorbell signals, such as one on a line of the process table."""
     deadline = time.monotonic() + DEADLINE_S
     pause = threading.Event()
     while not condition():
@@ -54,7 +54,7 @@ class Launched:
         self.states: list[str] = []
 
     def wait_state(self, state: str) -> None:
-        """Read states from the supervisor until it reports this one."""
+        """Read the supervisor's states until it reports this one."""
         assert self.process.stdout is not None
         deadline = time.monotonic() + DEADLINE_S
         while state not in self.states:
@@ -96,7 +96,7 @@ class Launched:
         return control.request(path, message, DEADLINE_S)
 
     def plan(self, jobs: list[Any], **others: Any) -> None:
-        """Write the plan for the next reload."""
+        """Write the plan that the next reload reads."""
         (self.folder / "plan.json").write_text(json.dumps({"jobs": jobs, **others}))
 
     def reload(self, jobs: list[Any], **others: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Supervises fake workers: ``run_supervisor.py INSTANCE FOLDER JOBS LIMITS``."""
+"""Runs a supervisor of fake workers: ``run_supervisor.py INSTANCE FOLDER JOBS LIMITS``."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def block(name: str, layout: Layout, ring_bytes: int) -> BlockSpec:
 def make(settings: dict[str, Any]) -> Plan:
     """Return a plan.
 
-    ``settings``: jobs as (name, kind, behaviour[, layout]), and other deviations.
+    ``settings`` has the jobs as (name, kind, behaviour[, layout]), and other changes to the default plan.
     """
     return Plan(
         instance=settings.get("instance", instance),
@@ -59,7 +59,7 @@ def make(settings: dict[str, Any]) -> Plan:
 
 
 def replan() -> Plan:
-    """Read the plan from its file; if the pipe exists, wait until a test writes to it."""
+    """Read the plan from its file. If the pipe exists, first wait until a test writes to it."""
     if (pipe := folder / "slow").exists():
         pipe.read_bytes()
     try:
@@ -69,13 +69,13 @@ def replan() -> Plan:
 
 
 def kill(child: ChildProcess, end: Callable[[ChildProcess], None] = ChildProcess.kill) -> None:
-    """Kill a process, unless the file ``held`` exists: then the process cannot be ended."""
+    """Kill a process. If the file ``held`` exists, do nothing, as if the process could not be ended."""
     if not (folder / "held").exists():
         end(child)
 
 
 def send(pidfd: int, sign: int, really: Callable[[int, int], None] = signal.pidfd_send_signal) -> None:
-    """Do the same for a process that is not a child."""
+    """Send a signal to a process that is not a child. If the file ``held`` exists, do nothing."""
     if not (folder / "held").exists():
         really(pidfd, sign)
 

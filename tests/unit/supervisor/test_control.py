@@ -22,7 +22,7 @@ from shmio.supervisor.control import Answer, ControlServer, Request, Restart, St
 
 
 class Served:
-    """A server, run step by step in the test's thread."""
+    """A control server. The test's thread runs it step by step."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -137,7 +137,7 @@ def test_a_client_stops_waiting_when_its_check_finds_a_reason(tmp_path: Path) ->
 
 
 def test_a_client_waits_until_the_backlog_has_room(tmp_path: Path) -> None:
-    """If a UNIX socket's backlog is full, connect fails at once."""
+    """When a UNIX socket's backlog is full, connect fails at once."""
     path = str(tmp_path / "s")
     with ExitStack() as stack:
         listener = stack.enter_context(socket.socket(socket.AF_UNIX))
@@ -225,7 +225,7 @@ def test_too_many_clients_are_refused(served: Served) -> None:
 
 
 def test_the_request_of_a_client_that_has_left_is_dropped(served: Served) -> None:
-    """Its user was told that the request had no answer."""
+    """The client's user was told that the request had no answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.connect(served.path)
         client.sendall(b'{"do": "stop"}\n')
@@ -318,7 +318,7 @@ def test_request_fails_without_a_server_or_without_an_answer(tmp_path: Path) -> 
     [b"", b"garbage\n", b"[]\n", b'{"ok": "\xff"}\n', b'{"a":' * 12_000 + b"\n", b"x" * (2 * control.MAX_ANSWER_BYTES)],
 )
 def test_hostile_answers_raise_a_control_error(tmp_path: Path, answer: bytes) -> None:
-    """The command ends with one line, and reads no more than the largest allowed answer."""
+    """The command prints one line, and reads no more than the longest allowed answer."""
     path = tmp_path / "taken.sock"
     with socket.socket(socket.AF_UNIX) as hijacker:
         hijacker.bind(str(path))

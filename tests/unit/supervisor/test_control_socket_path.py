@@ -1,4 +1,4 @@
-"""The path of the control socket, and folders that are not suitable."""
+"""The path of the control socket, and folders that are unsuitable for it."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def test_the_log_says_how_many_frames_a_recorder_lost(instance: str, caplog: pyt
 
 
 class Told:
-    """A process that counts how often it is told to read its rules again."""
+    """A process that counts how often it is told to read its access rules again."""
 
     def __init__(self) -> None:
         self.times = 0

@@ -1,4 +1,4 @@
-"""The check of the log folder while the instance runs."""
+"""The check of the log folder while an instance runs."""
 
 from __future__ import annotations
 

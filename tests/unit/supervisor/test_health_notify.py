@@ -16,7 +16,7 @@ from tests.unit.supervisor.harness import CELL, DEADLINE_S, Launch
 
 @pytest.fixture(params=["path", "abstract"])
 def manager(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    """The service manager's end of the socket that the environment names."""
+    """Return the service manager's end of the socket that the environment names."""
     name = f"@shmio-test-{os.getpid()}" if request.param == "abstract" else str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(name.replace("@", "\0"))
@@ -37,7 +37,7 @@ def test_notifications_from_start_to_stop(
     told: list[dict[str, str]] = []
 
     def until(begin: str) -> str:
-        """Receive until a line begins like this."""
+        """Receive until a line begins with this text."""
         while True:
             told.append(heard(manager))
             for key, value in told[-1].items():

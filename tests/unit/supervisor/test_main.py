@@ -182,7 +182,7 @@ def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(la
 
 
 def test_a_failed_supervisor_leaves_the_processes_for_the_next_one(launch: Launch) -> None:
-    """Here it fails because it writes its state to a pipe without a reader."""
+    """Here the supervisor fails because it writes its state to a pipe without a reader."""
     cell = launch([*CELL, ("press", "source", ["good", "unfit"])])
     cell.wait_state("running")
     before = cell.pids()
@@ -203,7 +203,7 @@ def test_a_failed_supervisor_leaves_the_processes_for_the_next_one(launch: Launc
 
 
 def test_an_unknown_process_in_a_slot_is_killed(launch: Launch) -> None:
-    """A supervisor may have started it just before its own death."""
+    """An earlier supervisor may have started such a process just before its own death."""
     cell = launch([("plc", "emulator", ["good", "crash", "good"])], backoff_first_s=2)
     cell.wait_state("running")
     os.kill(cell.pid("plc"), signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Decisions of the supervisor with a simulated clock."""
+"""Decisions of the supervisor, tested with a simulated clock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ S = 1_000_000_000
 
 @dataclass
 class World:
-    """One process and the time; the test drives them as the supervisor does."""
+    """One process and the time. The test drives them as the supervisor does."""
 
     now_ns: int = 1000 * S
     life: Life = field(default_factory=Life)

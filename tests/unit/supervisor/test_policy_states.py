@@ -1,4 +1,4 @@
-"""The state graph: as documented, and consistent on every path."""
+"""The state graph of processes: as documented, and consistent on every path."""
 
 from __future__ import annotations
 

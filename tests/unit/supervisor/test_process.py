@@ -1,4 +1,4 @@
-"""A child process: its description, its environment, and the text about its end."""
+"""A child process: its description, its environment, and the text that says how it ended."""
 
 from __future__ import annotations
 

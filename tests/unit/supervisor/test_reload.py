@@ -154,7 +154,7 @@ def test_a_wrong_configuration_changes_nothing(launch: Launch) -> None:
 
 
 def test_a_reload_that_fails_with_an_exception_changes_nothing(launch: Launch) -> None:
-    """A third-party connector may cause one."""
+    """A connector of another package may raise such an exception."""
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()

@@ -1,4 +1,4 @@
-"""Processes that not even SIGKILL ends: they are reported, and delay nothing else."""
+"""Processes that not even SIGKILL ends. They are reported, and delay nothing else."""
 
 from __future__ import annotations
 

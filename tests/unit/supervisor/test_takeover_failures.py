@@ -1,4 +1,4 @@
-"""A take-over that fails changes nothing: the processes continue for the next attempt."""
+"""A take-over that fails changes nothing. The processes continue, and a later attempt can take them over."""
 
 from __future__ import annotations
 

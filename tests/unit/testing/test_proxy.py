@@ -1,4 +1,4 @@
-"""Each fault of the fault proxy, seen by a plain socket."""
+"""Each fault that the fault proxy can cause, as a plain socket sees it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def frame(payload: bytes) -> bytes:
 
 @pytest.fixture
 def server() -> Iterator[Address]:
-    """A server that returns what it receives."""
+    """Run a server that sends back what it receives."""
     listener = socket.create_server(("127.0.0.1", 0))
     threads: list[threading.Thread] = []
 

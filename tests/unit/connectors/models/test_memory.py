@@ -41,7 +41,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @contextmanager
 def running(segment: Segment) -> Iterator[SourceWriter]:
-    """Run a process of the source in threads, and yield a writer toward it."""
+    """Run the source's process in threads, and yield a client that writes to it."""
     options = registry.convert_options("memory", {})
     memory = registry.load("memory")(options, LAYOUT)
     assert isinstance(memory, Computed)

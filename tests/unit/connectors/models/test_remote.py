@@ -1,4 +1,4 @@
-"""A source whose model runs in another program, which is a thread in these tests."""
+"""A source whose model runs in another program. In these tests, that program is a thread."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from tests.unit.connectors.models.test_stepped import GUEST, LAYOUT, MS, PATIENC
 
 NOBODY = "no model is connected"
 LONG_MS = 9000
-"""A time-out that no test reaches."""
+"""A time-out in ms that no test reaches."""
 Compute = Callable[[ModelRequest], bytes | str | None]
-"""Gives an image, the reason of a failure, or None for no answer."""
+"""Returns an image, or the reason of a failure, or None to send no answer."""
 MUTE = """
 import sys, time
 from shmio.segment import Segment

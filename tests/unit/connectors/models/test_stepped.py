@@ -56,7 +56,7 @@ PATIENCE_S = 20
 
 
 class Adder(Computed):
-    """Each step adds 1, ``given`` and ``other`` to ``sum``; ``trouble`` may raise or wait."""
+    """A model. Each step adds 1, ``given`` and ``other`` to ``sum``; ``trouble`` may raise or wait."""
 
     Options = msgspec.Struct
 
@@ -103,7 +103,7 @@ class VirtualClock:
         return self.time_ns
 
     def nudge(self) -> None:
-        """Do nothing: no wait of this clock is ever under way."""
+        """Do nothing, because waits of this clock return at once."""
 
     def wait_ns(self, duration_ns: int | None) -> bool:
         assert duration_ns is not None
@@ -319,7 +319,7 @@ def test_released_time_continues_from_virtual_time(instance: str) -> None:
 
 
 class SlowToAccept(BlockWriter):
-    """Waits after each event ACCEPTED until a step could have been made without that write."""
+    """Delays the source after each event ACCEPTED until a step could have been made without that write."""
 
     def event(self, record: Record, *, quality: Quality | None = None, at: Stamp | None = None) -> int:
         number = super().event(record, quality=quality, at=at)
@@ -472,7 +472,7 @@ def test_source_that_missed_steps_continues_with_the_current_one(instance: str) 
 
 
 def test_models_read_each_others_values_from_before_the_step(instance: str) -> None:
-    """In turns, each model waits until the other has published."""
+    """Each model in turn waits until the other has published."""
     with built(instance, "a", "b") as segment, ExitStack() as stack:
 
         def after(name: str, turn: int) -> Callable[[int], None]:

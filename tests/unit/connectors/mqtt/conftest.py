@@ -1,4 +1,4 @@
-"""A mosquitto with a device made with Node's mqtt, for all tests of a module."""
+"""A mosquitto and a device made with Node's mqtt, for all tests of a module."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.unit.connectors.mqtt.peer import Peer
 
 
 class Plant(NamedTuple):
-    """A broker, and a device at it."""
+    """A broker, and a device that is connected to it."""
 
     address: Address
     device: Peer

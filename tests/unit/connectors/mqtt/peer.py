@@ -1,4 +1,4 @@
-"""A device at a broker, made with Node's mqtt, and a broker made with Node's aedes; and a source that reads it."""
+"""A device made with Node's mqtt, a broker made with Node's aedes, and a source that reads them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _NEVER = threading.Event()
 
 
 class Peer:
-    """The Node process; ``ask`` runs its commands."""
+    """The Node process with the device and the broker. ``ask`` runs its commands."""
 
     def __enter__(self) -> Self:
         if MISSING:
@@ -64,18 +64,18 @@ class Peer:
         return found
 
     def publish(self, topic: str, payload: object, *, retain: bool = False) -> None:
-        """Publish a text, or a value as JSON; return when the broker has acknowledged it."""
+        """Publish a text, or another value as JSON. Return when the broker has acknowledged it."""
         text = payload if isinstance(payload, str) else json.dumps(payload)
         self.ask("publish", topic, text, {"qos": 1, "retain": retain})
 
     def clear(self, *topics: str) -> None:
-        """Let the broker forget what it has kept of topics."""
+        """Remove the retained messages of topics from the broker."""
         for topic in topics:
             self.ask("publish", topic, "", {"qos": 1, "retain": True})
 
 
 def layout_of(tags: Mapping[str, tuple[str, str] | dict[str, Any]]) -> Layout:
-    """Return a layout; a tag is (type, address), or as in a table."""
+    """Return a layout. Each tag is (type, address), or a dict with the keys of a tag table."""
     given = {path: {"type": tag[0], "address": tag[1]} if isinstance(tag, tuple) else tag for path, tag in tags.items()}
     return place_tags("robot", given).with_statuses()
 
@@ -134,7 +134,7 @@ def connected(
 
 
 def framing(data: bytes | bytearray) -> int:
-    """Return the length of the MQTT packet at the start of ``data``; 0 if unknown yet."""
+    """Return the length of the MQTT packet at the start of ``data``; 0 if the packet's length is not complete."""
     size = 0
     for place, byte in enumerate(data[1:5]):
         size |= (byte & 0x7F) << 7 * place

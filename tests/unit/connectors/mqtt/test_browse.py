@@ -1,4 +1,4 @@
-"""``shmio-supervisor browse``: the topics of a broker, as a tree and as a tag table that can be read at once."""
+"""``shmio-supervisor browse``: a broker's topics, as a tree and as a tag table that a source can read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Payloads of all kinds never do more than turn registers bad."""
+"""Payloads of any kind do no more harm than to turn registers bad."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def store_of(tags: dict[str, Any], **options: Any) -> Store:
 
 
 def check(store: Store) -> None:
-    """Each register of the image has a value of its type, and a status."""
+    """Assert that each register of the image has a value of its type, and a status."""
     raw, area = store.image(0), StatusArea(store.layout)
     for index, register in enumerate(store.layout.registers):
         value = codec(register, store.layout.byte_order).decode(raw)
@@ -153,7 +153,7 @@ def test_browsing_json(document: Any) -> None:
 
 
 def _browse(messages: list[tuple[str, bytes]]) -> None:
-    """What is offered has an address that can be read."""
+    """Assert that every address that browsing offers can be read."""
     listener = Listener(MqttOptions(url="mqtt://127.0.0.1"), Wanted())
     for topic, payload in messages:
         listener.take(topic, payload, retained=True)

@@ -102,7 +102,7 @@ def test_tls(make_broker: Callable[..., Address], tmp_path: Path) -> None:
 
 
 class Hostile:
-    """A broker that answers CONNECT and each SUBSCRIBE as it should, and then sends some bytes."""
+    """A broker that answers CONNECT and each SUBSCRIBE correctly, and then sends the bytes of the test."""
 
     def __init__(self, first: bytes, then: bytes) -> None:
         self._listening = socket.create_server(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""The examples of the page are valid."""
+"""The examples in docs/how-to/read-mqtt-topics.md are valid."""
 
 from __future__ import annotations
 

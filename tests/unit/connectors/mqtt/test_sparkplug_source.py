@@ -1,4 +1,4 @@
-"""The MQTT connector and Sparkplug B: an edge node made with Node's sparkplug-payload, and hostile messages."""
+"""The MQTT connector with Sparkplug B: an edge node made with Node's sparkplug-payload, and hostile messages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CODES: Callable[[Source], list[str]] = lambda source: [describe(source.code(path
 
 
 class Edge:
-    """An edge node that the test plays with the peer's messages."""
+    """An edge node, for which the peer sends the messages that the test asks for."""
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
@@ -60,7 +60,7 @@ class Edge:
         return {"name": "bdSeq", "type": "UInt64", "value": self.bd_seq if number is None else number}
 
     def asked(self) -> Any:
-        """Wait for a command to the node; return its metrics."""
+        """Wait for a command to the edge node, and return the command's metrics."""
         message = self.peer.ask("next", f"{GROUP}/NCMD/cell")
         assert (message["qos"], message["retain"]) == (0, False)
         return self.peer.ask("decode_sparkplug", message["hex"])["metrics"]
@@ -188,7 +188,7 @@ def test_no_question_is_asked_if_that_is_not_wanted(plant: Plant, edge: Edge) ->
 
 
 def test_a_node_of_shmio_itself_is_read(plant: Plant) -> None:
-    """What shmio's own bridge publishes comes back with the same values."""
+    """The connector reads the values that shmio's own bridge publishes."""
     kinds: dict[str, tuple[str, Any]] = {
         "a": ("SINT", -7), "b": ("INT", -300), "c": ("DINT", -70_000), "d": ("LINT", -(1 << 40)), "e": ("USINT", 200),
         "f": ("UINT", 60_000), "g": ("UDINT", 4_000_000_000), "h": ("ULINT", (1 << 64) - 1), "i": ("REAL", 0.5),

@@ -39,17 +39,17 @@ MS = 1_000_000
 S = 1_000 * MS
 PERIOD_NS = 20 * MS
 BEGIN_NS = 100 * S
-"""The clock of the first frame of a recording."""
+"""Instance clock of the first frame of a recording."""
 PATIENCE_S = 20.0
 
 
 def image(count: int, other: int = 0) -> bytes:
-    """Return an image of LAYOUT."""
+    """Return an image of LAYOUT with these values."""
     return struct.pack(">HH", count, other)
 
 
 class Recorded:
-    """A source of a recorded instance; the test gives the time of each frame and event."""
+    """A source of an instance that is recorded. The test sets the time of each frame and event."""
 
     def __init__(self, segment: Segment, source: str, take: Callable[[], object]) -> None:
         self._segment = segment
@@ -59,7 +59,7 @@ class Recorded:
         self.cycle = 5_000
 
     def stamp(self, clock_ns: int) -> Stamp:
-        """Return the stamp of a time of the recorded instance."""
+        """Return the stamp for a time of the recorded instance."""
         return Stamp(self._segment.header.started_ns + clock_ns, clock_ns, 7_000 * S + clock_ns)
 
     def frame(self, clock_ns: int, raw: bytes, **told: Any) -> None:
@@ -76,7 +76,7 @@ class Recorded:
 
 @contextmanager
 def recorded(folder: Path, instance: str, *sources: str, name: str = "") -> Iterator[list[Recorded]]:
-    """Record an instance to the folder; it began long before the recording."""
+    """Record an instance to the folder. The instance started long before the recording."""
     specs = [BlockSpec(source, LAYOUT, PERIOD_NS, 500 * MS, 1 << 22) for source in sources or ("cell",)]
     origin = Origin(BEGIN_NS - S, 7_000 * S)
     with Segment.create(f"{instance}{name}-recorded", specs, [], origin=origin) as segment:
@@ -87,7 +87,7 @@ def recorded(folder: Path, instance: str, *sources: str, name: str = "") -> Iter
 
 
 def record(folder: Path, instance: str, *sources: str, frames: int = 20) -> Path:
-    """Record sources that count from 0, by default one; ``other`` is 1 from count 10 on."""
+    """Record sources that count from 0; by default one source. The register ``other`` is 1 from count 10 on."""
     folder.mkdir(exist_ok=True)
     with recorded(folder, instance, *sources) as all_of_them:
         for number in range(frames):
@@ -149,7 +149,7 @@ class Playing:
         return list(iter(self.cursor.poll, None))
 
     def happened(self) -> list[Event]:
-        """Return the events since the last call, without STARTED and STOPPED."""
+        """Return the events since the last call, except STARTED and STOPPED."""
         told = list(iter(self.events.poll, None))
         return [event for event in told if event.kind not in (EventKind.STARTED, EventKind.STOPPED)]
 

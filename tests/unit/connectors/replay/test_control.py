@@ -109,7 +109,7 @@ def test_play_to_the_next_event(tmp_path: Path, instance: str) -> None:
 
 @pytest.mark.parametrize(("injections", "at"), [("keep", 3), ("leave out", 6)])
 def test_play_to_the_next_event_of_any_kind(tmp_path: Path, instance: str, injections: str, at: int) -> None:
-    """An event that the replay leaves out does not count."""
+    """Events that the replay omits do not count."""
     kinds = {1: EventKind.STARTED, 3: EventKind.INJECTED, 6: EventKind.NOTED}
     with recorded(tmp_path, instance) as [cell]:
         for number in range(10):
@@ -204,7 +204,7 @@ def test_play_until_a_past_time_is_refused(paused_replay: tuple[Playing, Attachm
 
 @contextmanager
 def replay_without_other(folder: Path, instance: str) -> Iterator[tuple[Path, Segment, Playing, Attachment]]:
-    """A paused replay of two sources, one of which has no process; time-outs are short."""
+    """Start a paused replay of two sources. One of them has no process, and time-outs are short."""
     file = record(folder, instance, "cell", "other")
     with (
         built(instance, "cell", "other", stepped=False) as segment,
@@ -277,7 +277,7 @@ def test_paused_replay_is_good_again_after_a_restart(tmp_path: Path, instance: s
 
 
 def play_and_request_pause(segment: Segment, for_ns: int) -> tuple[Playhead, int]:
-    """Set the playhead as if it had played for a time; request a pause, which the next process answers."""
+    """Set the playhead as if it had played for a time. Request a pause, which the next process answers."""
     head = segment.blocks["cell"].playhead
     assert head is not None
     play, now_ns = head.read(), segment.clock.present_ns()
@@ -288,7 +288,7 @@ def play_and_request_pause(segment: Segment, for_ns: int) -> tuple[Playhead, int
 
 
 def test_request_in_the_next_round_waits_for_the_end_of_this_one(tmp_path: Path, instance: str) -> None:
-    """A delayed source plays up to the place of the pause, and shows no frame twice."""
+    """A delayed source plays up to the position of the pause, and publishes no frame twice."""
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
         with Playing(segment, file, loop=True, paused=True):
@@ -314,7 +314,7 @@ def test_late_request_takes_effect_at_its_own_time(paused_replay: tuple[Playing,
 
 
 def test_frames_due_before_a_request_come_before_its_answer(tmp_path: Path, instance: str) -> None:
-    """After the answer to a pause, all frames are there and no more come."""
+    """When a pause is answered, all frames up to the pause are there, and no more come."""
     file = record(tmp_path, instance, frames=400)
     with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
         with Playing(segment, file, paused=True):
@@ -326,7 +326,7 @@ def test_frames_due_before_a_request_come_before_its_answer(tmp_path: Path, inst
 
 
 def test_request_just_after_a_wrap_takes_effect_in_the_next_round(tmp_path: Path, instance: str) -> None:
-    """The requesting program may have read the clock after the source did."""
+    """The requesting program may have read the clock later than the source did."""
     file = record(tmp_path, instance)
     with (
         built(instance, stepped=False) as segment,

@@ -1,4 +1,4 @@
-"""Edge cases of a replay: several recordings, a source that begins late, invalid times."""
+"""Edge cases of a replay: several recordings, a source whose recording begins late, invalid times."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_successor_repeats_no_event(tmp_path: Path, instance: str, monkeypatch: 
 def test_delayed_process_does_not_read_the_frames_that_it_skips(
     tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Reading them would delay it even more."""
+    """Reading these frames would delay the process even more."""
     with recorded(tmp_path, instance) as [cell]:
         for number in range(2000):
             cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))

@@ -141,7 +141,7 @@ def test_replay_refuses_writes(tmp_path: Path, instance: str) -> None:
 
 
 def test_gap_is_bad_until_the_recording_continues(tmp_path: Path, instance: str) -> None:
-    """The source overtook the recorder, so the recording has a gap."""
+    """The source was faster than the recorder, so the recording has a gap."""
     with recorded(tmp_path, instance) as [cell]:
         slots = cell.writer.block.ring.slot_count
         for number in range(slots + 10):
@@ -210,7 +210,7 @@ def test_long_step_plays_each_round_of_a_loop(tmp_path: Path, instance: str) -> 
 
 
 def test_frames_before_a_step_are_known_though_the_loop_restarts_within_it(tmp_path: Path, instance: str) -> None:
-    """A model that computes the step must see them, whichever process is faster."""
+    """A model that computes the step must see the frames before it, whichever process is faster."""
     file = record(tmp_path, instance)
     with built(instance) as segment, Playing(segment, file, loop=True) as cell:
         coordinator = Coordinator(segment)
@@ -230,7 +230,7 @@ def test_frames_before_a_step_are_known_though_the_loop_restarts_within_it(tmp_p
 
 
 def test_loop_skips_frames_of_earlier_rounds(tmp_path: Path, instance: str) -> None:
-    """The shown frame is always of the current round."""
+    """The newest frame is always of the current round."""
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, Playing(segment, file, loop=True, paused=True) as cell:
         cell.next()
@@ -346,7 +346,7 @@ def test_requests_for_an_earlier_recording_are_ignored(tmp_path: Path, instance:
 
 
 def test_age_is_in_recorded_time(tmp_path: Path, instance: str) -> None:
-    """A slow replay does not become stale."""
+    """Values of a slow replay do not become stale."""
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, Playing(segment, file, speed=0.01) as cell:
         frame = cell.next()

@@ -41,7 +41,7 @@ class Bridge:
             self._process.communicate(timeout=20)
 
     def start(self) -> None:
-        """Start the process, also again."""
+        """Start the process, for the first time or again."""
         command = ["node", str(NODE / "rosbridge_server.js"), str(self.address.port)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -49,12 +49,12 @@ class Bridge:
         assert self._line() == "ready"
 
     def kill(self) -> None:
-        """End the process at once."""
+        """Kill the process."""
         self._process.kill()
         self._process.communicate(timeout=20)
 
     def freeze(self) -> None:
-        """Stop the process, whose connections stay open."""
+        """Stop the process (SIGSTOP). Its connections stay open."""
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
@@ -66,7 +66,7 @@ class Bridge:
         return json.loads(self._process.stdout.readline())
 
     def ask(self, *words: object) -> Any:
-        """Send a command of the server's; return its result."""
+        """Send a command to the server; return its result."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(words) + "\n")
         self._process.stdin.flush()
@@ -74,7 +74,7 @@ class Bridge:
 
 
 def framing(data: bytes | bytearray) -> int:
-    """Return the length of the frame, or of the answer to the handshake, at the start of ``data``; 0 if unknown yet."""
+    """Return the length of the frame or handshake answer at the start of ``data``; 0 if it is not known yet."""
     if data.startswith(b"HTTP"):
         return data.find(b"\r\n\r\n") + 4 if b"\r\n\r\n" in data else 0
     if len(data) < 2:

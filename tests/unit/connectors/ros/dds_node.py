@@ -1,6 +1,6 @@
-"""A node of ROS 2 as a program, made with cyclonedds; its types are written from the public definitions, not ours.
+"""A ROS 2 node as a program, made with cyclonedds, with types written from the public definitions rather than ours.
 
-Usage: dds_node.py DOMAIN PREFIX; it takes commands on standard input, a JSON list a line, and answers each.
+Usage: dds_node.py DOMAIN PREFIX. Each line of its standard input is a command, a JSON list. It answers each.
 """
 
 import json
@@ -78,7 +78,7 @@ RELIABLE = Policy.Reliability.Reliable(10**9)
 
 
 class Node:
-    """What the node publishes, and what it has received."""
+    """A node: the topics that it publishes, and the messages that it has received."""
 
     def __init__(self, domain: str, prefix: str) -> None:
         self.domain, self.prefix = int(domain), prefix

@@ -1,4 +1,4 @@
-"""Nodes of ROS 2 for tests, in processes of their own: ``dds_node.py``."""
+"""ROS 2 nodes for tests, each in a separate process that runs ``dds_node.py``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _numbers = itertools.count(1)
 
 
 class Peer:
-    """A running node; its topics begin with ``prefix``, so that tests do not disturb each other."""
+    """A running node. Its topics begin with ``prefix``, so that tests do not disturb each other."""
 
     def __init__(self) -> None:
         if importlib.util.find_spec("cyclonedds") is None:
@@ -40,18 +40,18 @@ class Peer:
         self._process.communicate(timeout=20)
 
     def start(self) -> None:
-        """Start the process, also again."""
+        """Start the process, for the first time or again."""
         command = [sys.executable, str(PROGRAM), str(self.domain), self.prefix]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert self._line() == "ready"
 
     def kill(self) -> None:
-        """End the process at once."""
+        """Kill the process."""
         self._process.kill()
         self._process.communicate(timeout=20)
 
     def freeze(self) -> None:
-        """Stop the process."""
+        """Stop the process (SIGSTOP)."""
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
@@ -70,5 +70,5 @@ class Peer:
         return self._line()
 
     def address(self, topic: str, rest: str) -> str:
-        """Return the address of a field of one of the node's topics."""
+        """Return the address of a field in one of the node's topics."""
         return f"/{self.prefix}/{topic} {rest}"

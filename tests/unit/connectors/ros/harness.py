@@ -1,4 +1,4 @@
-"""A connector with a tag table, and what its images say."""
+"""A connector with a tag table, for tests of its images and writes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NEVER = threading.Event()
 
 
 def layout_of(tags: Mapping[str, tuple[str, str] | dict[str, Any]]) -> Layout:
-    """Return a layout; a tag is (type, address), or as in a table."""
+    """Return a layout. Each tag is (type, address), or a dict with the keys of a tag table."""
     given = {path: {"type": tag[0], "address": tag[1]} if isinstance(tag, tuple) else tag for path, tag in tags.items()}
     return place_tags("robot", given).with_statuses()
 

@@ -1,4 +1,4 @@
-"""The addresses of fields, and how they find values in messages."""
+"""The addresses of message fields: how they are parsed, and which values of a message they find."""
 
 from __future__ import annotations
 

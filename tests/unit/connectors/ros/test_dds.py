@@ -1,4 +1,4 @@
-"""The ros2 connector with nodes that have type definitions of their own."""
+"""The ros2 connector with nodes that have their own type definitions."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def descriptors() -> set[int]:
 
 
 def test_other_hosts_are_kept_out(peer: Peer) -> None:
-    """The library binds its receiving sockets to all addresses; the connector keeps them to loopback."""
+    """The library binds its receiving sockets to all addresses, but the connector rebinds them to loopback."""
     before = descriptors()
     devices = []
     with connected(peer):

@@ -1,4 +1,7 @@
-"""Servers that do not speak rosbridge, or do so to do harm: in time, with little memory, and without a wrong value."""
+"""Servers that do not speak rosbridge, or speak it to do harm.
+
+The connector fails in time, uses little memory, and never shows a wrong value.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ _KEY = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
 
 def upgraded(then: hostile.Behaviour) -> hostile.Behaviour:
-    """Open a WebSocket as a server does, and then behave like this."""
+    """Open a WebSocket as a server does, and then do what ``then`` does."""
 
     def behave(client: socket.socket) -> None:
         request = b""
@@ -43,7 +46,7 @@ def upgraded(then: hostile.Behaviour) -> hostile.Behaviour:
 
 
 def alive(fragments: bytes) -> hostile.Behaviour:
-    """Begin a message, send the same again and again, and answer each ping."""
+    """Begin a message, send the same fragments again and again, and answer each ping."""
 
     def behave(client: socket.socket) -> None:
         waiting = bytearray()
@@ -123,7 +126,7 @@ def test_a_hostile_server_is_refused_in_time_and_costs_little(behave: hostile.Be
 
 
 def read_on(connector: RosbridgeConnector) -> None:
-    """Read until there is an error; fail if a value is shown as good."""
+    """Read until the connector raises an error. Fail if it shows a value as good."""
     connector.connect()
     area = StatusArea(LAYOUT)
     while area.get(connector.read(), 0).code != GOOD:

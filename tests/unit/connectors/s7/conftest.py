@@ -16,7 +16,7 @@ from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
 
 @pytest.fixture
 def make_plc() -> Iterator[MakePlc]:
-    """Make controllers with given traits."""
+    """Return a function that starts a controller with the given properties."""
     with ExitStack() as stack:
 
         def make(traits: Traits, kind: type[S7Server] = S7Server) -> Plc:

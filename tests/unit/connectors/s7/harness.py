@@ -1,4 +1,4 @@
-"""An emulated controller behind a proxy, and clients of it."""
+"""An emulated controller behind a proxy, and S7 clients that connect to it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MakePlc(Protocol):
 
 
 def assert_recovers(plc: Plc, client: S7Client) -> None:
-    """The error has closed the client; with the fault gone, it connects and reads."""
+    """Assert that the error has closed the client, and that it connects and reads again without the fault."""
     assert not client.connected
     with pytest.raises(ConnectorError, match="not connected"):
         client.read()

@@ -1,4 +1,4 @@
-"""Reading a block with answers in any split and order: it is complete, or refused."""
+"""Reading a block from answers that arrive split and in any order: the block is complete, or refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The size of a block is found with few jobs."""
+"""The client finds the size of a block with few jobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes in waves, whose jobs are served in any order, have the effect of single writes."""
+"""Writes are sent in waves of jobs. In any order of service, they have the effect of single writes."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_many_small_writes_go_in_few_jobs() -> None:
 
 
 def items(requests: bytes) -> list[tuple[int, bool]]:
-    """Return (first bit, writes a single bit) for each item, in the order of sending."""
+    """Return (first bit, whether a single bit is written) for each item, in the order of sending."""
     found = []
     for request in split(requests):
         places = range(19, 19 + 12 * request[18], 12)
@@ -114,7 +114,7 @@ def items(requests: bytes) -> list[tuple[int, bool]]:
 @settings(max_examples=30)
 @given(order=st.permutations(range(90)), pdu_size=st.sampled_from([100, 240, 960]), size=st.sampled_from([1, 3, 300]))
 def test_data_are_sent_before_their_strobe(order: list[int], pdu_size: int, size: int) -> None:
-    """Writes keep their order within a job and from job to job, whatever their offsets are."""
+    """Writes keep their order, within a job and from job to job, at any offsets."""
     writes: list[Write] = []
     wanted = []
     for data, strobe in zip(order[:45], order[45:], strict=True):
@@ -186,7 +186,7 @@ ANSWER = bytes.fromhex("03000018 02f080 32 03 0000 0007 0002 0003 00 00 05 03 ff
 
 
 def test_one_job_of_bytes_and_a_bit() -> None:
-    """The odd value in the middle is padded; the last one is not."""
+    """Data of odd length are padded in the middle of a job, but not at its end."""
     items = [
         byte_item(201, 462, b"abc"),
         bit_item(201, 7, 5, True),

@@ -28,7 +28,7 @@ Scripted = Callable[..., S7Client]
 
 @pytest.fixture
 def scripted() -> Iterator[Scripted]:
-    """Makes a client of a peer that sends one answer for each thing that it receives, then closes."""
+    """Return a function that makes a client. Its peer sends one of the given answers for each message, then closes."""
     with ExitStack() as stack:
 
         def make(*answers: bytes, timeout: int = 60_000, size: int = SIZE) -> S7Client:
@@ -380,7 +380,7 @@ def test_bytes_after_the_last_answer_end_the_session(scripted: Scripted) -> None
 
 
 def confirm(parameters: bytes, *, kind: int = 0xD0, indicator: int | None = None, length: int | None = None) -> bytes:
-    """A connection confirm; its lengths are right unless they are given."""
+    """Return a connection confirm. Its lengths are correct unless they are given."""
     head = bytes(((6 + len(parameters)) & 255 if indicator is None else indicator, kind, 0, 1, 0, 7, 0))
     whole = 4 + len(head) + len(parameters) if length is None else length
     return struct.pack(">BxH", 3, whole) + head + parameters
@@ -450,7 +450,7 @@ def test_a_peer_that_falls_silent_at_any_point_of_the_set_up(answers: tuple[byte
 
 
 def test_endless_input_during_the_set_up_takes_no_memory(scripted: Scripted) -> None:
-    """Bytes after the confirm stay in the kernel's buffer."""
+    """Bytes after the connection confirm stay in the kernel's buffer."""
     client = scripted(CONFIRM + bytes.fromhex("03000007 02f080") * 200_000)
     tracemalloc.start()
     with pytest.raises(ConnectorError):

@@ -1,4 +1,4 @@
-"""Several reads under way: each image is complete, in order, and of its own answers."""
+"""Several reads are under way at once: each image is complete, in order, and made of its own answers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def wide(make_plc: MakePlc) -> Plc:
 
 
 class Answers:
-    """Counts the answers of the controller."""
+    """Counts the controller's answers."""
 
     def __init__(self, plc: Plc) -> None:
         self._count = 0
@@ -119,7 +119,7 @@ def test_incomplete_image_is_not_returned(wide: Plc) -> None:
 
 
 def test_each_read_has_its_own_time_out(wide: Plc) -> None:
-    """The first read has its answer; the second times out, though the connection is open."""
+    """The first read gets its answer. The second read times out although the connection is open."""
     client = wide.connected(timeout=300)
     client.submit()
     assert image(client) == wide.block
@@ -131,7 +131,7 @@ def test_each_read_has_its_own_time_out(wide: Plc) -> None:
 
 
 def test_an_answer_in_time_counts_even_if_it_is_collected_late(wide: Plc) -> None:
-    """The write receives the answers of the read under way; its duration does not make them late."""
+    """A write receives the answers of the read under way. The write's duration does not make them late."""
     client = wide.connected(timeout=200)
     client.submit()
     Answers(wide)

@@ -1,4 +1,4 @@
-"""The client's diagnosis of a controller that refuses reads, or does not run."""
+"""How the client diagnoses a controller that refuses reads or is not running."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_refusal_is_reported_if_the_size_cannot_be_found(make_plc: MakePlc) -> N
 
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ask for the mode with every read."""
+    """Make the client ask for the operating mode with every read."""
     monkeypatch.setattr(mode, "INTERVAL_NS", 0)
 
 
@@ -121,7 +121,7 @@ class Ignorant(S7Server):
 
 
 class Touchy(S7Server):
-    """A controller that closes the connection on an unknown request."""
+    """A controller that closes the connection when it receives an unknown request."""
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
         return None
@@ -161,7 +161,7 @@ def test_a_controller_that_is_silent_when_asked(plc: Plc) -> None:
 
 
 def test_unanswered_mode_query_ends_the_session(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The controller has answered before: the connection is faulty, and reads alone do not show it."""
+    """The controller has answered such queries before, so the connection is faulty. Reads alone do not show that."""
     client = plc.connected(timeout=200)
     monkeypatch.setattr(mode, "INTERVAL_NS", 0)
     plc.proxy.edit(lambda frame: None if frame[8] == 7 else frame)

@@ -19,7 +19,7 @@ from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc, assert_recovers
 
 
 class Clock:
-    """The real clock plus an offset: answers seem to come seconds apart without any waiting."""
+    """The real clock plus an offset, so that answers seem to take seconds without any waiting."""
 
     def __init__(self) -> None:
         self._moved_ns = 0
@@ -31,7 +31,7 @@ class Clock:
         self._moved_ns += by_s * 10**9
 
     def slow_down(self, plc: Plc, answer_s: int) -> None:
-        """Let answers to writes seem to take so long; others, which come at any time, take none."""
+        """Make each answer to a write seem to take ``answer_s`` seconds. Other answers take no time."""
 
         def pass_on(frame: bytes) -> bytes:
             if frame[8] == 3 and frame[19] == 5:  # an answer to a job, which writes
@@ -74,7 +74,7 @@ def test_nothing_to_write(plc: Plc) -> None:
 
 
 def test_bit_write_leaves_the_other_bits_to_the_program(plc: Plc) -> None:
-    """The program counts in the other bits of the byte all the time. No count may be lost."""
+    """The PLC's program counts in the other bits of the byte all the time. No count may be lost."""
     client = plc.connected()
     plc.block[7] = 0
     stopping = threading.Event()
@@ -111,7 +111,7 @@ def test_a_write_passes_between_reads_under_way(make_plc: MakePlc) -> None:
 
 
 def test_a_refused_item_among_good_ones(plc: Plc) -> None:
-    """A write beyond the end of the block is refused; the others are carried out."""
+    """The controller refuses a write beyond the end of the block, and carries out the others."""
     client = plc.connected(size=SIZE)
     outcomes = client.write([Write(0, 0, b"one"), Write(SIZE, 0, b"two"), Write(9, 2, b"\2")])
     assert [outcomes[0], outcomes[2]] == ["", ""]
@@ -184,7 +184,7 @@ def test_the_connection_is_lost_in_mid_write(make_plc: MakePlc, count: int) -> N
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_outcome_of_each_write_after_a_lost_connection(make_plc: MakePlc, jobs: int) -> None:
-    """Each answer lets the next job be sent, so the jobs after those under way were never sent."""
+    """Each answer lets the next job be sent. Jobs after those under way were therefore never sent."""
     plc = make_plc(Traits(max_pdu_size=240, max_jobs=jobs))
     client = plc.connected(timeout=300)
     writes = [Write(SIZE, 0, b"?"), *(Write(at, 0, b"\xee" * 200) for at in range(0, 2000, 200))]  # a job each
@@ -250,7 +250,7 @@ def test_without_a_session_nothing_is_sent(plc: Plc) -> None:
 
 
 def test_refused_read_does_not_affect_a_write(make_plc: MakePlc) -> None:
-    """The outcome of the write is known and returned; the read then ends the connection."""
+    """The outcome of the write is known and returned. The refused read then ends the connection."""
     plc = make_plc(Traits(block_size=1000))
     client = plc.connected()
     client.submit()
@@ -264,7 +264,7 @@ SCATTERED = [Write(2 * place, 1 << place % 8, b"\xff") for place in range(60)]  
 
 
 def test_slow_controller_does_not_time_out(make_plc: MakePlc, clock: Clock) -> None:
-    """Each answer has the whole time-out; reads that wait behind the writes are not late."""
+    """Each answer may take the whole time-out. Reads that wait behind writes do not count as late."""
     plc = make_plc(Traits(max_jobs=1))
     client = plc.connected(timeout=5000)
     clock.slow_down(plc, 4)
@@ -284,7 +284,7 @@ def test_slow_controller_does_not_time_out(make_plc: MakePlc, clock: Clock) -> N
 
 @pytest.mark.parametrize(("timeout_s", "most_s"), [(5, 20), (30, 30)])
 def test_duration_of_a_batch_is_bounded(make_plc: MakePlc, clock: Clock, timeout_s: int, most_s: int) -> None:
-    """The supervisor takes a source's process for hung if a call does not return."""
+    """Otherwise the supervisor would consider the source's process hung, because a call does not return."""
     plc = make_plc(Traits(max_jobs=1))
     client = plc.connected(timeout=1000 * timeout_s)
     clock.slow_down(plc, 4)

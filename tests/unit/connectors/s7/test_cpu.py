@@ -1,4 +1,7 @@
-"""Registers with values of the CPU: read from the emulator, python-snap7's server, and CPUs that refuse."""
+"""Registers with values of the CPU.
+
+The tests read them from shmio's emulator, from python-snap7's server, and from CPUs that refuse.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,7 @@ IDENTITY: dict[str, Value] = {
 
 
 class Refusing(S7Server):
-    """Refuses some questions, as CPUs do whose firmware does not know them, or answers them in another way."""
+    """An emulator that refuses some questions, as CPUs with older firmware do, or answers them differently."""
 
     refused: Callable[[bytes], bool] = staticmethod(lambda _: True)
     asked = 0
@@ -85,7 +88,7 @@ def serving(plc: Plc, kind: type[S7Server] = S7Server, traits: Traits | None = N
 
 
 def settled(layout_tags: dict[str, object], port: int) -> tuple[dict[str, Value], dict[str, int]]:
-    """Return values and statuses as soon as no register waits for its first value."""
+    """Return values and statuses as soon as every register has received its first value."""
     layout = table(layout_tags)
     with connected(layout, port) as connector:
         for _ in range(1000):
@@ -101,7 +104,7 @@ def settled(layout_tags: dict[str, object], port: int) -> tuple[dict[str, Value]
 
 @pytest.mark.parametrize("pdu_size", [100, 240, 960])
 def test_what_the_cpu_is_does_and_says_of_the_time(pdu_size: int) -> None:
-    """With a PDU of 100 bytes the names come in three parts."""
+    """With a PDU of 100 bytes, the CPU's names arrive in three parts."""
     before = dt.datetime.now().replace(microsecond=0)
     with serving(Plc(), traits=Traits(max_pdu_size=pdu_size)) as server:
         found, statuses = settled(CPU, server.address.port)
@@ -114,7 +117,7 @@ def test_what_the_cpu_is_does_and_says_of_the_time(pdu_size: int) -> None:
 
 
 def test_python_snap7s_server_is_read_as_far_as_it_answers() -> None:
-    """Its lists of the mode and the firmware are missing, and that of names has no records."""
+    """This server has no lists of mode and firmware, and its list of names has no records."""
     with served_by_snap7(Plc()) as port:
         found, statuses = settled(CPU, port)
     assert found["code"] == "6ES7 315-2EH14-0AB0"
@@ -181,7 +184,7 @@ def test_values_of_another_session_are_not_shown() -> None:
 
 
 def test_a_cpu_that_never_answers_is_not_asked_for_ever(caplog: pytest.LogCaptureFixture) -> None:
-    """It closes the connection at each question: twice for each of the four, and then the data are read."""
+    """The CPU closes the connection at each question. After two attempts at each of the four, the source reads data."""
 
     class Closing(Refusing):
         def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
@@ -279,7 +282,7 @@ def test_a_table_of_nothing_else_is_a_fault_of_the_configuration() -> None:
 
 
 def test_requests() -> None:
-    """As python-snap7 sends them, but for the reference."""
+    """The requests equal those of python-snap7, except for the reference."""
     wanted = "03000021 02f080 32 07 0000 0102 0008 0008 00 01 12 04 11 44 01 00 ff 09 0004 001c 0000"
     assert userdata.request(0x0102, userdata.READ_SZL, userdata.szl_data(0x1C)) == bytes.fromhex(wanted)
     wanted = "0300001d 02f080 32 07 0000 0102 0008 0004 00 01 12 04 11 47 01 00 0a 00 0000"

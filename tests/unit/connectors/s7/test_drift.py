@@ -57,7 +57,7 @@ def emulated(data: bytearray, traits: Traits | None = None) -> Iterator[S7Server
 
 @contextlib.contextmanager
 def reading(layout: Layout, port: int) -> Iterator[Connector]:
-    """Connect a source with a data block's layout, DB1."""
+    """Connect a source whose layout is the data block DB1."""
     options = S7Options(host="127.0.0.1", port=port, timeout=2000, dbNumber=1)
     with contextlib.closing(S7Connector.for_layout(layout)(options, layout)) as connector:
         connector.connect()
@@ -71,7 +71,7 @@ def again(connector: Connector) -> None:
 
 @pytest.fixture
 def pass_a_minute(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """Let the time pass after which a block is looked at again."""
+    """Return a function that advances the clock until the source examines the block again."""
     return lambda: monkeypatch.setattr("shmio.connectors.s7.session.time.monotonic_ns", later(INTERVAL_NS))
 
 
@@ -176,7 +176,7 @@ def plc() -> Iterator[S7Server]:
 def test_of_a_tag_table_only_the_registers_beyond_the_end_are_bad(
     plc: S7Server, caplog: pytest.LogCaptureFixture, pass_a_minute: Callable[[], None]
 ) -> None:
-    """Those that are left in a block that became shorter are uncertain: they may have moved."""
+    """The registers that remain in a shortened block are uncertain, because they may have moved."""
     layout = table(TAGS)
     with connected(layout, plc.address.port) as connector:
         for _ in range(5):
@@ -251,7 +251,7 @@ def test_a_controller_that_tells_nothing_of_its_blocks_is_asked_once_a_session(
 
 
 def test_python_snap7s_server_tells_the_length(caplog: pytest.LogCaptureFixture) -> None:
-    """It has no checksum; the blocks of Plc have 100 bytes."""
+    """This server reports no checksum. The blocks of Plc have 100 bytes."""
     plc = Plc()
     with served_by_snap7(plc) as port, reading(press(), port) as connector:
         for _ in range(5):
@@ -278,7 +278,7 @@ def test_python_snap7s_client_reads_the_emulators_information() -> None:
 
 
 def test_information_about_a_block() -> None:
-    """From the description in Snap7: DB 5 of 84 bytes, compiled on day 11,000 and 12,000."""
+    """The answer follows the description in Snap7: DB 5 of 84 bytes, compiled on days 11,000 and 12,000."""
     data = bytes.fromhex(
         "30 41 0001 0022 0000 00 01 05 0a 0005 0000007c 00000000 00000102 2af8 00000304 2ee0 0000 0000 0000 0054"
         "0000000000000000 0000000000000000 0000000000000000 01 00 beef 00000000 00000000"

@@ -1,4 +1,4 @@
-"""Every refusal that a user meets must say what to do."""
+"""Every message about a refusal that a user meets says what to do."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_refused_jobs(error: int, text: str) -> None:
 
 
 def test_every_text_fits_into_the_reason_of_a_frame() -> None:
-    """A longer text would be cut off at its end, the remedy."""
+    """A longer text would lose its end, which is the remedy."""
     texts = [explain.explain_error(error) for error in (0x8104, 0x8304, 0xD241, *range(0x8000, 0x8800))]
     for code in range(256):
         texts += [explain.explain_read(code, 65535, 65536), explain.explain_write(code, 65535, 65535)]

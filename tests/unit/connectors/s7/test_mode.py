@@ -1,4 +1,4 @@
-"""The operating mode: its query, the resulting doubt, and controllers that do not answer."""
+"""The operating mode: its query, the doubt that follows from its answer, and controllers that do not answer."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def test_a_bit_is_written_without_its_neighbours() -> None:
 
 
 def test_refused_registers_are_found_and_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of a range lies behind the end of a block, and one block is missing, until both are there."""
+    """At first, half of a range lies beyond the end of a block, and one block is missing. Later both exist."""
     tags: dict[str, object] = {f"r{at}": {"type": "INT", "address": f"DB1.DBW{at}"} for at in range(80, 120, 2)}
     tags["gone"] = {"type": "INT", "address": "DB3.DBW0"}
     layout, plc = table(tags), Plc()
@@ -295,7 +295,7 @@ def test_any_answer_is_parsed_or_a_fault(noise: bytes, sizes: list[int], headed:
 
 
 def test_data_behind_an_item_that_is_too_short_are_no_refusal() -> None:
-    """The first item lacks its data; the head and data of the second one would fit in their place."""
+    """The first item lacks its data. The header and data of the second item would fit in their place."""
     data = b"\xff\x04\0\x20" + b"\xff\x04\0\x20" + b"0123"
     head = struct.pack(">BxH3sBB2xHHHH", 3, 0, b"\x02\xf0\x80", 0x32, 3, 1, 2, len(data), 0) + b"\x04\x02"
     with pytest.raises(ConnectorError, match="return code 0x30 and length 12851"):

@@ -1,7 +1,7 @@
-"""A tag table read from a controller whose answers are changed on the way: counts, lengths, codes, garbage.
+"""A tag table read from a controller whose answers a proxy changes: counts, lengths, codes, garbage.
 
-Whatever comes, a read ends in an image or a ConnectorError, a good register has the controller's
-value, the number of requests is bounded, and the connector recovers.
+Whatever arrives, a read ends in an image or a ConnectorError. A good register has the controller's value, the number
+of requests is bounded, and the connector recovers.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from tests.unit.connectors.s7.test_cpu import CPU
 from tests.unit.connectors.s7.test_table import table, values
 
 READS = 3
-"""Reads during which answers are changed."""
+"""Number of reads during which answers are changed."""
 SPARE = 40
-"""Requests of a read besides those that halve ranges: the mode, the CPU, a block, refused registers."""
+"""Maximum number of requests of a read that do not halve ranges: for the mode, the CPU, a block, refused registers."""
 SIZE = 400
 TAGS: dict[str, object] = {
     **{f"int/{at}": {"type": "INT", "address": f"DB1.DBW{at}"} for at in range(0, 60, 6)},
@@ -75,7 +75,7 @@ def items_of(frame: bytes) -> list[Item] | None:
 
 
 def with_items(frame: bytes, items: list[Item], count: int | None = None) -> bytes:
-    """Return the answer with other items, and correct lengths of the whole."""
+    """Return the answer with other items. Its lengths are correct."""
     parts = [struct.pack(">BBH", *item[:3]) + item.data for item in items]
     data = b"".join(part + bytes(len(part) & 1) for part in parts[:-1]) + (parts[-1] if parts else b"")
     head = frame[7:13] + struct.pack(">HHH", 2, len(data), 0)
@@ -87,7 +87,7 @@ Change = Callable[[bytes], bytes | None]
 
 
 def of_items(change: Callable[[list[Item]], list[Item]], count: int | None = None) -> Change:
-    """Change the items of answers to reads; other frames pass."""
+    """Return a change of the items of answers to reads. It leaves other frames unchanged."""
 
     def changed(frame: bytes) -> bytes:
         items = items_of(frame)
@@ -105,14 +105,14 @@ def of_one(at: int, change: Callable[[Item], Item]) -> Change:
 
 
 def refused_job(error: int) -> Change:
-    """Refuse the whole job, or userdata, by a header error."""
+    """Return a change that refuses the whole job, or the userdata request, by an error in the header."""
     return lambda frame: (
         frame[:2] + b"\0\x13" + frame[4:8] + b"\2" + frame[9:13] + b"\0\0\0\0" + error.to_bytes(2, "big")
     )
 
 
 def patched(place: int, value: int) -> Change:
-    """Change a byte before the data, but not the reference: it says whose answer it is."""
+    """Return a change of one byte before the data. It spares the reference, which says whose answer it is."""
 
     def changed(frame: bytes) -> bytes:
         at = place % 21
@@ -124,7 +124,7 @@ def patched(place: int, value: int) -> Change:
 
 
 def resized(cut: int, tail: bytes) -> Change:
-    """Cut the end of a frame off, and add another, with a correct TPKT length."""
+    """Return a change that replaces the end of a frame, with a correct TPKT length."""
 
     def changed(frame: bytes) -> bytes:
         body = frame[4 : max(7, len(frame) - cut)] + tail
@@ -161,7 +161,7 @@ CHANGES: st.SearchStrategy[Change] = st.one_of(
 
 
 class Plc:
-    """A controller whose memory changes before each read, behind a proxy, which changes answers by a list."""
+    """A controller whose memory changes before each read, behind a proxy that changes the answers."""
 
     def __init__(self, server: S7Server, proxy: FaultProxy, memory: dict[Place, bytearray]) -> None:
         self.server, self.proxy, self.memory = server, proxy, memory
@@ -170,7 +170,10 @@ class Plc:
         self._table = TableMemory(LAYOUT)
 
     def change(self, changes: list[Change]) -> None:
-        """Change the next answers by the list, and those after it by the list again."""
+        """Change the next answers, one by each change of the list.
+
+        After the last change, begin again with the first.
+        """
         begun = self.frames
 
         def edit(frame: bytes) -> bytes | None:
@@ -182,7 +185,7 @@ class Plc:
     def turn(self) -> dict[str, Value]:
         """Change all bytes of the memory, and return the registers' values.
 
-        No byte is the return code of a good item, so that data are never taken for items.
+        No byte equals the return code of a good item, so that data are never mistaken for items.
         """
         self.turns += 1
         with self.server.lock:
@@ -221,7 +224,7 @@ def connector_of(plc: Plc) -> Iterator[Connector]:
 
 
 def read(plc: Plc, connector: Connector) -> set[str]:
-    """Read once; check that good registers have their present values, and return those that are not bad."""
+    """Read once. Check that good registers have their present values, and return those that are not bad."""
     wanted, usable = plc.turn(), set()
     with contextlib.suppress(ConnectorError):
         if not getattr(connector, "connected", False):
@@ -264,7 +267,7 @@ def test_no_answer_gives_a_wrong_value(plc: Plc, changes: list[Change]) -> None:
 
 
 def test_the_values_of_the_cpu_come_back_in_the_next_session(plc: Plc) -> None:
-    """An answer to one question is changed once."""
+    """The proxy changes an answer to one question once."""
     with connector_of(plc) as connector:
         changed = 0
 

@@ -1,4 +1,4 @@
-"""Each answer goes once, to the operation that asked for it."""
+"""Each answer is passed once, to the operation that asked for it."""
 
 from __future__ import annotations
 

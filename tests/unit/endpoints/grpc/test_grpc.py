@@ -1,4 +1,4 @@
-"""The gRPC endpoint over real sockets: a segment on one side, a client on the other."""
+"""The gRPC endpoint over real sockets: the test publishes into a segment, and a client receives."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ async def shadow(served: Endpoint, target: str, prefix: str = "shadow/test 1", s
 async def reaches(served: Endpoint, device: Plant, step: bytes) -> None:
     """Wait until the device has the value.
 
-    Write returns when the source has accepted it; the device gets it a cycle later.
+    Write returns when the source has accepted the value. The device gets it a cycle later.
     """
 
     async def condition() -> bool:
@@ -59,7 +59,7 @@ async def info(served: Endpoint, path: str) -> tuple[int, int, bool]:
 
 
 def test_a_typical_injecting_client(segment: Segment) -> None:
-    """The calls of the wire contract, in order."""
+    """The client makes the calls of the wire contract, in order."""
 
     async def test(served: Endpoint, device: Plant) -> None:
         published: Any = served.v2.Publish(timeout=TIMEOUT_S)

@@ -49,6 +49,6 @@ def test_a_limit_is_as_documented(what: str, limit: float) -> None:
 
 
 def test_the_clients_keepalive_interval_is_allowed_by_the_server() -> None:
-    """gRPC would end the connection of a client with idle streams after a minute or two."""
+    """Otherwise gRPC would end the connection of a client with idle streams after a minute or two."""
     allowed_ms = dict(server.OPTIONS)["grpc.http2.min_ping_interval_without_data_ms"]
     assert allowed_ms < dict(calls.OPTIONS)["grpc.keepalive_time_ms"]

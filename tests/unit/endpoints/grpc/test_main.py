@@ -52,7 +52,7 @@ def test_no_call_starts_between_new_feeds_and_the_move_of_open_calls() -> None:
 def test_the_heartbeat_continues_while_layouts_are_read(
     segment: Segment, instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without a heartbeat, a reload of large layouts would get the endpoint killed."""
+    """Without a heartbeat, the supervisor would kill the endpoint during a reload of large layouts."""
     begun, going_on = threading.Event(), threading.Event()
     stops: list[Callable[[], object]] = []
     beats: list[object] = []
@@ -144,7 +144,7 @@ def test_a_stop_with_open_streams_leaves_no_traceback(
 
 
 class Turn(asyncio.Lock):
-    """A lock that signals when a task has to wait for it."""
+    """A lock that signals when a task waits for it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -157,7 +157,7 @@ class Turn(asyncio.Lock):
 
 
 def test_of_two_concurrent_reloads_the_later_one_applies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second reload starts while the first reads its file; a removed token must not return."""
+    """The second reload starts while the first reads its file. A token that the second removes must not return."""
     begun, going_on = threading.Event(), threading.Event()
     numbers = itertools.count()
     taken: list[int] = []

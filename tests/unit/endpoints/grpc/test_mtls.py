@@ -29,7 +29,7 @@ Certificate = trustme.LeafCert | None
 
 
 class Party:
-    """The endpoint's certificate authorities, and clients with certificates of several kinds."""
+    """The certificate authorities of the endpoint, and clients with certificates of several kinds."""
 
     def __init__(self, folder: Path) -> None:
         self.server, self.clients = trustme.CA(), trustme.CA()

@@ -1,4 +1,4 @@
-"""A source that gives each register a status, as clients of gRPC see it."""
+"""What clients of gRPC see of a source that gives each register a status."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def selection(segment: Segment) -> Selection:
 
 
 def times(update: bytes | None) -> dict[int, int]:
-    """Return the source times that an update has, without their common part, by the register's index."""
+    """Return the source times in an update by register index, without the part that all of them share."""
     assert update is not None
     found = wire.Update.FromString(update).statuses
     return {place: time - SOURCE_NS for place, time in zip(found.registers, found.source_ns, strict=True)}

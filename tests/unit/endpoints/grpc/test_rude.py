@@ -295,7 +295,7 @@ def test_shmio_v1_streams_beyond_the_limit_are_refused_until_others_end(segment:
 
 
 async def first(stream: Any) -> Any:
-    """Return the first message; EOF if the stream is refused."""
+    """Return the first message of a stream; EOF if the stream is refused."""
     try:
         return await stream.read()
     except grpc.aio.AioRpcError:
@@ -311,7 +311,7 @@ async def until_streams(served: Endpoint, count: int) -> None:
 
 
 def test_a_shmio_v1_subscriber_that_never_reads_delays_no_other(segment: Segment) -> None:
-    """For this client the endpoint keeps only its position, and writes up to a bound."""
+    """For such a client the endpoint stores only its position, and writes only up to a limit."""
     both = ours.SubscribeRequest(patterns=["cell/long", "cell/long/in"], mode=ours.MODE_EVERY_FRAME)
 
     async def test(served: Endpoint, polite: Polite) -> None:
@@ -338,7 +338,7 @@ def test_a_shmio_v1_subscriber_that_never_reads_delays_no_other(segment: Segment
 
 @pytest.mark.parametrize("call", ["Inject", "Declare"])
 def test_a_client_that_does_not_read_its_injections_events_loses_it(segment: Segment, call: str) -> None:
-    """The stream itself would wait for the client, as long as the connection exists."""
+    """The injection ends. Otherwise the stream would wait for the client as long as the connection exists."""
     lay = ours.InjectRequest(lay=ours.Lay(patterns=["cell/inputs/in"]))
     request: Any = lay if call == "Inject" else ours.DeclareRequest(declarations=[NOISE])
     put = ours.WriteRequest(values=[ours.Assignment(path="cell/inputs/0", value=ours.Value(integer=1))])

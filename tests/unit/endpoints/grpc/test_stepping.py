@@ -1,4 +1,4 @@
-"""Time controlled by clients: what streams receive of a step, and when the call returns."""
+"""Time controlled by clients: what streams receive of a step, and when the step's call returns."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_every_value_of_a_step_comes_before_its_one_marker(instance: str) -> Non
 
 
 def test_all_streams_have_received_a_step_when_its_call_returns(instance: str) -> None:
-    """Messages written before the answer arrive before it, as they share a connection."""
+    """Messages sent before the answer arrive before it, because they share a connection."""
 
     async def test(served: Endpoint, models: Models) -> None:
         streams = [await served.subscriber(str(n), "sim/count", "SIMLOG://step") for n in range(5)]
@@ -182,7 +182,7 @@ def test_a_step_applies_the_writes_before_it_and_their_echo_comes_first(instance
 
 
 def test_version_1_publishes_values_between_steps(instance: str) -> None:
-    """The client waits until its values have arrived, as gRPC orders no two calls."""
+    """The client waits until its values have arrived, because gRPC does not order two calls."""
 
     async def test(served: Endpoint, models: Models) -> None:
         goal, write_subscriptions = await open_v1(served, "sim/goal"), await open_v1(served, "sim/goal/in")

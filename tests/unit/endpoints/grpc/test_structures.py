@@ -1,4 +1,4 @@
-"""Structures of known shape: message types of version 1, and values of version 2."""
+"""Structures of known types: message types of version 1, and values of version 2."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 def image(**values: object) -> bytes:
-    """Return a block's image with these values; in the names, __ stands for a slash."""
+    """Return a block's image with these values. In the names, __ stands for a slash."""
     frame = bytearray(LAYOUT.size)
     for name, value in values.items():
         codec(find(LAYOUT, name.replace("__", "/")), "little").encode_into(value, frame)

@@ -1,4 +1,4 @@
-"""Doorbells of blocks that wake listeners in the event loop."""
+"""Doorbells of blocks, which wake listeners in the event loop."""
 
 from __future__ import annotations
 

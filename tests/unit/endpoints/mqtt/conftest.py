@@ -25,7 +25,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def make_segment(instance: str) -> Iterator[Callable[[], Segment]]:
-    """Make more segments, each of another instance."""
+    """Return a function that makes further segments, each of another instance."""
     with ExitStack() as stack:
 
         def make() -> Segment:
@@ -40,7 +40,7 @@ def make_segment(instance: str) -> Iterator[Callable[[], Segment]]:
 
 @pytest.fixture
 def make_broker(tmp_path: Path) -> Iterator[Callable[..., Mosquitto]]:
-    """Start a mosquitto for this test."""
+    """Return a function that starts a mosquitto for this test."""
     if reason := missing():
         pytest.skip(reason)
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""A bridge in a thread, and a client that listens to its broker."""
+"""A bridge in a thread, and a client that subscribes to everything at its broker."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PREFIX = "shmio/test"
 
 
 class Listener:
-    """A client that receives everything and keeps it in order."""
+    """A client that receives everything, in order."""
 
     def __init__(
         self, address: Address, *filters: str, protocol: MQTTProtocolVersion = MQTTv5, qos: int = 1, **account: Any
@@ -122,7 +122,7 @@ class Running:
         self.bridge.close()
 
     def until(self, condition: Any) -> None:
-        """Wait until a condition holds that the bridge or its peer brings about."""
+        """Wait until the bridge or its peer has made a condition true."""
         with self._turned:
             assert self._turned.wait_for(condition, TIMEOUT_S), self.bridge.problem
 

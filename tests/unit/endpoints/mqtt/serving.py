@@ -1,4 +1,4 @@
-"""The broker that shmio starts, run in a thread; and a client that sends raw packets."""
+"""The broker that shmio starts, run in a thread, and a client that sends raw packets."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def address() -> Iterator[Address]:
 
 
 class Process:
-    """The broker's process, as far as the broker uses it."""
+    """The parts of the broker's process that the broker uses."""
 
     def __init__(self, segment: Segment, **config: Any) -> None:
         self.stopping, self.ready = threading.Event(), threading.Event()
@@ -75,7 +75,7 @@ class Process:
 
 @contextmanager
 def serving(segment: Segment, address: Address, program: str = "embedded", **config: Any) -> Iterator[Process]:
-    """Serve a broker; by default clients without an account may do everything."""
+    """Serve a broker. By default, clients without an account may do everything."""
     config.setdefault("prefix", PREFIX)
     config.setdefault("account", [{"roles": ["read", "write"], "publish": ["#"]}])
     process = Process(segment, broker=program, listen=str(address), **config)

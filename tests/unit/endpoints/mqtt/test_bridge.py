@@ -209,9 +209,9 @@ def test_a_rate_limit_skips_values_but_never_the_last(segment: Segment, broker: 
 
 
 def test_a_structure_is_one_message_for_each_frame_that_changes_it(segment: Segment, broker: Mosquitto) -> None:
-    """It has all members that no earlier rule matches.
+    """The message has all members that no earlier rule matches.
 
-    If a rule names a register itself, the register is sent alone.
+    If a rule names a register itself, the register has its own message.
     """
     rules = [
         MqttTopic(match="cell/long", publish=False),
@@ -243,7 +243,7 @@ def test_a_structure_is_one_message_for_each_frame_that_changes_it(segment: Segm
 
 
 def test_texts_and_values_without_a_json_form(segment: Segment, broker: Mosquitto) -> None:
-    """A STRING is sent as its text, an array as JSON; NaN is the text "NaN" in JSON."""
+    """A STRING is sent as its text, and an array as JSON. NaN is the text "NaN" in JSON."""
     rules = [MqttTopic(match="cell/axis", payload="json")]
     data = bytearray(image(position=float("nan"), running=True))
     data[16:20] = bytes([8, 2]) + b"hi"

@@ -1,4 +1,4 @@
-"""Commands from a real broker: values for a source's device, and their results."""
+"""Commands that arrive from a real broker: values for a source's device, and the results of the writes."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_a_refusal_by_the_device_is_a_result(segment: Segment, broker: Mosquitto
 
 
 def test_a_retained_command_is_not_carried_out(segment: Segment, broker: Mosquitto) -> None:
-    """Its age is unknown; a sender that still exists can publish it again."""
+    """The age of a retained command is unknown. A sender that is still there can publish it again."""
     with listening(broker.address, "none") as before:
         before.publish("cell/step/in", "5", retain=True)
     with running(segment, broker) as (plant, listener):
@@ -142,9 +142,9 @@ def test_a_retained_command_is_not_carried_out(segment: Segment, broker: Mosquit
 def test_a_retained_command_of_a_bridged_broker_is_not_carried_out(
     segment: Segment, make_broker: Callable[..., Mosquitto], tmp_path: Path
 ) -> None:
-    """A second broker is bridged to ours.
+    """A second broker is bridged to the instance's broker.
 
-    Whenever their connection is restored, ours receives the retained messages as new ones.
+    Whenever their connection is restored, the second broker sends its retained messages as new ones.
     """
     (tmp_path / "elsewhere").mkdir()
     with reserved_port() as address:
@@ -208,7 +208,10 @@ def test_a_flood_of_commands_is_bounded_and_answered(segment: Segment, broker: M
 def test_commands_are_taken_a_few_at_a_time(
     segment: Segment, make_broker: Callable[..., Mosquitto], qos: int, bound: int
 ) -> None:
-    """Also while results wait for acknowledgements, as many of them would delay all other work."""
+    """The limit also holds while results wait for acknowledgements.
+
+    Otherwise many commands would delay all other work.
+    """
     broker = make_broker("allow_anonymous true", "max_inflight_messages 1000", "max_queued_messages 0")
     writer, slot = segment.writer("cell"), segment.processes.find("mqtt")
     writer.publish(image(), cycle=1)

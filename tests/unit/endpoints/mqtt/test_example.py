@@ -21,7 +21,7 @@ def command(address: Address, *words: str) -> list[str]:
 
 
 def fails(address: Address, *words: str) -> str:
-    """Run the example, which must fail; return its one line."""
+    """Run the example, which must fail. Return the line that it prints."""
     done = subprocess.run(command(address, *words), capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done.stderr
     return done.stderr

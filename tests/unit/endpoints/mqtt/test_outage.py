@@ -1,4 +1,4 @@
-"""A broker that disconnects and returns: changes in between are kept, in order."""
+"""A broker that disappears and returns: changes in between are kept, in order."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mosquitto) -> None:
-    """They come in order with their times, marked as late; then come the current values."""
+    """The changes arrive in order with their times, marked as late. The current values arrive after them."""
     rules = [MqttTopic(match="cell/step", payload="json")]
     writer = segment.writer("cell")
     writer.publish(image(step=1), cycle=1)
@@ -96,7 +96,7 @@ class Load:
 def test_a_connection_cut_repeatedly_loses_no_change(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Under load. Changes that the broker may have missed are sent again; their order is kept."""
+    """The source publishes all the time. The bridge sends changes again that the broker may have missed, in order."""
     # A busy host must not look like a slow broker, for which changes are conflated.
     monkeypatch.setattr("shmio.endpoints.mqtt.feed.CATCH_UP_S", 10.0)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
@@ -141,7 +141,7 @@ def test_the_bridge_reconnects_to_a_broker_killed_repeatedly(segment: Segment, b
 def test_another_client_misses_no_change_though_the_broker_is_killed_repeatedly(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The bridge's connection is frozen before each kill, so that it gets no acknowledgement.
+    """The test freezes the bridge's connection before each kill, so that the bridge gets no acknowledgement.
 
     A message that a broker has acknowledged and then lost cannot be sent again.
     """
@@ -297,7 +297,7 @@ def test_a_host_that_accepts_but_never_answers_times_out(segment: Segment, monke
 def test_a_file_that_cannot_be_read_yet_blocks_nothing(
     segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Such as a file on a network server that is down; here it is a pipe without a writer."""
+    """An example is a file on a network server that is down. Here the file is a pipe without a writer."""
     monkeypatch.setattr("shmio.endpoints.mqtt.connection.attempt.SLOW_S", 0.1)
     pipe = tmp_path / "ca.pem"
     os.mkfifo(pipe)

@@ -9,7 +9,7 @@ from shmio.endpoints.mqtt.topics import Message
 
 
 class FakeConnection:
-    """A connection that accepts ``room`` messages."""
+    """A connection that accepts at most ``room`` messages."""
 
     def __init__(self) -> None:
         self.up = True
@@ -25,7 +25,7 @@ class FakeConnection:
 
 
 class Counter:
-    """A topic whose payload is its value when it is asked."""
+    """A topic whose payload is the counter's value when the message is sent."""
 
     def __init__(self, topic: str, *, keep: bool = True) -> None:
         self.topic = topic
@@ -111,7 +111,7 @@ def test_the_oldest_messages_are_dropped_when_the_backlog_is_full() -> None:
 
 
 def test_a_backlog_that_is_full_at_reconnection_accepts_the_newest_value() -> None:
-    """Values that change meanwhile are conflated, not dropped."""
+    """Values that change during the reconnection are conflated, not dropped."""
     connection = FakeConnection()
     connection.up = False
     outbox, a = Outbox(connection, connection, OVERHEAD_BYTES + 1), Counter("a")

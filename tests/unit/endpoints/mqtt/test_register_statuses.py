@@ -1,4 +1,4 @@
-"""A source that gives each register a status, as MQTT publishes it."""
+"""What MQTT clients see of a source that gives each register a status."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Virtual time: a step is done when the broker has all its changes and its marker."""
+"""Virtual time: a step is done when the broker has received all its changes and its marker."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_each_of_many_steps_is_published(models: Segment, broker: Mosquitto) -> 
 
 
 def test_a_broker_that_is_away_delays_no_step(models: Segment, broker: Mosquitto) -> None:
-    """The changes of the steps are kept for the broker."""
+    """The bridge keeps the changes of the steps for the broker."""
     with (
         FaultProxy(broker.address, framing=None) as proxy,
         listening(broker.address) as listener,

@@ -1,4 +1,4 @@
-"""Messages that other clients publish on the bridge's topics: corrected, but at a bounded rate."""
+"""Messages that other clients publish on the bridge's topics: the bridge corrects them, at a limited rate."""
 
 from __future__ import annotations
 

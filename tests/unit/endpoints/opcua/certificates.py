@@ -1,4 +1,4 @@
-"""Certificates for tests."""
+"""Makes certificates for tests of OPC UA."""
 
 from __future__ import annotations
 

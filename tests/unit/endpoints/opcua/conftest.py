@@ -1,4 +1,4 @@
-"""A segment with one source, which only the test publishes."""
+"""A segment with one source. Only the test publishes its frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ _standard: dict[Any, Any] = {}
 
 @pytest.fixture(autouse=True)
 def standard_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Create the standard's 6,000 nodes once, not for each server; no server changes more of them than this."""
+    """Create the standard's 6,000 nodes once for all servers.
+
+    Servers change only the references of the folder Objects, which this fixture restores.
+    """
     original = InternalServer.load_standard_address_space
 
     async def load(server: InternalServer, shelf_file: None = None) -> None:

@@ -1,4 +1,4 @@
-"""An OPC UA endpoint over a real socket: a segment on one side, clients on the other."""
+"""An OPC UA endpoint over a real socket: the test publishes into a segment, and clients receive."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE
 WRITER = 6
 TIMEOUT_S = 30
 ABOUT = ("Quality", "Reason", "Lift", "LiftAll", "Injections")
-"""Properties and methods of each source."""
+"""Names of the properties and methods that each source has."""
 
 
 def spec(source: str = "cell", layout: Any = LAYOUT, stale_ns: int = STALE_NS) -> BlockSpec:
@@ -31,7 +31,7 @@ def processes() -> list[ProcessSpec]:
 
 
 class Served:
-    """A served segment."""
+    """An endpoint that serves a segment."""
 
     def __init__(self, segment: Segment, endpoint: Endpoint) -> None:
         self.segment, self.endpoint = segment, endpoint
@@ -58,7 +58,7 @@ class Served:
             yield client
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        """Wait until a condition holds, which the endpoint's loop or a thread brings about."""
+        """Wait until the endpoint's loop or a thread has made a condition true."""
         async with asyncio.timeout(TIMEOUT_S):
             while not condition():  # noqa: ASYNC110
                 await asyncio.sleep(0.001)
@@ -79,7 +79,7 @@ class Changes:
         self.come.put_nowait((str(node.nodeid.Identifier), data.monitored_item.Value))
 
     async def until(self, path: str, accept: Callable[[ua.DataValue], bool]) -> ua.DataValue:
-        """Return the next change of a node that fits."""
+        """Return the next change of a node for which ``accept`` is true."""
         while True:
             name, value = await asyncio.wait_for(self.come.get(), TIMEOUT_S)
             self.seen.append((name, value))

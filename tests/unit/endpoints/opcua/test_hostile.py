@@ -1,4 +1,4 @@
-"""Hostile input on the port: the endpoint bounds what it costs, and serves others."""
+"""Hostile input to the endpoint: its cost is bounded, and other clients are still served."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def hello() -> bytes:
 
 
 async def ended(one: Served, data: bytes) -> bytes:
-    """Send bytes, and return what comes until the endpoint disconnects."""
+    """Send bytes. Return what the endpoint sends until it disconnects."""
     reader, writer = await asyncio.open_connection("127.0.0.1", one.port)
     try:
         writer.write(data)
@@ -143,7 +143,7 @@ def test_wishes_beyond_the_limits_are_revised(segment: Segment) -> None:
 
 
 def test_an_array_of_nothing_is_refused(segment: Segment) -> None:
-    """Its elements take no bytes, so a short message could ask for any amount of memory."""
+    """The elements take no bytes, so that a short message could request any amount of memory."""
 
     async def test(one: Served) -> None:
         with pytest.raises(ua.UaStatusCodeError):

@@ -1,4 +1,4 @@
-"""Methods: to step virtual time, and to lift injections."""
+"""Methods of the OPC UA endpoint: to step virtual time, and to lift injections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Browsing, reading and subscribing, with asyncua's client."""
+"""Browsing, reading and subscribing at the OPC UA endpoint, with asyncua's client."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ SMALLER = Layout(
 
 
 def follows(one: Served) -> bool:
-    """Let the endpoint look for a reload, as its process does all the time."""
+    """Let the endpoint check for a reload, as its process does all the time. The result is always False."""
     one.endpoint.follow_reloads()
     return False
 

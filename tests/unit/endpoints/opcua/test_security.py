@@ -56,7 +56,7 @@ def test_a_trusted_certificate_gives_its_roles_and_no_other_opens_a_channel(
 
 
 def test_a_channel_without_security_only_tells_which_ones_there_are(segment: Segment, identity: dict[str, str]) -> None:
-    """The library lets everybody create a session on such a channel, whatever its policies are."""
+    """The library itself would let everybody create a session on such a channel, whatever its policies are."""
 
     async def test(one: Served) -> None:
         client = Client(one.url, timeout=TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""Writes: each is a command to the source, and its status is the outcome."""
+"""Writes by OPC UA: each is a command to the source, and the status of the write is the command's outcome."""
 
 from __future__ import annotations
 

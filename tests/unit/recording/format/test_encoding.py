@@ -1,4 +1,4 @@
-"""Encoding and decoding a recording's messages, and undecodable bytes."""
+"""Encoding and decoding the messages of a recording, and bytes that cannot be decoded."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ images = st.integers(0, 50).flatmap(
     st.tuples(u32, u64, u64),
 )
 def test_a_frame(fields: tuple[int, ...], images: tuple[bytes, bytes | None], header: tuple[int, int, int]) -> None:
-    """Both versions are tested, with any values in the message's own header."""
+    """Both versions of the encoding are tested, with arbitrary values in the message's header."""
     frame = Frame._make((*fields, *images))
     data = encode_frame(frame)
     assert decode_frame(data) == frame

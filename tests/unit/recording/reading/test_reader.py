@@ -64,7 +64,7 @@ def test_a_survey_counts_the_messages(recording: bytes, tmp_path: Path, whole: b
 
 
 def test_a_file_cut_off_anywhere_is_read_up_to_the_cut(recording: bytes, tmp_path: Path) -> None:
-    """A killed recorder leaves such a file; every message of a complete chunk is read."""
+    """A killed recorder leaves such a file. Every message of a complete chunk is read."""
     file = tmp_path / "x.mem"
     file.write_bytes(recording)
     whole, closed = look(file)
@@ -107,7 +107,7 @@ def test_any_bytes_are_refused_or_read(tmp_path: Path, data: bytes) -> None:
 
 
 def test_zeros_at_the_end_are_reported(recording: bytes, tmp_path: Path) -> None:
-    """A power failure leaves such a file."""
+    """A power failure may leave such a file."""
     file = tmp_path / "x.mem"
     cut_at = recording.rindex(b"cell/frames") - 400
     file.write_bytes(recording[:cut_at])

@@ -224,7 +224,7 @@ def test_the_names_of_a_certificate_give_its_roles(segment: Segment, tmp_path: P
 
 
 def test_a_caller_without_a_token_is_refused_at_once(segment: Segment) -> None:
-    """The refusal comes before the call's message, which is not read."""
+    """The refusal comes before the call's message, which the endpoint does not read."""
 
     async def test(served: Endpoint) -> None:
         async with (

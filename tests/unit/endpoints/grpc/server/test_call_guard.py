@@ -125,7 +125,10 @@ def test_one_client_cannot_take_all_calls_and_their_total_is_limited(segment: Se
 
 
 def test_the_limits_hold_as_documented(segment: Segment) -> None:
-    """The numbers of the page on limits: 4,096 calls, of which one client leaves 1,024."""
+    """The limits are those of docs/reference/grpc-access.md.
+
+    The endpoint has 4,096 calls, of which one client leaves 1,024 to others.
+    """
 
     async def test(served: Endpoint) -> None:
         method, request = "/simulation.server.SimlogAPI/Subscribe", STEP.SerializeToString()
@@ -180,7 +183,7 @@ PUBLISHES = [method for method in NEEDS if method.endswith("/Publish")]
 def test_undecodable_bytes_are_refused_without_a_log_line(
     segment: Segment, method: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Publish skips them instead; its own tests check that."""
+    """Publish is not tested here, because it skips such messages. Its own tests check that."""
 
     async def test(served: Endpoint) -> None:
         call: Any = served.channel.unary_unary(method)

@@ -1,4 +1,4 @@
-"""The health service, with a standard client and with a watcher that does not read."""
+"""The health service, with a standard client, and with a watcher that does not read its stream."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.unit.endpoints.rude import HEALTH
 UNKNOWN, SERVING, NOT_SERVING = 3, 1, 2
 CELL = wire.HealthCheckRequest(service="source.cell")
 NO_WINDOW = http2.frame(http2.SETTINGS, 0, 0, b"\0\4\0\0\0\0")
-"""SETTINGS_INITIAL_WINDOW_SIZE 0 (RFC 9113, 6.5.2): the server may send no byte of a message."""
+"""SETTINGS_INITIAL_WINDOW_SIZE 0 (RFC 9113, 6.5.2): the server may not send any byte of a message."""
 
 
 async def told(watch: Any) -> int:

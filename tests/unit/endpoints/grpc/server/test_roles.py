@@ -1,4 +1,4 @@
-"""The table of roles has every call that the endpoint serves, and no unknown one."""
+"""The table of roles lists exactly the calls that the endpoint serves."""
 
 from __future__ import annotations
 

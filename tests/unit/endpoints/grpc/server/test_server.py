@@ -45,7 +45,7 @@ async def refused(server: Server, flood: Flood, calls: int) -> None:
 def test_calls_to_unknown_methods_do_not_stop_the_server(
     segment: Segment, tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Tested by TCP, by TLS and by a UNIX socket."""
+    """The calls come by TCP, by TLS and by a UNIX socket."""
     authority = trustme.CA()
     certificate = authority.issue_cert("localhost")
     certificate.private_key_pem.write_to_path(tmp_path / "key.pem")
@@ -118,7 +118,7 @@ def test_grpcio_without_the_needed_internals_is_refused_at_start(
 
 
 def test_a_stopped_server_is_not_alive(segment: Segment) -> None:
-    """Its process exits then: gRPC does not survive a second server in one process."""
+    """The endpoint's process then exits, because gRPC does not survive a second server in one process."""
 
     async def test(served: Endpoint) -> None:
         assert served.server.alive

@@ -24,7 +24,7 @@ PUBLISH = "/simlog.server.SimlogAPI/Publish"
 
 
 def request(path: str, value: Any = None, **kind: Any) -> v2.PubRequest:
-    """Return a request that gives a topic a value: as in JSON, or one of Value's kinds by name."""
+    """Return a request that gives a topic a value: one with a JSON form, or one of Value's kinds by name."""
     data = Value(**kind) if kind else ParseDict(value, Value())
     return v2.PubRequest(topic=path, data=v2.SimlogMessage(type=v2.NULL, value=data))  # the type does not matter
 
@@ -99,7 +99,7 @@ def test_an_unknown_topic_has_empty_info_and_other_calls_fail_with_not_found(seg
 
 
 def test_a_typical_client_session(segment: Segment) -> None:
-    """The calls of the wire contract, in order; the first Write comes before any message."""
+    """The session makes the calls of the wire contract, in order. The first Write comes before any message."""
 
     async def test(served: Endpoint, device: Plant) -> None:
         published: Any = served.v2.Publish(timeout=TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""The streams of version 2: all topics of a subscriber in one."""
+"""The streams of version 2, which carry all topics of a subscriber."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ async def end(stream: Any) -> tuple[grpc.StatusCode, str]:
 
 
 async def left(served: Endpoint) -> bool:
-    """Return whether all listeners have left."""
+    """Return whether all listeners have ended."""
     feed = served.feeds["cell"]
     return await listening(served, 0) and not feed._channels and not feed.commands.write_subscriptions.busy
 
@@ -409,7 +409,7 @@ def test_topics_survive_a_reload_and_removed_registers_resume_when_they_return(s
 
 
 def test_a_uuid_belongs_to_its_client(segment: Segment) -> None:
-    """Other clients can neither end its stream nor add topics; a token identifies the client."""
+    """Other clients can neither end its stream nor add topics to it. A token identifies the client."""
     first, other = (("authorization", "Bearer one"),), (("authorization", "Bearer other"),)
     subscriber, topic = v2.Subscriber(name="a", uuid="a"), v2.SubscriptionRequest(path="cell/step", subscriberUUID="a")
 

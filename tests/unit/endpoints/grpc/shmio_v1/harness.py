@@ -1,4 +1,4 @@
-"""Calls of shmio.v1 with the generated code only, as any client can make them."""
+"""Calls of shmio.v1 that use only the generated code, as a client in any language does."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Stream:
 def values(registers: Iterable[Any], found: Any) -> dict[str, Any]:
     """Return the scalars and whole arrays of ``Values`` by path.
 
-    For an array in part, the value is a dict of its elements by index.
+    For an array of which only some elements are sent, the value is a dict of these elements by index.
     """
     elements: dict[tuple[int, int], Any] = {}
     for column, name in enumerate(COLUMNS):

@@ -1,4 +1,4 @@
-"""A source whose model a client computes, with its process in threads, behind an endpoint."""
+"""A source whose model a client computes, behind an endpoint. The source's process runs in threads."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def spec(source: str, period_ns: int = 20_000_000) -> BlockSpec:
 
 @contextmanager
 def remote_segment(instance: str, *, virtual: bool = True) -> Iterator[Segment]:
-    """Create a segment with the source ``drive``, computed by a client, and ``cell``."""
+    """Create a segment with the source ``drive``, which a client computes, and the source ``cell``."""
     plain = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("memory", WRITABLE))
     processes = [ProcessSpec("drive", "source"), ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]
     with Segment.create(instance, [spec("drive"), plain], processes, stepped=virtual) as segment:

@@ -1,4 +1,4 @@
-"""Time by shmio.v1: steps, and the updates that streams receive before the call returns."""
+"""Steps of time by shmio.v1, and the updates that streams receive before the call returns."""
 
 from __future__ import annotations
 

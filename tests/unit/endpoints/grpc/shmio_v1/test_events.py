@@ -43,7 +43,7 @@ class Stream:
         self._waiting: list[Any] = []
 
     async def begin(self) -> list[str]:
-        """Wait until the sources are followed; their names."""
+        """Wait until the endpoint follows the sources. Return their names."""
         return list((await asyncio.wait_for(self.call.read(), TIMEOUT_S)).sources)
 
     async def next(self) -> Any:
@@ -55,7 +55,7 @@ class Stream:
 
 
 def reload(served: Endpoint, layout: Layout | None) -> None:
-    """As a reload of the configuration does it: the source has another block by now, or none."""
+    """Replace the source's block or remove it, as a reload of the configuration does."""
     block = [BlockSpec("cell", layout, 20_000_000, STALE_NS, 1 << 16, Attributes("test"))] if layout else []
     served.segment.change(block, ["cell"])
     served.feeds.pop("cell").stop()
@@ -187,7 +187,7 @@ def test_more_events_than_the_ring_holds_are_counted(segment: Segment) -> None:
 
 
 async def stream_over_a_reload(served: Endpoint, layout: Layout | None) -> Stream:
-    """Begin a stream, publish the note "last words", and reload; nothing of it is read yet."""
+    """Begin a stream, publish the note "last words", and reload. The stream is not read meanwhile."""
     served.writer.event(NOTE)
     stream = Stream(served)
     await stream.begin()

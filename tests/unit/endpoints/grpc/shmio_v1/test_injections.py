@@ -1,4 +1,4 @@
-"""Inject, list and lift over real sockets, by the clients and with the generated code only."""
+"""Inject, list and lift over real sockets, by the Python clients and with the generated code only."""
 
 from __future__ import annotations
 
@@ -378,7 +378,7 @@ def test_too_many_pieces_are_refused_before_any_is_checked(segment: Segment) -> 
 
 
 def test_originals_include_the_effect_of_an_inner_declared_injection(segment: Segment) -> None:
-    """After it was lifted, the source's value is the original."""
+    """After the declared injection is lifted, the original is the source's value."""
 
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         struct.pack_into(">f", device.memory, 0, 1.5)

@@ -1,4 +1,4 @@
-"""Models that disconnect, stop half-way or never read: they free their source."""
+"""Models that disconnect, stop half-way or never read. Afterwards their source is free for another model."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def test_staleness_is_sent(soon_stale: Segment, mode: Any) -> None:
 
 
 def test_a_stream_that_is_behind_catches_up_in_slices(segment: Segment) -> None:
-    """Even if its updates are small: other tasks run in between."""
+    """Other tasks run between the slices, even if the updates are small."""
 
     async def test(served: Endpoint) -> None:
         served.publish(image(step=0))

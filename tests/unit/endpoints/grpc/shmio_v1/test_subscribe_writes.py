@@ -83,7 +83,7 @@ def test_in_and_out_on_one_stream(segment: Segment) -> None:
 
 
 def test_long_texts_arrive_whole(instance: str) -> None:
-    """The source reports them in parts."""
+    """The source reports a long text in parts."""
     layout = Layout("L", 1, 1024, False, (Register("texts", "STRING[100]", ((0, 9),), 2, None, 1020, 10),))
     block = BlockSpec("cell", layout, 20_000_000, STALE_NS, 1 << 20, Attributes("test", ("**",)))
     texts = [chr(65 + index) * 100 for index in range(10)]

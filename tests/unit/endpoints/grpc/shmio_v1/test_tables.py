@@ -1,4 +1,4 @@
-"""From images to packed arrays and on to a client's numpy arrays, compared with the codec.
+"""Images become packed arrays and then a client's numpy arrays. The results are compared with the codec's.
 
 The codec has its own tests with fixed bytes.
 """
@@ -33,9 +33,9 @@ def table_of(registers: list[Register], columns: Columns) -> Table:
 
 
 def plain(value: Value, register: Register) -> Any:
-    """Return what a client gets for a value.
+    """Return the value that a client receives for a register's value.
 
-    For an array's invalid element that is zero or an empty text.
+    An invalid element of an array becomes zero or an empty text.
     """
     if isinstance(value, list):
         return [plain(item, register) for item in value]
@@ -64,7 +64,7 @@ seeds = st.integers(0, 1 << 32)
 
 
 def random_image(seed: int) -> bytes:
-    """Random bytes with many zeros, so that some are valid dates and texts."""
+    """Return random bytes with many zeros, so that some of them are valid dates and texts."""
     random = np.random.default_rng(seed)
     return bytes(
         random.integers(0, 256, LAYOUT.size, np.uint8) * (random.random(LAYOUT.size) < seed % 5 / 4).astype(np.uint8)

@@ -28,7 +28,7 @@ A fast host publishes more frames in one test.
 
 
 class Known(LossMonitor):
-    """A monitor with a fixed result."""
+    """A loss monitor whose result the test sets."""
 
     def __init__(self, *, behind: bool) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class Followed:
         assert [await value for value in asking] == [1] * len(asking)
 
     async def publish(self, count: int) -> None:
-        """Publish frames with the next numbers, with time to show or skip each."""
+        """Publish frames with the next numbers, and give the streams time to show or skip each."""
         for _ in range(count):
             self.count += 1
             self.writer.publish(image(step=self.count % STEPS), cycle=self.count)
@@ -99,7 +99,7 @@ def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behin
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Never look for stale frames, count every frame as late, and let feeds rest until woken."""
+    """Never look for stale frames, count every frame as late, and let feeds sleep until they are woken."""
     monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
     monkeypatch.setattr(back_pressure, "LATE_S", 0.0)
     monkeypatch.setattr(wakeups, "REST_S", 1000.0)
@@ -290,7 +290,7 @@ def test_skipped_frames_do_not_make_a_source_stale(soon_stale: Segment) -> None:
 
 
 def test_a_gap_between_two_frames_read_at_once_counts_as_stale(segment: Segment) -> None:
-    """The time of the next frame counts, not the time at which the feed looked."""
+    """The publication time of the next frame counts, not the time at which the feed read it."""
 
     async def test(followed: Followed) -> None:
         (stream,), block = followed.streams, segment.blocks["cell"]

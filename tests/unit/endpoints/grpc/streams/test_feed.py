@@ -1,4 +1,4 @@
-"""The feeds of an instance that is reloaded."""
+"""Feeds of an instance whose configuration is reloaded."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_replaced_feed_is_dropped_when_its_streams_have_left(segment: Segment,
 
 
 def test_the_event_loop_runs_while_a_new_layout_is_read(segment: Segment, instance: str) -> None:
-    """Another thread than that of the streams reads the segment."""
+    """A thread other than the event loop's reads the segment."""
 
     async def run(opened: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
         wake_ups = WakeUps()
@@ -127,7 +127,7 @@ def test_a_model_replaced_by_a_reload_in_virtual_time_is_shown_step_by_step(inst
 
 
 def test_a_held_feed_skips_no_frames(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It gives the frames to its streams later, so no stream counts as slow."""
+    """The feed gives the frames to its streams later, so no stream counts as slow."""
     monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
     monkeypatch.setattr(ringing, "REST_S", 0.001)
 

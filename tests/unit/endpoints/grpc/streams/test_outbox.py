@@ -51,7 +51,7 @@ def test_a_stream_far_behind_gets_no_old_values(
         lane, other = StateLane(outbox), StateLane(outbox)
 
         async def offered() -> list[bytes]:
-            """Offer four values, of which two come at once, and return those that are left."""
+            """Offer four values, two of them at once, and return the messages that are left."""
             nonlocal now_s
             for letter in (b"a", b"b", b"c"):
                 lane.deliver(letter)
@@ -209,7 +209,7 @@ def test_an_ended_outbox_can_be_used_again() -> None:
 
 
 def test_a_failure_is_reported_once_in_a_later_turn() -> None:
-    """The callback may change collections that the caller is iterating over."""
+    """The callback must not run at once, because it may change collections that the caller is iterating over."""
 
     async def test() -> None:
         outbox, told = Outbox(), list[str]()

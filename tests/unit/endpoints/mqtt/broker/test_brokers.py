@@ -1,4 +1,4 @@
-"""The brokers that shmio starts, mosquitto and aMQTT, seen by clients."""
+"""What clients see of the brokers that shmio starts: mosquitto and aMQTT."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_an_occupied_port_ends_the_broker_with_the_reason(segment: Segment, prog
 
 
 class Listening:
-    """A server of another program."""
+    """A server that belongs to another program."""
 
     def __enter__(self) -> Listening:
 

@@ -50,7 +50,7 @@ def test_a_connection_made_after_the_end_is_closed(
 
 
 class Broker:
-    """The broker's end of a connection, which a test plays byte by byte (MQTT 5.0, section 3)."""
+    """The broker's end of a connection. The test sends and reads its packets (MQTT 5.0, section 3)."""
 
     def __init__(self, server: socket.socket) -> None:
         self._server = server
@@ -74,7 +74,7 @@ class Broker:
         self.turn_until(lambda: not self.connection.up)
 
     def hear(self, kind: int, count: int = 1) -> None:
-        """Read this many packets of a kind, and no more."""
+        """Read this many packets of a kind. Fail if another packet follows."""
         for _ in range(count):
             assert self._socket.recv(1)[0] & 0xF0 == kind
             length = shift = 0
@@ -89,7 +89,7 @@ class Broker:
         self._socket.sendall(bytes.fromhex(packet))
 
     def say(self, packet: str, until: Callable[[], bool]) -> None:
-        """Send a packet, and turn the connection until it takes effect."""
+        """Send a packet, and let the connection work until the packet takes effect."""
         self.put(packet)
         self.turn_until(until)
 
@@ -113,7 +113,7 @@ class Broker:
 
 
 def test_repeated_disconnections_suggest_another_client_with_the_same_id(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two clients with one id, at a broker that does not give the reason."""
+    """Two clients have the same id, and the broker does not say why it disconnects one."""
     monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.0, 0.0))
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
@@ -127,7 +127,7 @@ def test_repeated_disconnections_suggest_another_client_with_the_same_id(monkeyp
 
 
 def test_a_brokers_refusal_is_reported_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The report stays although the broker accepts other messages."""
+    """The report remains although the broker accepts other messages."""
 
     def publish(topic: str) -> None:
         connection.send(Message(topic, b"1", 1, retain=True))

@@ -1,4 +1,4 @@
-"""Commands have their own connection: trouble on it does not affect values, and vice versa."""
+"""Commands have their own connection, so that trouble on it does not affect values, and vice versa."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CONNACK = b"\x20\x03\0\0\0"
 FLOOD = 20_000
 FRAMES = 20
 IN_FLIGHT = 5
-"""Fewer than the published frames, so that the broker must acknowledge values for more to be sent."""
+"""Number of messages without acknowledgement. It is less than the number of frames published."""
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def flood(address: Address, qos: int) -> None:
-    """Send commands faster than a bridge can take them; return when the broker has them all."""
+    """Send commands faster than a bridge can process them. Return when the broker has received all."""
     topic = f"{PREFIX}/cell/axis/speed/in".encode()
     packets = []
     for number in range(1, FLOOD + 1):
@@ -93,7 +93,7 @@ class Narrow:
 
 @pytest.mark.parametrize("qos", [0, 1])
 def test_a_flood_of_commands_delays_no_value(segment: Segment, make_broker: Callable[..., Mosquitto], qos: int) -> None:
-    """Only commands queue in the broker, neither values nor their acknowledgements."""
+    """The broker queues only commands, neither values nor their acknowledgements."""
     broker = make_broker("allow_anonymous true", f"max_inflight_messages {IN_FLIGHT}", "max_queued_messages 0")
     plant = Plant(segment.writer("cell"))
     plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)

@@ -1,4 +1,4 @@
-"""An edge node of Sparkplug B: its protocol rules, and its messages with another implementation."""
+"""An edge node of Sparkplug B: its protocol rules, and its messages as another implementation reads them."""
 
 from __future__ import annotations
 

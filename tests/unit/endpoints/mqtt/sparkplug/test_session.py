@@ -27,7 +27,7 @@ PLANT = Sparkplug(group="plant", node="a50")
 
 
 class Heard(NamedTuple):
-    """A message: NBIRTH, DDATA and so on, and its metrics by name."""
+    """A received message: its type (NBIRTH, DDATA and so on), and its metrics by name."""
 
     kind: str
     payload: wire.Payload
@@ -35,7 +35,7 @@ class Heard(NamedTuple):
 
 
 class Host:
-    """A host application: it maps aliases to metrics by the births that it receives."""
+    """A host application, which learns the metrics' aliases from the births that it receives."""
 
     def __init__(self, listener: Listener) -> None:
         self._listener = listener
@@ -284,7 +284,7 @@ def test_a_rate_limit_conflates_changes_even_without_the_broker_and_sends_the_la
 
 
 def test_a_flood_of_rebirth_requests_is_answered_by_few_births(segment: Segment, broker: Mosquitto) -> None:
-    """A birth may have megabytes, and the client that requests them need not read them."""
+    """A birth may have megabytes, and a client can request births without reading them."""
     segment.writer("cell").publish(image(step=1), cycle=1)
     with FaultProxy(broker.address, framing=None) as proxy, hosting(broker.address) as host:
         with node(segment, proxy.address):

@@ -1,4 +1,4 @@
-"""The backlog of changes of devices: bounded in bytes, and the oldest are dropped first."""
+"""The backlog of changes of devices: its size in bytes is limited, and the oldest changes are dropped first."""
 
 from __future__ import annotations
 
