@@ -27,7 +27,7 @@ class RegisterImage:
         self._layout = layout
         self._area = StatusArea(layout)
         self._image, _ = initial_frame(layout)
-        for index in range(len(layout.own)):
+        for index in range(len(layout.registers)):
             self.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
 
     def __bytes__(self) -> bytes:

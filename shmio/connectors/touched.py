@@ -31,7 +31,7 @@ def touched(layout: Layout, write: Write, present: Callable[[int], Value]) -> It
     none = True
     covered, image = bytearray(layout.size), bytearray(layout.size)
     apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
-    registers, stop = layout.own, write.offset + len(write.data)
+    registers, stop = layout.registers, write.offset + len(write.data)
     first = bisect_right(registers, write.offset, key=lambda register: register.offset + register.size)
     for index in range(first, bisect_left(registers, stop, key=lambda register: register.offset)):
         register = registers[index]

@@ -99,7 +99,7 @@ class Wave:
 
     def __init__(self, layout: Layout) -> None:
         """Find the registers; raise ConfigError if there is none."""
-        moved = [one for one in layout.own if not one.writable and (one.type in NUMBERS or one.type == "BOOL")]
+        moved = [one for one in layout.registers if not one.writable and (one.type in NUMBERS or one.type == "BOOL")]
         if not moved:
             raise ConfigError("program wave: the layout has no number or BOOL that commands cannot write")
         self._moved = [(codec(one, layout.byte_order), one.shape, one.type) for one in moved]

@@ -1,6 +1,6 @@
 """Compile tag tables that lie over a data block: names for its bits, parts, slices and views.
 
-Such a table is given beside the block's source: ``layout = ["db201.db", "names.toml"]``. It has the
+Such a table is given beside the block's source: ``layout = "db201.db"``, ``tags = "names.toml"``. It has the
 same forms as every tag table (``tags.py``), but addresses are paths of the block, and types may be
 left out. In TOML::
 

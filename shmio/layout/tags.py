@@ -394,7 +394,7 @@ def parse_type(text: str) -> tuple[ElementType, Dims]:
     if element is None and _PATH.search(text):
         raise ValueError(
             f"there is no type {shorten(text)!r}; a table of names over a data block is given beside the block's "
-            'source: layout = ["cell.db", "names.toml"]'
+            'source: layout = "cell.db" and tags = "names.toml"'
         )
     if element is None:
         raise ValueError(

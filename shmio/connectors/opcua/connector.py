@@ -82,8 +82,8 @@ class OpcUaConnector(Connector):
                 f'layout: the block {layout.name} has optimized access: set nodes = "siemens" to read it by names'
             )
         self._options, self._layout = options, layout
-        self._addresses = [_address(options, layout, register) for register in layout.own]
-        self._fittings = [Fitting(register) for register in layout.own]
+        self._addresses = [_address(options, layout, register) for register in layout.registers]
+        self._fittings = [Fitting(register) for register in layout.registers]
         self._credentials = _credentials(options)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
         self._lock = threading.Lock()  # of the image, and of what is known of its values
@@ -183,7 +183,10 @@ class OpcUaConnector(Connector):
     # -- values --------------------------------------------------------------------------------------------------------
 
     def _deadbands(self) -> list[float]:
-        return [one.deadband / abs(one.scale[0]) if one.scale is not None else one.deadband for one in self._layout.own]
+        return [
+            one.deadband / abs(one.scale[0]) if one.scale is not None else one.deadband
+            for one in self._layout.registers
+        ]
 
     def _deliver(self, samples: list[tuple[Item, Sample]]) -> None:
         """Store samples; the thread of the sessions calls it."""
@@ -354,7 +357,7 @@ def _credentials(options: OpcUaOptions) -> Credentials:
 
 def _overlapping(layout: Layout, write: Write) -> range:
     """Return the indices of the registers that share a byte with a write."""
-    registers, stop = layout.own, write.offset + len(write.data)
+    registers, stop = layout.registers, write.offset + len(write.data)
     first = bisect_right(registers, write.offset, key=lambda register: register.offset + register.size)
     return range(first, bisect_left(registers, stop, key=lambda register: register.offset))
 

@@ -97,7 +97,7 @@ class S7Connector(S7Client, Connector):
         if layout.byte_order != "big":
             raise ConfigError(f"layout: {layout.name!r} is little-endian, but a controller's block is big-endian")
         super().__init__(options, number, layout.size)
-        ends = [(register.offset + register.size, register.path) for register in layout.own]
+        ends = [(register.offset + register.size, register.path) for register in layout.registers]
         self._described = Described(number, layout.name, layout.size, ends, whole=True)
         self._watch = BlockWatch([self._described])
         self._add_query(self._watch)

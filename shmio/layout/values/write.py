@@ -92,7 +92,7 @@ def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
     """
     named = (register for pattern in patterns for register in chosen(layout, pattern))
     mask = bytearray(covering(named, layout.size))
-    for register in layout.registers:
+    for register in layout.own:
         if register.type == "BOOL" and register.dims:
             _fill_rows(mask, register)
     return bytes(mask)

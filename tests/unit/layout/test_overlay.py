@@ -17,7 +17,7 @@ from shmio.layout.model import INTEGERS, Layout, Register, element_type
 from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
 from shmio.layout.values.frame_codec import FrameCodec
-from shmio.layout.values.write import apply, encode, paths_of
+from shmio.layout.values.write import apply, cover, encode, paths_of
 from shmio.model.statuses import GOOD, RegisterStatus, StatusArea
 
 A50 = (Path(__file__).parents[3] / "db201.db").read_bytes()
@@ -155,7 +155,7 @@ def test_what_does_not_fit_is_refused_by_name_and_line(names: str) -> None:
 
 
 def test_a_table_that_is_given_without_its_block_says_so() -> None:
-    with pytest.raises(LayoutError, match=r'beside the block\'s source: layout = \["cell\.db", "names\.toml"\]'):
+    with pytest.raises(LayoutError, match=r'beside the block\'s source: layout = "cell\.db" and tags = "names\.toml"'):
         compile_sources([Source("names.toml", NAMES.encode())])
 
 
@@ -198,6 +198,11 @@ def test_initial_values_are_those_of_the_block() -> None:
 def test_writes_are_named_by_the_block() -> None:
     layout = laid(NAMES)
     assert paths_of(layout, encode(find(layout, "Release"), True)) == ["Outputs/13.%X6"]
+
+
+def test_patterns_cover_the_bits_of_a_row_and_no_others() -> None:
+    layout = laid('[registers]\nrow = { address = "Inputs/3.%X2", type = "ARRAY[0..2] OF BOOL" }', SMALL)
+    assert cover(layout, ["row"]) == bytes([0, 0, 0, 0b11100]).ljust(layout.size, b"\0")
 
 
 def test_a_name_has_the_status_of_what_it_lies_over() -> None:
