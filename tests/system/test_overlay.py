@@ -92,6 +92,9 @@ def test_a_view_and_its_bytes_are_the_same(local: Attachment) -> None:
     assert local.write({"cell/Outputs/120": 0xC0, "cell/Outputs/131": 0})[0].done
     until(lambda: local["cell/door/Speed"] == -2.5, "the view of the bytes")
     assert local["cell/lamps"] == [True, False, False, False]
+    refused = local.write({"cell/Outputs/120..123": [0x7F, 0xC0, 0, 0]})[0]
+    assert not refused.done
+    assert refused.text.startswith("door/Speed: NaN and infinities are written only if")
 
 
 def test_what_is_injected_over_a_name_is_injected_over_its_bytes(local: Attachment) -> None:
