@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
-from shmio.layout.overlay import needed
-from shmio.layout.topic import near, parse_topic
+from shmio.layout.topic import holder, near, parse_topic
 from shmio.layout.values.write import chosen, covering
 from shmio.model.statuses import StatusArea
 from shmio.segment import Block, Frame
@@ -59,7 +58,7 @@ def _with_statuses(
     old, new = StatusArea(whole), StatusArea(part)
     kept, taken = np.zeros(part.size, np.uint8), np.zeros(part.size, np.intp)
     kept[: len(mask)], taken[: len(mask)] = mask, np.arange(len(mask))
-    for index, register in enumerate(part.own):
+    for index, register in enumerate(part.registers):
         for of in (StatusArea.code_range, StatusArea.time_range):
             (start, size), (to, _) = of(old, old.index(register)), of(new, index)
             kept[to : to + size], taken[to : to + size] = 0xFF, np.arange(start, start + size)
@@ -70,8 +69,7 @@ class Selection:
     """The sources and registers to record.
 
     ``sources`` are the names of the sources, or None for all. ``registers`` are patterns as for
-    ``shmio get``; empty for all. A pattern that names an element selects its whole array, and one
-    that names a register of a tag table over the block also the register that it lies over.
+    ``shmio get``; empty for all. A pattern that names an element selects its whole array.
     """
 
     def __init__(self, sources: Collection[str] | None = None, registers: Sequence[str] = ()) -> None:
@@ -130,6 +128,6 @@ def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) 
         topic = parse_topic(pattern, sources, next(iter(sources)) if len(sources) == 1 else None)
         if topic.source != source or topic.direction == "in":
             return set()
-        return set().union(*(needed(layout, register) for register in chosen(layout, topic.path or "**")))
+        return {holder(layout, register) for register in chosen(layout, topic.path or "**")}
     except PathError:
         return set()

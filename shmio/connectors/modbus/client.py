@@ -13,8 +13,8 @@ import time
 from typing import Final
 
 from shmio.connectors import tcp
-from shmio.connectors.modbus.address import Table
 from shmio.errors import ConnectorError
+from shmio.layout.addresses.modbus import Table
 
 READ: Final = {Table.COIL: 1, Table.DISCRETE: 2, Table.HOLDING: 3, Table.INPUT: 4}
 WRITE_COIL, WRITE_WORD, WRITE_COILS, WRITE_WORDS, MASK_WORD = 5, 6, 15, 16, 22

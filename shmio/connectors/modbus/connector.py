@@ -12,11 +12,11 @@ import msgspec
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.load import Load, Requests, counted
 from shmio.connectors.modbus import client
-from shmio.connectors.modbus.address import Address, Order, Table, WordCodec, parse
 from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError
 from shmio.connectors.modbus.plan import Element, Limits, ReadRequest, plan
 from shmio.connectors.register_image import RegisterImage
 from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.addresses.modbus import Address, Order, Table, WordCodec, parse
 from shmio.layout.model import Layout, Register, bit_positions
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import Write, apply

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import NamedTuple
 
-from shmio.connectors.modbus.address import Table
+from shmio.layout.addresses.modbus import Table
 
 
 class Element(NamedTuple):

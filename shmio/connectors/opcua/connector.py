@@ -20,13 +20,13 @@ from shmio.config.credentials import read_password
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.load import Load, Requests, counted
-from shmio.connectors.opcua import siemens
-from shmio.connectors.opcua.address import Address, parse
 from shmio.connectors.opcua.decode import Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
 from shmio.connectors.opcua.values import Fitting, MismatchError
 from shmio.connectors.register_image import RegisterImage
 from shmio.errors import ConfigError, ConnectorError, ValueRangeError
+from shmio.layout.addresses import siemens
+from shmio.layout.addresses.opcua import Address, parse
 from shmio.layout.model import Layout, Register, bit_positions
 from shmio.layout.values.codec import codec
 from shmio.layout.values.write import Write, apply, bits_of

@@ -28,10 +28,10 @@ from asyncua.crypto import security_policies
 from asyncua.ua import ua_binary
 
 from shmio.connectors.opcua import decode
-from shmio.connectors.opcua.address import Address, BrowsePath
 from shmio.connectors.opcua.decode import FaultError, MalformedError, Publication, Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
 from shmio.errors import ConnectorError
+from shmio.layout.addresses.opcua import Address, BrowsePath
 from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, BAD_WAITING_FOR_INITIAL_DATA, GOOD, describe
 
 MAX_CHUNK_BYTES: Final = 65_535

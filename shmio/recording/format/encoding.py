@@ -313,8 +313,8 @@ def decode_position(text: str) -> BlockPosition:
 class Channel:
     """A channel with a block's frames or events, or with gaps, steps or process changes.
 
-    ``layout`` is the hash of the block's layout in hex, with the tag tables over the block.
-    ``encoding`` is FRAME for frames of both versions, and empty for the messages of other programs.
+    ``layout`` is the hash of the block's layout in hex. ``encoding`` is FRAME for frames of both
+    versions, and empty for the messages of other programs.
     """
 
     number: int
@@ -345,7 +345,7 @@ def decode_channel(content: memoryview) -> Channel:
     if found.message_encoding in (FRAME, FRAME_V2, EVENT):
         block, section, after = (int(about[name]) for name in ("block", "section", "after"))
         period_ns, stale_ns = (int(about[name]) for name in ("period_ns", "stale_ns"))
-        source, layout = about["source"], about.get("names", about["layout"])
+        source, layout = about["source"], about["layout"]
         encoding = EVENT if found.message_encoding == EVENT else FRAME
         return Channel(
             found.id, encoding, found.topic, source, block, section, after, layout, period_ns, stale_ns,

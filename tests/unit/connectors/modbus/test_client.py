@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.modbus.address import Table
 from shmio.connectors.modbus.client import ModbusClient, RefusedError
 from shmio.errors import ConnectorError
+from shmio.layout.addresses.modbus import Table
 
 PATIENCE_S = 20.0
 

@@ -10,10 +10,10 @@ from typing import Any, Literal
 import pytest
 
 from shmio.connectors.browsing import Wanted
-from shmio.connectors.opcua.address import NodeAddress
 from shmio.connectors.opcua.connector import OpcUaConnector
 from shmio.connectors.opcua.options import OpcUaOptions
-from shmio.connectors.opcua.siemens import NAMESPACE, node_address
+from shmio.layout.addresses.opcua import NodeAddress
+from shmio.layout.addresses.siemens import NAMESPACE, node_address
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value, codec

@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from shmio.connectors.opcua.address import NodeAddress
+from shmio.layout.addresses.opcua import NodeAddress
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import decode_segment
 

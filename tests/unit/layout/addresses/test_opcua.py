@@ -4,7 +4,7 @@ import uuid
 
 import pytest
 
-from shmio.connectors.opcua.address import BrowsePath, NodeAddress, parse
+from shmio.layout.addresses.opcua import BrowsePath, NodeAddress, parse
 
 GUID = "72962b91-fa75-4ae6-8d28-b404dc7daf63"
 
