@@ -31,7 +31,7 @@ _DISTRIBUTIONS: Final = {"uniform": wire.Noise.DISTRIBUTION_UNIFORM, "gaussian":
 
 
 def value_to_wire(value: object, path: str) -> wire.Value:
-    """Convert a Python or numpy value.
+    """Convert a Python or numpy value to a message.
 
     Args:
         value: The value.
@@ -72,7 +72,7 @@ def value_from_wire(value: wire.Value, path: str) -> object:
 
 
 def declaration_to_wire(table: Mapping[str, Any], key: str) -> wire.Declaration:
-    """Convert an ``[[injection]]`` table.
+    """Convert an ``[[injection]]`` table to a message.
 
     Args:
         table: The table.

@@ -162,7 +162,7 @@ class Table:
     """
 
     def __init__(self, found: Any) -> None:
-        """Convert a message. Raise RemoteError if it is invalid."""
+        """Create the table that a message describes. Raise RemoteError if it is invalid."""
         self.number: int = found.number
         self.source: str = found.source
         self.section: int = found.section

@@ -185,7 +185,7 @@ class Cell(Held, Protocol):
         """Names of the sources."""
 
     def layouts(self, *sources: str) -> Mapping[str, Layout]:
-        """Return the layouts of these sources, or of all, by source.
+        """Return the layouts of these sources, or of all sources, by source.
 
         Raises:
             PathError: There is no such source.
@@ -217,7 +217,7 @@ class Cell(Held, Protocol):
         """
 
     def events(self, *sources: str) -> Events:
-        """Follow the events of these sources, or of all, from now on.
+        """Follow the events of these sources, or of all sources, from now on.
 
         Events are about commands and their outcomes, injections, changes of quality, notes, and
         starts and stops of a source's process.
@@ -275,7 +275,7 @@ class Cell(Held, Protocol):
         """
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all.
+        """Return the present injections of these sources, or of all sources.
 
         Within a source, the innermost injection comes first.
         """

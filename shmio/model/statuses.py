@@ -175,7 +175,7 @@ class RegisterStatus(NamedTuple):
 
     @property
     def quality(self) -> Quality:
-        """The severity of the code; the reserved severity counts as bad."""
+        """Quality according to the severity of the code. The reserved severity counts as bad."""
         return quality_of(self.code)
 
     @property
@@ -196,7 +196,7 @@ def worse(quality: Quality, reason: str, status: RegisterStatus) -> tuple[Qualit
 
 
 def quality_of(code: int) -> Quality:
-    """Return the severity of a status code; the reserved severity counts as bad."""
+    """Return the quality according to a status code's severity. The reserved severity is bad."""
     return _QUALITIES[code >> 30]
 
 

@@ -56,7 +56,7 @@ class Client:
         self._simulate: Any = connection.stream_stream(f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString)
 
     async def layouts(self, *sources: str) -> dict[str, BlockLayout]:
-        """Return the layouts of these sources, or of all, by source.
+        """Return the layouts of these sources, or of all sources, by source.
 
         Raises:
             PathError: There is no such source.
@@ -104,7 +104,7 @@ class Client:
         return calls.status(await self._call(self._stub.GetStatus, wire.GetStatusRequest()))
 
     async def read(self, *patterns: str, originals: bool = False) -> Snapshot:
-        """Read registers; those of one source come from one frame.
+        """Read registers. All values of one source come from one frame.
 
         Args:
             patterns: Paths, elements, slices, structures, globs, or the names of sources.
@@ -146,7 +146,7 @@ class Client:
             deadband: A change of a number is reported only if it is larger than this.
 
         Returns:
-            An iterator over updates. If a pattern names nothing, its first call raises PathError.
+            An iterator over updates. Its first step raises PathError if a pattern names nothing.
         """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
@@ -154,7 +154,7 @@ class Client:
         return Subscription(Stream(self._channel, self._subscribe, request))
 
     async def events(self, *sources: str) -> Events:
-        """Follow the events of these sources, or of all, from now on: see :class:`shmio.Cell`.
+        """Follow the events of these sources, or of all sources: see :class:`shmio.Cell`.
 
         Raises:
             PathError: There is no such source.
@@ -250,7 +250,7 @@ class Client:
         return await Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     async def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all.
+        """Return the present injections of these sources, or of all sources.
 
         Within a source, the innermost injection comes first.
         """
@@ -473,7 +473,7 @@ class Subscription(AsyncIterator[Update]):
         self._waiting: Iterator[Update] = iter(())
 
     async def __anext__(self) -> Update:
-        """Wait for the next update, which changes the arrays of the previous update in place.
+        """Wait for the next update. It changes the previous update's arrays, so use these first.
 
         Raises:
             RemoteError: The instance has ended.
@@ -530,7 +530,7 @@ class Steps(AsyncIterator[Stepped]):
                 raise
 
     async def step(self, dt_s: float | None = None) -> Stepped:
-        """Request one more step, and wait for it and all earlier ones.
+        """Request one more step, and wait for it and for all earlier steps.
 
         It raises the same errors as the iteration.
         """
@@ -544,7 +544,7 @@ class Steps(AsyncIterator[Stepped]):
         return last
 
     def close(self) -> None:
-        """Cancel the requested steps, except one that has begun."""
+        """Cancel the requested steps, except a step that has begun."""
         self._left = 0
         self._stream.close()
 

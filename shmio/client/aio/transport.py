@@ -149,7 +149,7 @@ class Condition(asyncio.Condition):
 
 
 class Background:
-    """A coroutine that runs beside the program."""
+    """A task that runs a coroutine in the background."""
 
     def __init__(self, run: Callable[[], Coroutine[Any, Any, None]], name: str) -> None:
         self._task = asyncio.get_running_loop().create_task(run(), name=name)

@@ -57,7 +57,7 @@ class Client:
         self._simulate: Any = connection.stream_stream(f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString)
 
     def layouts(self, *sources: str) -> dict[str, BlockLayout]:
-        """Return the layouts of these sources, or of all, by source.
+        """Return the layouts of these sources, or of all sources, by source.
 
         Raises:
             PathError: There is no such source.
@@ -105,7 +105,7 @@ class Client:
         return calls.status(self._call(self._stub.GetStatus, wire.GetStatusRequest()))
 
     def read(self, *patterns: str, originals: bool = False) -> Snapshot:
-        """Read registers; those of one source come from one frame.
+        """Read registers. All values of one source come from one frame.
 
         Args:
             patterns: Paths, elements, slices, structures, globs, or the names of sources.
@@ -147,7 +147,7 @@ class Client:
             deadband: A change of a number is reported only if it is larger than this.
 
         Returns:
-            An iterator over updates. If a pattern names nothing, its first call raises PathError.
+            An iterator over updates. Its first step raises PathError if a pattern names nothing.
         """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
@@ -155,7 +155,7 @@ class Client:
         return Subscription(Stream(self._channel, self._subscribe, request))
 
     def events(self, *sources: str) -> Events:
-        """Follow the events of these sources, or of all, from now on: see :class:`shmio.Cell`.
+        """Follow the events of these sources, or of all sources: see :class:`shmio.Cell`.
 
         Raises:
             PathError: There is no such source.
@@ -249,7 +249,7 @@ class Client:
         return Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all.
+        """Return the present injections of these sources, or of all sources.
 
         Within a source, the innermost injection comes first.
         """
@@ -472,7 +472,7 @@ class Subscription(Iterator[Update]):
         self._waiting: Iterator[Update] = iter(())
 
     def __next__(self) -> Update:
-        """Wait for the next update, which changes the arrays of the previous update in place.
+        """Wait for the next update. It changes the previous update's arrays, so use these first.
 
         Raises:
             RemoteError: The instance has ended.
@@ -529,7 +529,7 @@ class Steps(Iterator[Stepped]):
                 raise
 
     def step(self, dt_s: float | None = None) -> Stepped:
-        """Request one more step, and wait for it and all earlier ones.
+        """Request one more step, and wait for it and for all earlier steps.
 
         It raises the same errors as the iteration.
         """
@@ -543,7 +543,7 @@ class Steps(Iterator[Stepped]):
         return last
 
     def close(self) -> None:
-        """Cancel the requested steps, except one that has begun."""
+        """Cancel the requested steps, except a step that has begun."""
         self._left = 0
         self._stream.close()
 

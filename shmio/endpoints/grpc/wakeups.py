@@ -213,7 +213,7 @@ class BatchReader:
         try:
             more = self._read()
         except Exception:
-            log.exception("source %s can no longer be followed", self._block.source)
+            log.exception("the endpoint can no longer follow source %s", self._block.source)
             self.stop()
             return
         if more and not self._again:

@@ -16,7 +16,7 @@ from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.web", "uvicorn", "asyncio")
-"""Loggers whose lines clients can cause; their rate is limited."""
+"""Loggers of lines that clients can cause. The rate of these lines is limited."""
 FOLDERS: Final = "folders"
 
 

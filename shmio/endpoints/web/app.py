@@ -22,7 +22,7 @@ _HINT: Final = "shmio: /metrics has the figures of the instance, for Prometheus\
 def metrics_app(
     segment: Segment, measurements: Measurements, folders: Mapping[str, str], registers: Sequence[str]
 ) -> Starlette:
-    """Return the application of ``[metrics]``: ``/metrics``, and a hint at ``/``.
+    """Return the application of ``[metrics]``, which answers ``/metrics``, and ``/`` with a hint.
 
     Args:
         segment: The instance's segment.

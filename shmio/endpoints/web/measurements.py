@@ -1,6 +1,6 @@
 """Histograms of each source's timing, measured from the frames and events that it publishes.
 
-The sources measure nothing for it: a thread of this process reads their rings. Its readings cost them no time.
+The sources do not measure anything. A thread of this process reads their rings, which costs the sources no time.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from shmio.segment import Block, Segment
 from shmio.segment.events import ENDS, EventKind
 
 INTERVAL_S: Final = 0.5
-"""Interval at which the rings are read. They hold at least some seconds."""
+"""Interval at which the rings are read, in s. A ring has room for at least some seconds."""
 BOUNDS_S: Final = (
     0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.025, 0.03, 0.05, 0.075,
     0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0,
 )  # fmt: skip
 """Upper bounds of the buckets of all histograms."""
 MAX_COMMANDS: Final = 4096
-"""Maximum number of commands of a source whose outcome is awaited; the oldest are forgotten first."""
+"""Maximum number of a source's commands without outcome. If there are more, the oldest are forgotten."""
 
 
 class Histogram:
@@ -36,7 +36,7 @@ class Histogram:
         """Sum of all durations."""
 
     def add(self, duration_ns: int) -> None:
-        """Count a duration. A negative one, which a change of the clock may cause, counts as 0."""
+        """Count a duration. A negative duration, which a change of the clock may cause, counts as 0."""
         duration_s = max(0, duration_ns) / 1e9
         self._counts[bisect_left(BOUNDS_S, duration_s)] += 1
         self.sum_s += duration_s
@@ -56,7 +56,7 @@ class SourceTiming:
 
         Args:
             block: The source's block.
-            started_ns: The start of the instance by CLOCK_MONOTONIC, from which cycles count.
+            started_ns: Start of the instance by CLOCK_MONOTONIC, in ns. Cycles are counted from it.
 
         """
         self.block = block
@@ -67,7 +67,7 @@ class SourceTiming:
         self.round_trip = Histogram()
         """Times that the device took to answer."""
         self.wake_up = Histogram()
-        """Times from the publication of a frame until this process, which waited for it, ran."""
+        """Times from the publication of a frame until this process ran, which waited for the frame."""
         self.command = Histogram()
         """Times from the acceptance of a command by the source until its outcome was known."""
         self._started_ns = started_ns

@@ -1,7 +1,7 @@
 """The figures of an instance in the text format of Prometheus.
 
 Names, units and types follow https://prometheus.io/docs/practices/naming. All figures come from the segment, from
-``/proc``, and from :mod:`shmio.endpoints.web.measurements`; no other process does anything for them.
+``/proc``, and from :mod:`shmio.endpoints.web.measurements`. No other process does anything for them.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from shmio.segment.processes import Phase
 from shmio.version import __version__
 
 MAX_REGISTERS: Final = 10_000
-"""Maximum number of values of registers."""
+"""Maximum number of register values in an answer."""
 FRESH_S: Final = 0.25
-"""Time for which an answer is used again, so that many scrapers cost no more than one."""
+"""Time in s for which an answer is reused, so that many scrapers cost no more than a single scraper."""
 
 
 class _Named(NamedTuple):
@@ -92,26 +92,26 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
     },
 }
 _LABELS: Final[Mapping[str, str]] = {"source": "source", "emulator": "emulator", "web": "process"}
-"""The label that names the process, for kinds of which an instance has several."""
+"""Label for the name of the process, for each kind of process that an instance can have several times."""
 BROKER: Final = "broker"
-"""The process of shmio's own MQTT broker: of the kind of the bridge, but it counts nothing."""
+"""Name of the process of shmio's own MQTT broker. It has the same kind as the bridge, but no counters."""
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 _PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
 
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process uses, from ``/proc``."""
+    """Resources that a process uses, from ``/proc``."""
 
     cpu_s: float
     memory_bytes: int
     threads: int
     descriptors: int | None
-    """Open file descriptors; None if this user may not see them."""
+    """Number of open file descriptors; None if this user may not see it."""
 
 
 def usage(pid: int) -> Usage | None:
-    """Return what a process uses, proc(5); None if it has ended."""
+    """Return what a process uses, by proc(5); None if the process has ended."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(errors="replace")
     except OSError:
@@ -310,7 +310,7 @@ class Exposition:
         self._fresh_until_s = 0.0
 
     def answer(self) -> bytes:
-        """Return all figures in the text format, which are at most ``FRESH_S`` old."""
+        """Return all figures in the text format. They are at most ``FRESH_S`` old."""
         with self._turn:
             if time.monotonic() >= self._fresh_until_s:
                 self._answer = generate_latest(self._registry)

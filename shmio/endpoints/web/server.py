@@ -21,13 +21,13 @@ from shmio.errors import EndpointError
 
 MAX_CONNECTIONS: Final = 128
 REQUEST_S: Final = 10.0
-"""Time in which a client must send its first request, or its next one, once it has begun."""
+"""Time limit in s for a client's first request, and for each later request from its first byte on."""
 IDLE_S: Final = 75
-"""Time after which an idle connection is closed. Prometheus keeps its own open between scrapes."""
+"""Time in s after which an idle connection is closed. Prometheus keeps its connection between scrapes."""
 MAX_HEADER_BYTES: Final = 16 << 10
 BACKLOG: Final = 64
 STOP_S: Final = 1
-"""Time that answers may take to end when the server stops."""
+"""Time in s that answers may take to end when the server stops."""
 _HEADERS: Final = (
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
@@ -71,7 +71,7 @@ class _Protocol(H11Protocol):
         self.counters.connections = len(self.connections)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes of a request; begin its deadline with the first."""
+        """Process bytes of a request. The first byte starts the request's deadline."""
         if self._deadline is None and (self.cycle is None or self.cycle.response_complete):
             self._set_deadline()
         super().data_received(data)
@@ -158,7 +158,7 @@ class _Server(Uvicorn):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Install no handlers."""
+        """Install no signal handlers, because the worker has its own."""
         yield
 
 
@@ -182,7 +182,7 @@ class HttpServer:
             hosts: Names by which clients may address the server, besides IP addresses, ``localhost`` and the name in
                 ``address``.
             certificate: PEM file of the certificate for TLS.
-            key: PEM file of its key.
+            key: PEM file of the certificate's key.
 
         """
         self.address = address
@@ -211,7 +211,7 @@ class HttpServer:
         self._serving: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Begin to listen. EndpointError: the address cannot be used."""
+        """Begin to listen. Raise EndpointError if the address cannot be used."""
         family = socket.AF_INET6 if ":" in self.address.host else socket.AF_INET
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -193,7 +193,8 @@ class OpenCalls:
             raise DeniedError(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
                 f"this client has {self._by_client[client]} calls open, and the last {limits.reserve} of {limits.calls}"
-                f" are for clients with fewer than {limits.share}: use SimlogAPI version 2 (one stream for all topics)",
+                f" calls are for clients with fewer than {limits.share}: use SimlogAPI version 2 (one stream for all "
+                "topics)",
             )
 
 

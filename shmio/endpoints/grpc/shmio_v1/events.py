@@ -329,7 +329,7 @@ class EventCalls:
         return {"Events": grpc.unary_stream_rpc_method_handler(self.events, wire.EventsRequest.FromString)}
 
     async def events(self, request: wire.EventsRequest, context: Context) -> AsyncIterator[bytes]:
-        """Stream the events of these sources, or of all, from now on.
+        """Stream the events of these sources, or of all sources, from now on.
 
         Statuses:
             NOT_FOUND: There is no such source.

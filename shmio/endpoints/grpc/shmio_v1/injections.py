@@ -56,7 +56,7 @@ def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
     """Read the target of an injection.
 
     Raises:
-        PathError: There is no such source, or the target is not in one source and direction.
+        PathError: There is no such source, or the patterns differ in source or direction.
         ValueRangeError: There is no target, there are too many patterns or ranges, or the direction
             is not valid.
 
@@ -189,7 +189,7 @@ class InjectCall(InjectionFollower):
         """Check the request.
 
         Raises:
-            PathError: There is no such source, or the target is not in one source and direction.
+            PathError: There is no such source, or the patterns differ in source or direction.
             ValueRangeError: An option is not valid, or there is no target.
 
         """
@@ -532,7 +532,7 @@ class InjectionCalls:
         """Read the first message.
 
         Raises:
-            PathError: There is no such source, or the target is not in one source and direction.
+            PathError: There is no such source, or the patterns differ in source or direction.
             ValueRangeError: The message does not lay an injection, or an option is not valid.
             EndpointError: There are too many calls.
 
@@ -592,7 +592,7 @@ class InjectionCalls:
     async def list_injections(
         self, request: wire.ListInjectionsRequest, context: Context
     ) -> wire.ListInjectionsResponse:
-        """List the injections on these sources, or on all.
+        """List the injections on these sources, or on all sources.
 
         Statuses:
             NOT_FOUND: There is no such source.

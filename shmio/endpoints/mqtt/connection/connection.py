@@ -400,7 +400,8 @@ class BrokerConnection:
             return
         if not limits.fit(message):
             self.problems.message_refused(
-                f"broker {self._target} takes at most {limits.packet_bytes} bytes: {message.topic} is larger"
+                f"broker {self._target} takes at most {limits.packet_bytes} bytes: "
+                f"a message for {message.topic} is larger"
             )
             return
         qos, retain = message.qos and limits.qos, message.retain and limits.retain

@@ -131,7 +131,7 @@ class Metric:
         elif self._field in ("float_value", "double_value"):
             expected = {"float_value", "double_value"}
         if field not in expected:
-            raise ValueRangeError(f"{self.name}: {field} is not a value of {self.register.type}")
+            raise ValueRangeError(f"{self.name}: the field {field} does not fit the type {self.register.type}")
         if self.register.dims:
             return self._unpacked(value)
         bits = 32 if field == "int_value" else 64
@@ -229,7 +229,7 @@ class EdgeNode:
         self._by_alias: dict[int, Metric] = {}
 
     def define(self, devices: Mapping[str, Iterable[Register]]) -> None:
-        """Define the devices and their registers. Then publish the births of all of them again."""
+        """Define the devices and their registers. The node then has to publish all births again."""
         aliases = count(1)
         self.metrics = {
             device: {register.path: Metric(register, next(aliases)) for register in registers}

@@ -102,7 +102,7 @@ def test_one_client_cannot_take_all_calls_and_their_total_is_limited(segment: Se
         greedy, other, last = clients
         await greedy.open(8)
         assert await greedy.refused() == (
-            "this client has 8 calls open, and the last 4 of 12 are for clients with fewer than 2: use SimlogAPI "
+            "this client has 8 calls open, and the last 4 of 12 calls are for clients with fewer than 2: use SimlogAPI "
             "version 2 (one stream for all topics)"
         )
         await other.open(2)
