@@ -1,7 +1,8 @@
-// Subscribers on @grpc/grpc-js, on one connection, that count messages as bytes; with `stamps` they also take from each
-// the time at which its frame was published. Usage: node streams.js ADDRESS STARTED_NS. The first line it reads is
+// Subscribers on @grpc/grpc-js, on one connection, that count messages without decoding them. With `stamps`, they also
+// read from each message the time at which its frame was published. Usage: node streams.js ADDRESS STARTED_NS. The first line it reads is
 // {streams: [{method, request, then: [{method, request}]}], stamps: path of fields, or null}, the requests in base64.
-// It prints a line when all streams have all they asked for and had a message, and for each line more that it reads what came since the one before.
+// It prints a line when all calls of all streams are answered and each stream has received a message. For each further
+// line that it reads, it prints what has arrived since the line before.
 'use strict';
 
 const path = require('path');
@@ -13,7 +14,7 @@ const raw = (data) => data;
 let messages = 0;
 let latencies = [];
 
-// The place behind a varint, and its value.
+// Returns the position after a varint, and its value.
 function varint(data, at) {
   let value = 0;
   let scale = 1;
@@ -25,7 +26,7 @@ function varint(data, at) {
   }
 }
 
-// The value of a field of a protobuf message: a number, or [start, end].
+// Returns the value of a field of a protobuf message: a number, or [start, end] of its bytes.
 function field(data, [at, end], number) {
   while (at < end) {
     let tag, value;

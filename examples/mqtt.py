@@ -1,4 +1,4 @@
-"""Follow registers by MQTT, and write one: any client of MQTT does it so.
+"""Follow registers by MQTT, or write one, with an ordinary MQTT client.
 
 examples/mqtt.py 127.0.0.1:1883 shmio/a50 cell/Robot_800/Axs1_Pos
 examples/mqtt.py 127.0.0.1:1883 shmio/a50 --write cell/Outputs/13=1
@@ -17,14 +17,20 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 
 def main() -> int:
-    """Follow, or write and follow what becomes of it; 1: it did not come, for a reason that is told."""
+    """Print the messages about the registers. Return 1, after a line with the reason, if they do not arrive."""
     parser = argparse.ArgumentParser()
     parser.add_argument("broker", metavar="HOST:PORT")
     parser.add_argument("prefix")
     parser.add_argument("paths", nargs="*", metavar="PATH")
     parser.add_argument("--write", metavar="PATH=VALUE")
-    parser.add_argument("--count", type=int, default=0, help="end after so many messages")
-    parser.add_argument("--timeout", type=float, default=10, metavar="S", help="with --count, --write: wait so long")
+    parser.add_argument("--count", type=int, default=0, help="end after this number of messages")
+    parser.add_argument(
+        "--timeout",
+        type=float,
+        default=10,
+        metavar="S",
+        help="with --count or --write: wait at most this long (default: 10)",
+    )
     arguments = parser.parse_intermixed_args()
     host, _, port = arguments.broker.rpartition(":")
     if not host or not port.isdecimal():
@@ -33,12 +39,12 @@ def main() -> int:
     topics = [f"{prefix}/{path}/out" for path in arguments.paths] + ([f"{prefix}/{path}/in/result"] if path else [])
     if not topics:
         parser.error("name a PATH, or --write PATH=VALUE")
-    over: queue.SimpleQueue[str] = queue.SimpleQueue()  # why it is; empty: all has come
+    over: queue.SimpleQueue[str] = queue.SimpleQueue()  # the reason for the end; empty if all messages have arrived
     seen = 0
 
     def heard(_client: Client, _data: object, message: MQTTMessage) -> None:
         nonlocal seen
-        if 0 < arguments.count <= seen:  # it came before we had left
+        if 0 < arguments.count <= seen:  # it arrived before we had disconnected
             return
         if not any(topic_matches_sub(topic, message.topic) for topic in topics):  # aMQTT sends more than was asked for
             return
@@ -58,7 +64,7 @@ def main() -> int:
             client.publish(f"{prefix}/{path}/in", value, qos=1)
 
     def lost(*_: object) -> None:
-        over.put(f"{arguments.broker}: the broker has closed the connection; shmio-supervisor status says how it is")
+        over.put(f"{arguments.broker}: the broker has closed the connection; shmio-supervisor status shows its state")
 
     client = Client(CallbackAPIVersion.VERSION2, reconnect_on_failure=False)
     client.on_message = heard
@@ -72,7 +78,8 @@ def main() -> int:
     except OSError as error:
         why = f"{arguments.broker}: {error.strerror or error}; shmio-supervisor status says whether the broker runs"
     except queue.Empty:
-        why = f"{seen} messages in {arguments.timeout:g} s on {', '.join(topics)}; shmio list names the registers"
+        told = ", ".join(topics)
+        why = f"received {seen} messages in {arguments.timeout:g} s on {told}; shmio list names the registers"
     client.disconnect()
     client.loop_stop()
     if why:

@@ -20,13 +20,13 @@ from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 
 
 async def values(topics: list[TopicDescriptor], texts: list[str]) -> AsyncIterator[PubRequest]:
-    """The stream: a program with more to say would go on. Its end is the half-close."""
+    """Yield the messages of the stream. The stream ends with them; another program may continue it."""
     for topic, text in zip(topics, texts, strict=True):
         yield PubRequest(topic=topic, data=ROSMessage(type=topic.msgType, value=text))
 
 
 def channel_to(options: argparse.Namespace) -> grpc.aio.Channel:
-    """A channel in plain text, or by TLS."""
+    """Open a channel in plain text, or with TLS."""
     if options.ca is None:
         return grpc.aio.insecure_channel(options.address)
     ca, key, certificate = (file and file.read_bytes() for file in (options.ca, options.key, options.certificate))
@@ -34,21 +34,21 @@ def channel_to(options: argparse.Namespace) -> grpc.aio.Channel:
 
 
 async def main() -> int:
-    """Publish in the order given; exit status 1 when a topic is not there, or the server.
+    """Publish in the given order. Return 1 if a topic does not exist, or the server is not there.
 
-    Publish itself tells of no value that was refused; the server's log does, and the topic as it then reads.
+    Publish does not report refused values. The server's log names them, and a read of the topic shows its value.
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ca", type=Path, help="use TLS, and trust this authority (PEM)")
-    parser.add_argument("--certificate", type=Path, help="our own certificate (PEM), where the server asks for one")
-    parser.add_argument("--key", type=Path, help="its key (PEM)")
-    parser.add_argument("--token-file", type=Path, help="the token to send, where the server asks for one")
+    parser.add_argument("--certificate", type=Path, help="our own certificate (PEM), if the server requires one")
+    parser.add_argument("--key", type=Path, help="the key of our certificate (PEM)")
+    parser.add_argument("--token-file", type=Path, help="file with the token, if the server requires one")
     parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
     parser.add_argument("words", metavar="TOPIC VALUE", nargs="+")
     options = parser.parse_args()
     paths, texts = options.words[::2], options.words[1::2]
     if len(paths) != len(texts):
-        parser.error(f"no value for {paths[-1]}")
+        parser.error(f"missing value for topic {paths[-1]}")
     async with channel_to(options) as channel:
         stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
         token = options.token_file and options.token_file.read_text().strip()
@@ -59,7 +59,7 @@ async def main() -> int:
         except grpc.aio.AioRpcError as error:
             print(f"{options.address}: {error.code().name}: {error.details()}", file=sys.stderr)
             return 1
-    print(f"{len(texts)} sent, and the server is done with them; what was refused is named in its log")
+    print(f"sent {len(texts)} values; the server has handled them, and its log names those that it refused")
     return 0
 
 
@@ -68,7 +68,7 @@ if __name__ == "__main__":
         sys.exit(asyncio.run(main()))
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # who read our output went away, as `head` does
+    except BrokenPipeError:  # the reader of our output has ended, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except OSError as error:

@@ -14,9 +14,9 @@ from shmio.errors import ShmioError
 
 
 def main() -> int:
-    """Print the registers that each update is about; exit status 1 when the endpoint refuses or is not there."""
+    """Print the registers that each update has. Return 1 if the endpoint refuses or is not there."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, help="stop after so many updates")
+    parser.add_argument("--count", type=int, help="stop after this number of updates")
     parser.add_argument("--write", metavar="PATH=VALUE", help="first write a register; VALUE is JSON")
     parser.add_argument("address", metavar="HOST:PORT")
     parser.add_argument("patterns", metavar="PATTERN", nargs="+", help="path, structure or glob")

@@ -1,4 +1,4 @@
-"""Be the model of a source of connector "remote": a drive that follows a target. Docs: docs/how-to/remote-model.md.
+"""Compute a source of connector "remote": a drive that follows a target. Docs: docs/how-to/remote-model.md.
 
 python examples/remote_model.py [--ca CA.pem] [--token-file FILE] [--name NAME] HOST:PORT|unix:PATH SOURCE
 """
@@ -21,13 +21,13 @@ class Drive:
     position = 0.0
 
     def start(self, source: Simulation) -> None:
-        """Called whenever the source has been joined: go on from where it was shown last."""
+        """Continue from the position that the source showed last. Called each time the model has joined the source."""
         if source.computed:
             self.position = float(source.outputs["position"])
         print(f"joined {source.source}, the position is {self.position:g}", flush=True)
 
     def step(self, time_s: float, dt_s: float, inputs: Values) -> dict[str, object]:  # noqa: ARG002  it knows no time
-        """Called for each step: the outputs at its end."""
+        """Return the outputs at the end of a step."""
         most = inputs["speed"] * dt_s
         way = inputs["target"] - self.position
         self.position += max(-most, min(most, way))
@@ -35,11 +35,11 @@ class Drive:
 
 
 def main() -> int:
-    """Compute until Ctrl-C; exit status 1 when the endpoint refuses, or is not there for 10 s."""
+    """Compute until Ctrl-C. Return 1 if the endpoint refuses, or is not there for 10 s."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ca", help="use TLS, and trust this authority (PEM)")
-    parser.add_argument("--token-file", type=Path, help="the token to send, where the endpoint asks for one")
-    parser.add_argument("--name", default="remote_model.py", help="of the model, for messages")
+    parser.add_argument("--token-file", type=Path, help="file with the token, if the endpoint requires one")
+    parser.add_argument("--name", default="remote_model.py", help="name of the model in messages")
     parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
     parser.add_argument("source", metavar="SOURCE")
     options = parser.parse_args()

@@ -20,11 +20,11 @@ from shmio.wire.simlog_v1_pb2 import TopicDescriptor
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 
 STOPPED = ("Cancelling all calls", "Socket closed")
-"""What gRPC says of a server that has ended."""
+"""Texts by which gRPC reports that the server has ended."""
 
 
 async def follow(stub: Any, path: str, options: argparse.Namespace) -> None:
-    """Print a topic's values as they come; the first is the present one."""
+    """Print a topic's values as they arrive. The first is the present value."""
     count = options.count
     metadata = options.token_file and [("authorization", f"Bearer {options.token_file.read_text().strip()}")]
     stream = stub.Subscribe(TopicDescriptor(path=path), metadata=metadata)
@@ -37,7 +37,7 @@ async def follow(stub: Any, path: str, options: argparse.Namespace) -> None:
 
 
 def channel_to(options: argparse.Namespace) -> grpc.aio.Channel:
-    """A channel in plain text, or by TLS."""
+    """Open a channel in plain text, or with TLS."""
     if options.ca is None:
         return grpc.aio.insecure_channel(options.address)
     ca, key, certificate = (file and file.read_bytes() for file in (options.ca, options.key, options.certificate))
@@ -45,13 +45,13 @@ def channel_to(options: argparse.Namespace) -> grpc.aio.Channel:
 
 
 async def main() -> int:
-    """Subscribe to all topics at once; exit status 1 when the server refuses or is not there."""
+    """Subscribe to all topics at once. Return 1 if the server refuses or is not there."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, help="stop after so many values of each topic")
+    parser.add_argument("--count", type=int, help="stop after this number of values of each topic")
     parser.add_argument("--ca", type=Path, help="use TLS, and trust this authority (PEM)")
-    parser.add_argument("--certificate", type=Path, help="our own certificate (PEM), where the server asks for one")
+    parser.add_argument("--certificate", type=Path, help="our own certificate (PEM), if the server requires one")
     parser.add_argument("--key", type=Path, help="its key (PEM)")
-    parser.add_argument("--token-file", type=Path, help="the token to send, where the server asks for one")
+    parser.add_argument("--token-file", type=Path, help="file with the token, if the server requires one")
     parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
     parser.add_argument("topics", metavar="TOPIC", nargs="+")
     options = parser.parse_args()
@@ -72,7 +72,7 @@ if __name__ == "__main__":
         sys.exit(asyncio.run(main()))
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # who read our output went away, as `head` does
+    except BrokenPipeError:  # the reader of our output has ended, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except OSError as error:

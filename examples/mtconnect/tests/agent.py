@@ -1,4 +1,4 @@
-"""Runs the agent of the tests, a process in another language, and gives it commands."""
+"""Starts the agent of the tests, a process in another language, and sends it commands."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Agent:
         self._process.communicate(timeout=20)
 
     def tell(self, **command: object) -> None:
-        """Give a command; return when it is carried out."""
+        """Send a command. Return when the agent has carried it out."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(command) + "\n")
         self._process.stdin.flush()
         assert self._line() == "ok"
 
     def set(self, **values: str) -> None:
-        """Set data items."""
+        """Set the values of data items."""
         self.tell(set=values)
 
     def condition(self, item: str, element: str, code: str = "", text: str = "") -> None:

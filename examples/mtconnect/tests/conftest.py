@@ -1,4 +1,4 @@
-"""Fixtures of all tests."""
+"""Fixtures that all tests of the package use."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ import pytest
 
 @pytest.fixture
 def instance() -> str:
-    """Return a name for an instance that no other test has; shmio's suite asks for it."""
+    """Return a name for an instance that no other test uses. shmio's conformance suite asks for it."""
     return f"test-{os.getpid()}-{secrets.token_hex(4)}"

@@ -1,4 +1,4 @@
-"""Values, quality and recovery, against an agent in another language."""
+"""Values, quality and recovery of the connector, tested with an agent in another language."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TAGS: dict[str, object] = {
 
 
 class Reader:
-    """A connector, and what its images have."""
+    """A connector, and the values and statuses of its images."""
 
     def __init__(self, agent: Agent, **options: int) -> None:
         self.layout = place_tags("device", TAGS).with_statuses()
@@ -41,7 +41,7 @@ class Reader:
         self.connector = MTConnectConnector(MTConnectOptions(url=f"http://{agent.address}", **keys), self.layout)
 
     def read(self) -> dict[str, object]:
-        """Return value, or the name of its status, by path."""
+        """Return for each path the value, or the name of its status if it has no value."""
         raw, area = self.connector.read(), StatusArea(self.layout)
         found: dict[str, object] = {}
         for index, register in enumerate(self.layout.registers):
@@ -57,14 +57,14 @@ class Reader:
         return found
 
     def error(self) -> str:
-        """Read until the connection is lost; return why."""
+        """Read until the connection is lost. Return the message."""
         end = time.monotonic() + 10
         while time.monotonic() < end:
             try:
                 self.connector.read()
             except ConnectorError as error:
                 return str(error)
-        raise AssertionError("the connection is not lost")
+        raise AssertionError("the connection was not lost")
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def reader(agent: Agent) -> Iterator[Reader]:
 
 @pytest.mark.parametrize("version", ["1.3", "1.8", "2.3"])
 def test_values_of_all_kinds(agent: Agent, reader: Reader, version: str) -> None:
-    """Samples, events, vectors, time series and conditions, from ``current`` and from the stream."""
+    """Check samples, events, vectors, time series and conditions, from ``current`` and from the stream."""
     agent.tell(version=version)
     agent.set(Xact="1.5")
     reader.connector.connect()
@@ -120,7 +120,7 @@ def test_values_of_all_kinds(agent: Agent, reader: Reader, version: str) -> None
 
 
 def test_source_time_is_the_timestamp(agent: Agent, reader: Reader) -> None:
-    """With fractions of any length."""
+    """Check timestamps with fractions of any length."""
     agent.tell(set={"Xact": "1"}, at="2024-02-29T12:00:00.123456789Z")
     agent.tell(set={"Yact": "1"}, at="2024-02-29T13:00:00+01:00")
     reader.connector.connect()
@@ -130,7 +130,7 @@ def test_source_time_is_the_timestamp(agent: Agent, reader: Reader) -> None:
 
 
 def test_active_conditions_of_the_present_state(agent: Agent, reader: Reader) -> None:
-    """All of them are in ``current``; when the worst one ends, the other one remains."""
+    """All active conditions are in ``current``. When the worst one ends, the other one remains."""
     agent.condition("hyd", "Fault", "F7", "Pump")
     agent.condition("hyd", "Warning", "W1", "Oil")
     reader.connector.connect()
@@ -140,7 +140,7 @@ def test_active_conditions_of_the_present_state(agent: Agent, reader: Reader) ->
 
 
 def test_a_restarted_agent_is_read_anew(agent: Agent, reader: Reader) -> None:
-    """Its sequence begins again, and the connector begins with the present state."""
+    """The agent's sequence starts again, and the connector starts with the present state."""
     agent.set(Xact="1", count="1")
     reader.connector.connect()
     agent.tell(restart=True)
@@ -152,14 +152,14 @@ def test_a_restarted_agent_is_read_anew(agent: Agent, reader: Reader) -> None:
 
 
 def test_a_missing_heartbeat(agent: Agent, reader: Reader) -> None:
-    """The connection is open and silent: no old value stays good."""
+    """The connection is open but silent. No old value stays good."""
     reader.connector.connect()
     agent.tell(silent=True)
     assert "no answer" in reader.error()
 
 
 def test_a_stream_that_is_behind_is_uncertain(agent: Agent) -> None:
-    """It catches up, in the order of the observations."""
+    """The stream catches up, in the order of the observations."""
     reader = Reader(agent, count=2)
     agent.set(count="0")
     reader.connector.connect()
@@ -211,7 +211,7 @@ def test_observations_that_fell_out_of_the_buffer(agent: Agent, reader: Reader) 
     ids=["garbage", "html", "entities", "depth", "text", "items", "size", "cut", "error"],
 )
 def test_hostile_documents(agent: Agent, answer: tuple[str, str, int], error: str) -> None:
-    """Each is refused with a reason, and limited."""
+    """The connector refuses each document with a reason, and within its limits."""
     reader = Reader(agent, timeout=5000)
     agent.tell(raw=answer)
     with pytest.raises(ConnectorError, match=error):
@@ -220,7 +220,7 @@ def test_hostile_documents(agent: Agent, answer: tuple[str, str, int], error: st
 
 
 def test_an_older_observation_is_never_shown(agent: Agent, reader: Reader) -> None:
-    """The stream sends the observation again that came before the present one."""
+    """The stream sends an observation again that is older than the present one."""
     agent.set(count="1")
     agent.set(count="2")
     head = '<MTConnectStreams><Header instanceId="1000" nextSequence="100" lastSequence="99"/><Events>'
@@ -252,7 +252,7 @@ PART = "--part-1000\r\nContent-type: text/xml\r\n"
     ids=["no length", "long", "negative", "headers", "line", "html", "end", "entities", "other", "drip"],
 )
 def test_hostile_streams(agent: Agent, parts: list[object], error: str) -> None:
-    """Each is refused with a reason; one that never completes a part misses its heartbeat."""
+    """The connector refuses each stream with a reason. A part that never ends counts as a missing heartbeat."""
     reader = Reader(agent)
     agent.tell(parts=parts)
     reader.connector.connect()
@@ -262,7 +262,7 @@ def test_hostile_streams(agent: Agent, parts: list[object], error: str) -> None:
 
 @pytest.mark.parametrize("part", ["headers", "content"])
 def test_a_document_that_drips(agent: Agent, part: str) -> None:
-    """It is late as a whole, although there is always another byte in time."""
+    """The document as a whole is late, although another byte always arrives in time."""
     reader = Reader(agent, timeout=300)
     agent.tell(drip=part)
     with pytest.raises(ConnectorError, match=r"no answer from .* within 300 ms"):
@@ -280,7 +280,7 @@ def test_a_document_that_drips(agent: Agent, part: str) -> None:
     ],
 )
 def test_registers_that_it_cannot_read_are_refused(tag: object) -> None:
-    """The error names the register."""
+    """The message names the register."""
     with pytest.raises(ConfigError, match="speed"):
         MTConnectConnector(MTConnectOptions(url="http://a"), place_tags("device", {"speed": tag}).with_statuses())
 
@@ -289,11 +289,11 @@ def test_registers_that_it_cannot_read_are_refused(tag: object) -> None:
     "url", ["ftp://host:1", "http://", "http://a b", "http://a:99999", "http://u@a", "http://a/?b"]
 )
 def test_addresses_of_agents(url: str) -> None:
-    """Only plain ones are accepted."""
+    """Other schemes, invalid hosts and ports, users and queries are refused."""
     with pytest.raises(ValueError, match="url"):
         MTConnectOptions(url=url)
 
 
 def test_shmio_finds_it_by_its_entry_point() -> None:
-    """The package must be installed: pip install -e ."""
+    """The test needs an installed package: pip install -e ."""
     assert registry.load("mtconnect") is MTConnectConnector

@@ -1,4 +1,4 @@
-"""The suite that all connectors of shmio pass, against an agent in another language."""
+"""The conformance suite for all connectors of shmio, run with an agent in another language."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PIECE = 64
 
 
 class Rig:
-    """The agent behind a proxy that breaks the connection."""
+    """The agent behind a proxy, which can break the connection."""
 
     def __init__(self, proxy: FaultProxy) -> None:
         self.proxy = proxy
@@ -35,7 +35,7 @@ class Rig:
         return MTConnectConnector(options, self.layout)
 
     def generation(self, raw: bytes) -> int:
-        """Return the count that an image has."""
+        """Return the count in an image."""
         count, copy = (codec(register, "little").decode(raw) for register in self.layout.registers)
         assert isinstance(count, int)
         assert copy == count, "values of two moments in one image"
@@ -43,7 +43,7 @@ class Rig:
 
 
 class TestMTConnect(ConnectorConformance):
-    """The connector passes the suite of all connectors."""
+    """Runs the suite of all connectors."""
 
     @pytest.fixture
     def rig(self) -> Iterator[Rig]:

@@ -1,1 +1,1 @@
-"""The connector mtconnect for shmio: machine tools by MTConnect."""
+"""The connector mtconnect for shmio, which reads machine tools by MTConnect."""

@@ -1,4 +1,4 @@
-"""The connector mtconnect: its keys of ``[[source]]``, and the stream of an agent in an image."""
+"""The connector mtconnect: its keys of ``[[source]]``, and how an agent's stream becomes images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shmio_mtconnect.http import Exchange
 from shmio_mtconnect.values import Target, find, parse
 
 MAX_REPORTED: Final = 20
-"""Registers without a data item that are reported by name."""
+"""Most registers without a data item that a connection names in the log."""
 CLOSE_S: Final = 2.0
 
 log = logging.getLogger("shmio.source")
@@ -37,15 +37,15 @@ class MTConnectOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, 
     """
 
     url: Annotated[str, msgspec.Meta(min_length=8, max_length=1000)]
-    """``http://HOST:PORT`` of the agent; a path behind it comes before each request."""
+    """``http://HOST:PORT`` of the agent. If a path follows, it precedes the path of each request."""
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 2000
-    """Time-out in ms for each document, and for a heartbeat that is late."""
+    """Time-out in ms for each document, and for a late heartbeat."""
     interval: Annotated[int, msgspec.Meta(ge=1, le=60_000)] = 100
     """Shortest time in ms between two documents of the stream."""
     heartbeat: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 1000
     """Longest time in ms between two documents of the stream."""
     count: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1000
-    """Most observations in one document. The agent may refuse more than its buffer has."""
+    """Most observations in one document. The agent may refuse a number larger than its buffer."""
 
     def __post_init__(self) -> None:
         try:
@@ -54,9 +54,9 @@ class MTConnectOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, 
         except ValueError:
             valid = False
         if not valid or not self.url.isascii() or not self.url.isprintable() or " " in self.url:
-            raise ValueError(f"url: {self.url[:80]!r} is no address of an agent, such as http://192.168.0.20:5000")
+            raise ValueError(f"url: {self.url[:80]!r} is not the address of an agent, such as http://192.168.0.20:5000")
         if parts.query or parts.fragment or parts.username is not None:
-            raise ValueError("url: leave out everything from ? or # on, and users: expected http://HOST:PORT/PATH")
+            raise ValueError("url: remove the user and everything from ? or # on: expected http://HOST:PORT/PATH")
 
 
 class MTConnectConnector(Connector):
@@ -74,12 +74,12 @@ class MTConnectConnector(Connector):
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks, in s: a connection has three requests, and finds data items."""
+        """Longest time in s that a method blocks: a connection makes three requests and finds data items."""
         return 5 * self._options.timeout / 1000 + CLOSE_S
 
     @property
     def doubt(self) -> str:
-        """Why values are uncertain: the stream has fallen behind the agent."""
+        """The reason why values are uncertain: the stream is behind the agent. Empty if they are not."""
         behind = self._follower.behind if self._follower is not None else 0
         if behind <= self._options.count:
             return ""
@@ -91,15 +91,15 @@ class MTConnectConnector(Connector):
         return f"to {self._options.url}, {known} data items"
 
     def load(self) -> Load:
-        """Return what is read; no requests, because the agent sends a stream."""
+        """Return what the agent sends. There are no repeated requests, because the agent sends a stream."""
         note = f"the agent sends what has changed, at most every {self._options.interval} ms"
         return Load(counted(len(self._addresses), "data item"), note=note)
 
     def connect(self) -> None:
-        """Ask for the device model and the present state, and open the stream from there.
+        """Ask for the device model and the present state, and open the stream that continues it.
 
         Raises:
-            ConnectorError: The agent cannot be reached, or is none.
+            ConnectorError: The agent cannot be reached, or the peer is not an agent.
 
         """
         self.close()
@@ -130,7 +130,7 @@ class MTConnectConnector(Connector):
             self._follower = None
 
     def _targets(self, image: RegisterImage) -> dict[str, list[Target]]:
-        """Ask for the device model; return the registers of each data item."""
+        """Ask for the device model. Return the registers of each data item."""
         devices = DevicesDocument()
         exchange = Exchange(self._options.url, self._options.timeout)
         try:
@@ -147,8 +147,8 @@ class MTConnectConnector(Connector):
         for index, (register, address) in enumerate(zip(self._layout.registers, self._addresses, strict=True)):
             if time.monotonic() > deadline:
                 raise ConnectorError(
-                    f"finding the data items takes longer than {self._options.timeout} ms: name them by dataItemId, or "
-                    "raise timeout"
+                    f"finding the data items takes longer than {self._options.timeout} ms: "
+                    "use dataItemIds as addresses, or raise timeout"
                 )
             item, code, why = find(address, by_name.get(address.parts[-1], []))
             if item is not None:
@@ -164,7 +164,7 @@ class MTConnectConnector(Connector):
 
 
 class _Follower:
-    """Follows the stream of one connection in a thread. After an error it is done."""
+    """Follows the stream of one connection in a thread. The thread ends after an error."""
 
     def __init__(
         self, options: MTConnectOptions, image: RegisterImage, lock: threading.Lock, targets: dict[str, list[Target]]
@@ -177,10 +177,10 @@ class _Follower:
         self._error = ""
         self._heard_ns = 0
         self.behind = 0
-        """Observations that the agent has and has not sent yet, when it sent the last document."""
+        """Number of observations that the agent had not sent yet when it sent the last document."""
 
     def start(self) -> None:
-        """Take the whole state, and open the stream that continues it; ConnectorError."""
+        """Read the whole state, and open the stream that continues it. Raise ConnectorError if that fails."""
         current = StreamsDocument(self.targets)
         exchange = Exchange(self._options.url, self._options.timeout)
         try:
@@ -200,7 +200,7 @@ class _Follower:
         self._thread.start()
 
     def check(self) -> None:
-        """Raise ConnectorError unless the last document is recent; the caller has the lock."""
+        """Raise ConnectorError unless the last document is recent. The caller holds the lock."""
         if self._error:
             raise ConnectorError(self._error)
         limit_ms = self._options.heartbeat + self._options.interval + self._options.timeout
@@ -230,7 +230,7 @@ class _Follower:
             raise ConnectorError(f"{self._stream.peer} has restarted: its instanceId is {streams.instance_id!r} now")
         if streams.next_sequence < self._next:
             raise ConnectorError(
-                f"{self._stream.peer} goes back to observation {streams.next_sequence} behind {self._next}"
+                f"{self._stream.peer} went back from observation {self._next} to {streams.next_sequence}"
             )
         with self._lock:
             self._store(streams, whole=False)

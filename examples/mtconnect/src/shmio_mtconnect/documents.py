@@ -1,7 +1,7 @@
 """Parse the XML documents of an agent: devices, streams and errors, of versions 1.3 to 2.x.
 
-A document comes from a network: it has no DTD and so no entities, and its size, depth and number of
-data items are limited. Namespaces are not compared, because each version has one of its own.
+A document comes from a network. It must have no DTD, so that it has no entities. Its size, depth and number of data
+items are limited. Namespaces are not compared, because each version has its own.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_DATA_ITEMS: Final = 100_000
 MAX_OBSERVATIONS: Final = 100_000
 """Most observations of wanted data items in one document."""
 MAX_TEXT: Final = 1 << 20
-"""Longest text of one observation, in characters; a time series is one."""
+"""Longest text of one observation, in characters. A time series is one text."""
 MAX_ERROR: Final = 300
 _TIME = re.compile(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(Z|[+-]\d\d:\d\d)?", re.ASCII)
 _KINDS: Final = frozenset({"Samples", "Events", "Condition"})
@@ -33,9 +33,9 @@ class DataItem(NamedTuple):
     id: str
     category: str
     names: tuple[frozenset[str], ...]
-    """What each part of its path may be called: the device, its components, the item."""
+    """For each part of the item's path, the names that an address may use: the device, its components, the item."""
     path: str
-    """Its path for messages."""
+    """The item's path, as messages show it."""
     representation: str
 
 
@@ -61,7 +61,7 @@ class Streams:
 
 
 class _Parser:
-    """Feeds expat with limits, and calls back with local names."""
+    """Feeds expat with limited input, and passes on elements by their local names."""
 
     def __init__(
         self, root: str, begin: Callable[[str, dict[str, str]], None], end: Callable[[str, str], None]
@@ -80,21 +80,21 @@ class _Parser:
         self._expat.CharacterDataHandler = self._add
 
     def feed(self, data: bytes) -> None:
-        """Parse more of the document; ConnectorError."""
+        """Parse more of the document. Raise ConnectorError if it is invalid or too large."""
         self._size += len(data)
         if self._size > MAX_DOCUMENT_BYTES:
             raise ConnectorError(f"the agent's document has more than {MAX_DOCUMENT_BYTES >> 20} MiB")
         self._parse(data, last=False)
 
     def finish(self) -> None:
-        """Parse the end; ConnectorError if the document is not complete, or an error of the agent."""
+        """Parse the end. Raise ConnectorError if the document is incomplete, or reports an error of the agent."""
         self._parse(b"", last=True)
         if self._error is not None:
             raise ConnectorError(f"the agent reports: {' '.join(self._error)[:MAX_ERROR] or 'an error'}")
 
     @property
     def parent(self) -> str:
-        """Local name of the element around the present one."""
+        """Local name of the element that contains the present one."""
         return self._open[-2] if len(self._open) > 1 else ""
 
     @property
@@ -188,7 +188,7 @@ class DevicesDocument:
 
 
 class StreamsDocument:
-    """Parses values: the answer to ``current`` or ``sample``. Keeps only the wanted data items."""
+    """Parses values: the answer to ``current`` or ``sample``. It keeps only the wanted data items."""
 
     def __init__(self, wanted: Collection[str]) -> None:
         self.streams = Streams()
@@ -198,7 +198,7 @@ class StreamsDocument:
         self.feed = self._parser.feed
 
     def finish(self) -> Streams:
-        """Return the content; ConnectorError if the document is not complete, or an error of the agent."""
+        """Return the content. Raise ConnectorError if the document is incomplete, or reports an error."""
         self._parser.finish()
         if not self.streams.instance_id:
             raise ConnectorError("the agent's document has no Header with an instanceId")
@@ -233,7 +233,7 @@ class StreamsDocument:
 
 
 def to_ns(text: str) -> int:
-    """Return a timestamp as ns since 1970 UTC; 0 if it is none."""
+    """Return a timestamp as ns since 1970 UTC, or 0 if the text is not a timestamp."""
     match = _TIME.fullmatch(text)
     if match is None:
         return 0
@@ -249,5 +249,5 @@ def to_ns(text: str) -> int:
 
 def _whole(text: str, name: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= 20):
-        raise ConnectorError(f"the agent's document has {name} {text[:40]!r}, which is no number")
+        raise ConnectorError(f"the agent's document has {name} {text[:40]!r}, which is not a number")
     return int(text)

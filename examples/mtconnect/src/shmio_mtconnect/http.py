@@ -1,4 +1,4 @@
-"""Requests to an agent: one document, or an endless multipart stream of them. All of it is limited."""
+"""Requests to an agent: for one document, or for an endless multipart stream of documents, all within limits."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from shmio_mtconnect.documents import MAX_DOCUMENT_BYTES, DevicesDocument, Strea
 
 _CHUNK: Final = 1 << 16
 MAX_LINE: Final = 1 << 12
-"""Longest line of a part's header."""
+"""Longest line in the header of a part, in bytes."""
 MAX_LINES: Final = 32
 
 
 class Exchange:
     """One request on one connection, and its answer.
 
-    Within ``answer_within`` everything ends at a deadline, also an answer that drips in byte by byte.
+    Within ``answer_within`` there is one deadline for everything, even for an answer that arrives byte by byte.
     """
 
     def __init__(self, url: str, timeout_ms: int) -> None:
@@ -39,7 +39,7 @@ class Exchange:
 
     @contextmanager
     def answer_within(self) -> Iterator[None]:
-        """Cut the connection after the time-out, and turn all faults into ConnectorError."""
+        """Cut the connection at the time-out, and turn all errors into ConnectorError."""
         self._late = False
 
         def cut() -> None:
@@ -61,7 +61,7 @@ class Exchange:
 
     @contextmanager
     def faults(self) -> Iterator[None]:
-        """Turn faults of the connection into ConnectorError."""
+        """Turn errors of the connection into ConnectorError."""
         try:
             yield
         except TimeoutError:
@@ -72,7 +72,7 @@ class Exchange:
             raise ConnectorError(f"{self.peer} does not answer as an MTConnect agent: {_brief(error)}") from None
 
     def begin(self, request: str) -> None:
-        """Send a request, and receive the headers of its answer; to be called within ``answer_within``."""
+        """Send a request, and receive the headers of its answer. Call it within ``answer_within``."""
         self._connection.connect()
         self._socket = self._connection.sock
         if self._closed or self._late:  # there was no socket yet to be shut
@@ -93,7 +93,7 @@ class Exchange:
             into.finish()
 
     def parts(self) -> Iterator[bytes]:
-        """Yield the parts of a multipart answer as they come. It ends with ConnectorError only."""
+        """Yield the parts of a multipart answer as they arrive. It ends only by ConnectorError."""
         with self.faults():
             answer = self._opened()
             boundary = self._check(answer, streamed=True)
@@ -108,7 +108,7 @@ class Exchange:
                 self._socket.settimeout(timeout_s)
 
     def close(self) -> None:
-        """Close the connection. Any thread may call it; one that waits for an answer ends."""
+        """Close the connection. Any thread may call it. A thread that waits for an answer then ends."""
         self._closed = True
         self._shut()
         with suppress(OSError):
@@ -125,7 +125,7 @@ class Exchange:
         return self._answer
 
     def _check(self, answer: http.client.HTTPResponse, *, streamed: bool) -> bytes:
-        """Refuse an answer of another kind; return the boundary of a multipart one."""
+        """Refuse an answer of the wrong kind. Return the boundary of a multipart answer."""
         kind = answer.headers.get_content_type()
         if streamed and kind == "multipart/x-mixed-replace":
             boundary = answer.headers.get_param("boundary")
@@ -142,7 +142,7 @@ class Exchange:
 
 
 class _Reader:
-    """Cuts the parts out of a multipart answer."""
+    """Splits a multipart answer into its parts."""
 
     def __init__(self, answer: http.client.HTTPResponse, peer: str) -> None:
         self._answer, self._peer = answer, peer
@@ -191,7 +191,7 @@ class _Reader:
     def _more(self) -> None:
         data = self._answer.read1(_CHUNK)
         if not data:
-            raise ConnectorError(f"{self._peer} has closed the stream")
+            raise ConnectorError(f"{self._peer} has closed the connection of the stream")
         self._data += data
 
 

@@ -23,7 +23,7 @@ from shmio_mtconnect.documents import DataItem, Observation
 
 LEVELS: Final = {"Normal": 0, "Warning": 1, "Fault": 2}
 MAX_ACTIVE: Final = 1000
-"""Conditions of one data item that are active at once."""
+"""Most conditions of one data item that are kept as active at once."""
 _NUMBER = re.compile(r"[+-]?([0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})([eE][+-]?[0-9]{1,3})?", re.ASCII)
 _BOOLS: Final = {
     "TRUE": True,
@@ -42,11 +42,11 @@ class Address(NamedTuple):
 
     parts: tuple[str, ...]
     text: str | None
-    """If it is given, the register is true while the value is this text."""
+    """If the address has a text, the register is true while the value is this text."""
 
 
 def parse(register: Register) -> Address:
-    """Return a register's address; ConfigError names the register and the remedy."""
+    """Return a register's address. Raise ConfigError, with the register and the remedy, if it is invalid."""
     name, equals, text = register.address.partition("=")
     parts = tuple(part.strip() for part in name.strip().split("/"))
     if not all(parts):
@@ -62,7 +62,7 @@ def parse(register: Register) -> Address:
 
 
 def find(address: Address, items: Sequence[DataItem]) -> tuple[DataItem | None, int, str]:
-    """Return the data item of an address; if there is not exactly one, a status code and the reason.
+    """Find the data item of an address. If there is not exactly one, return a status code and the reason.
 
     A path names the device, the item, and as many components between them as needed, in their order.
     """
@@ -95,7 +95,7 @@ class Conditions:
         self._active: dict[str, tuple[int, str]] = {}
 
     def add(self, observation: Observation) -> tuple[int, str] | None:
-        """Take an observation; return the worst level and its text, or None if nothing is known."""
+        """Add an observation. Return the worst active level and its text, or None if the agent knows no state."""
         level = LEVELS.get(observation.element)
         if level is None:  # Unavailable
             self._active.clear()
@@ -112,7 +112,7 @@ class Conditions:
 
 
 class Target:
-    """A register, and how a data item becomes its value."""
+    """A register of a data item, which converts observations to the register's values."""
 
     def __init__(self, index: int, register: Register, address: Address, item: DataItem) -> None:
         self._index, self._register, self._address = index, register, address
@@ -123,8 +123,8 @@ class Target:
     def put(self, image: RegisterImage, observation: Observation, *, whole: bool) -> None:
         """Store an observation, unless it is older than the last.
 
-        ``whole`` says that it is part of the whole state, in which all active conditions are, with
-        the sequence number of each.
+        ``whole``: the observation belongs to the whole state, which has all active conditions, each with its own
+        sequence number.
         """
         if observation.sequence < self._last or (observation.sequence == self._last and not whole):
             return
@@ -153,7 +153,10 @@ class Target:
             image.put(self._index, value, observation.source_ns)
 
     def _value(self, text: str) -> Value:
-        """Return the register's value; ValueError if the text is none, OverflowError if it is too short."""
+        """Return the register's value.
+
+        Raise ValueError if the text is not a value, OverflowError if it has too few elements.
+        """
         register = self._register
         if self._address.text is not None:
             return text == self._address.text

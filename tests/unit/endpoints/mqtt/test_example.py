@@ -35,9 +35,9 @@ def test_an_address_without_a_broker_is_reported() -> None:
 
 def test_a_topic_without_messages_is_named(broker: Mosquitto) -> None:
     told = fails(broker.address, "--count", "1", "--timeout", "0.2", "cell/Nope")
-    assert told == f"0 messages in 0.2 s on {PREFIX}/cell/Nope/out; shmio list names the registers\n"
+    assert told == f"received 0 messages in 0.2 s on {PREFIX}/cell/Nope/out; shmio list names the registers\n"
     told = fails(broker.address, "--timeout", "0.2", "--write", "cell/Nope=1")
-    assert told == f"0 messages in 0.2 s on {PREFIX}/cell/Nope/in/result; shmio list names the registers\n"
+    assert told == f"received 0 messages in 0.2 s on {PREFIX}/cell/Nope/in/result; shmio list names the registers\n"
 
 
 def test_a_killed_broker_is_reported(broker: Mosquitto) -> None:
@@ -56,7 +56,7 @@ def test_a_killed_broker_is_reported(broker: Mosquitto) -> None:
         _, error = running.communicate(timeout=TIMEOUT_S)
     assert running.returncode == 1
     assert error == (
-        f"{broker.address}: the broker has closed the connection; shmio-supervisor status says how it is\n"
+        f"{broker.address}: the broker has closed the connection; shmio-supervisor status shows its state\n"
     )
 
 
