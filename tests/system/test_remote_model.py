@@ -219,7 +219,7 @@ def test_a_kill_during_a_step_fails_it_and_the_next_step_works(make_drive: Calla
     with served(cell) as model:
         step(cell)
         pid = cell.processes()["drive"]["pid"]
-        assert "drive: its process was restarted during this step" in failing(lambda: kill(pid))
+        assert "drive: the source's process was restarted during this step" in failing(lambda: kill(pid))
     with served(cell) as model:  # the previous model hangs in its step
         step(cell)
         pid = cell.processes()["grpc"]["pid"]

@@ -29,7 +29,7 @@ class Memory(Computed):
         self._image, _ = initial_frame(layout)
 
     def resume(self, image: bytes) -> None:
-        """Continue with the values of the previous process."""
+        """Continue with the values of the source's previous process."""
         self._image[:] = image
 
     def begin(self) -> bytes:
@@ -37,7 +37,7 @@ class Memory(Computed):
         return bytes(self._image)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write registers; every write succeeds."""
+        """Store the values; every write succeeds."""
         for write in writes:
             apply(write, self._image)
         return [""] * len(writes)

@@ -19,24 +19,27 @@ from shmio.segment.model_channel import ConnectedModel, ModelAnswer, ModelChanne
 from shmio.simulation.images import Images
 
 TURN_NS: Final = 50_000_000
-"""Period at which a waiting source checks the model; a process that dies causes no wake-up."""
+"""Period in ns at which a waiting source checks that the model's process is alive.
+
+The death of a process causes no wake-up.
+"""
 STOPPED: Final = "the source was stopped"
 
 
 class Remote(Computed):
     """``connector = "remote"``: a program connected by Simulate of shmio.v1 computes each step.
 
-    Without such a program, a step fails at once. If the program does not answer, the step fails
-    after ``timeout_ms``. A register that the program does not compute keeps its commanded or
-    connected value; a new value is shown from the next step on.
+    A step fails at once if no program is connected, and after ``timeout_ms`` if the program does
+    not answer. A register that the program does not compute keeps the value last written to it or
+    last read from its connected topic. The next step shows a new value.
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         """Keys of the source.
 
         ``outputs`` and ``inouts`` are patterns of the registers that the model computes; at least
-        one is needed. ``timeout_ms`` is in real time, and less than the 10 s that a step waits for
-        its sources.
+        one pattern is needed. ``timeout_ms`` is in real time. It must be less than the 10 s for
+        which a step waits for its sources.
         """
 
         outputs: list[str] = []
@@ -81,7 +84,7 @@ class Remote(Computed):
         return self._inputs
 
     def attach(self, writer: BlockWriter) -> None:
-        """Find the link to the model in the source's block."""
+        """Find the communication area of the model in the source's block."""
         link = writer.block.model_channel
         if link is None:
             raise SegmentError(f"source {writer.block.source}: its block has no link to a model")
@@ -99,7 +102,10 @@ class Remote(Computed):
                 raise ConnectorError(f"input {path}: {error}") from None
 
     def resume(self, image: bytes) -> None:
-        """Continue from the last image. The model keeps its other state in its own program."""
+        """Continue from the last image.
+
+        Any other state of the model is kept by the program that runs it.
+        """
         self._images.resume(image)
 
     def begin(self) -> bytes:
@@ -118,7 +124,7 @@ class Remote(Computed):
         return self._link.model() != self._last_model
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write registers; writes to outputs are refused."""
+        """Store values of registers; writes to outputs are refused."""
         return self._images.write(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
@@ -137,12 +143,12 @@ class Remote(Computed):
         ask = ModelRequest(0, self._writer.cycle, time_ns, dt_ns, until_ns, self._doubt, bytes(images.commanded), shown)
         answer = self._await(self._link.ask(ask, self._writer.now_ns()), model, until_ns)
         if answer.failure is not None:
-            raise ModelError(f"model {model.name!r}: {answer.failure or 'it gave no reason'}")
+            raise ModelError(f"model {model.name!r}: {answer.failure or 'it failed without giving a reason'}")
         images.shown[:] = images.with_given(answer.image)
         return bytes(images.shown)
 
     def interrupt(self) -> None:
-        """End the wait for an answer."""
+        """End a :meth:`step` that waits for an answer."""
         self._stopped = True
         self._link.answered.wake()
 

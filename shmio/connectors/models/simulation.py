@@ -1,8 +1,8 @@
 """A source whose registers a model computes inside the source's process.
 
-The supervisor also runs this module as a program (``python -m``) to describe a model: it imports
-the user's code in a fresh process. The program reads a ``Request`` from standard input and writes
-an ``Answer`` to standard output, both as JSON.
+The supervisor also runs this module as a program (``python -m``) to learn what a model's block
+contains. The program imports the user's code in a fresh process. It reads a ``Request`` from
+standard input and writes an ``Answer`` to standard output, both as JSON.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Simulation(Computed):
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         """Keys of the source.
 
-        ``model`` is ``package.module:Class``. ``folder`` is searched for modules that are not
-        installed.
+        ``model`` is ``package.module:Class``. Modules that are not installed are searched for in
+        ``folder``.
         """
 
         model: str
@@ -65,7 +65,10 @@ class Simulation(Computed):
         self._runner.connect(values)
 
     def resume(self, image: bytes) -> None:
-        """Continue from the last image. A restart of the process loses the model's other state."""
+        """Continue from the last image.
+
+        All other state of the model is lost when the process restarts.
+        """
         self._runner.resume(image)
 
     def begin(self) -> bytes:
@@ -73,7 +76,7 @@ class Simulation(Computed):
         return self._runner.begin()
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write registers; writes to outputs are refused."""
+        """Store values of registers; writes to outputs are refused."""
         return self._runner.write(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
@@ -84,10 +87,11 @@ class Simulation(Computed):
 def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
     """Create the model that the options name.
 
-    ``layout`` is the layout of its block; None if the model declares its registers itself.
+    ``layout`` is the layout of the source's block; None if the model itself declares its registers.
 
     Raises:
-        ConfigError: The model cannot be created. The message begins with the key.
+        ConfigError: The model cannot be created. The message begins with the configuration key that
+            is wrong.
 
     """
     try:
@@ -104,7 +108,7 @@ def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
 class Request(msgspec.Struct):
     """A request to describe a model.
 
-    ``layout`` is the JSON document of the layout of its block; None if the model declares one.
+    ``layout`` is the layout of the source's block as JSON; None if the model itself declares it.
     """
 
     options: Simulation.Options
@@ -112,7 +116,10 @@ class Request(msgspec.Struct):
 
 
 class Answer(msgspec.Struct):
-    """The layout of the model's block as JSON and the inputs that can be connected, or an error."""
+    """The layout of the model's block as JSON, and the inputs that can be connected.
+
+    Or an error.
+    """
 
     layout: str = ""
     inputs: tuple[str, ...] = ()

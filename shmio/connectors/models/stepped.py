@@ -26,22 +26,23 @@ from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Qual
 from shmio.segment.clock import ClockPage
 
 NO_DATA: Final = "no data yet"
-RESTARTED: Final = "its process was restarted during this step; it continues with the next one"
+RESTARTED: Final = "the source's process was restarted during this step; it continues with the next step"
 
 
 class Inputs:
     """Reads the registers of other sources that are connected to one source's inputs.
 
-    If the other source takes part in steps, it reads the last frame from before the present step,
-    even if that source has completed the step already (the Jacobi method). Otherwise it reads the
-    newest frame. Use an object in one thread only.
+    From a source that takes part in steps, it reads the last frame before the present step, even if
+    that source has already completed the step (the Jacobi method). From any other source it reads
+    the newest frame. Use an object in one thread only.
     """
 
     def __init__(self, segment: Segment, connections: Mapping[str, Topic]) -> None:
         """Create the inputs.
 
         Args:
-            segment: A segment that only this object uses, because it follows reloads.
+            segment: A segment that no other object uses, because reading refreshes it after
+                reloads.
             connections: The topic of each input, by the input's path.
 
         """
@@ -50,9 +51,10 @@ class Inputs:
         self._found: dict[str, tuple[Block, RegisterCodec]] = {}
 
     def read(self, step: int | None) -> tuple[dict[str, Value], str]:
-        """Return the values by input path, and why the other inputs have none; empty if all have.
+        """Return values by the paths of inputs, and why the other inputs have no value.
 
-        ``step`` is the present step; None in wall time.
+        The reason is empty if all inputs have a value. ``step`` is the present step; None in wall
+        time.
         """
         if self._segment.refresh():
             self._found = {}
@@ -86,13 +88,13 @@ class Inputs:
 
 
 def _why_none(block: Block, topic: Topic, frame: Frame | None) -> str:
-    """Return why the register of a good frame has no value."""
+    """Return why a register has no value although its frame is good."""
     status = frame and status_of(block, find(block.layout, topic.path), frame)
     return (status.reason if status else "") or "the bytes are not a valid value"
 
 
 def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
-    """Return the frame to read, or None and why there is no usable frame."""
+    """Return the frame to read and "", or None and the reason why there is no usable frame."""
     frame = newest(block, step)
     if frame is None:
         return None, NO_DATA
@@ -103,7 +105,7 @@ def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
 
 
 class StepClock(Protocol):
-    """The protocol through which the loop reads time and waits; tests implement it themselves."""
+    """What the loop needs of a clock. Tests implement it themselves."""
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC in ns."""
@@ -111,7 +113,7 @@ class StepClock(Protocol):
     def wait_ns(self, duration_ns: int | None) -> bool:
         """Wait for a wake-up, at most ``duration_ns`` (None: without limit).
 
-        Return True if the loop must stop, else False.
+        Return whether the loop must stop.
         """
 
     def nudge(self) -> None:
@@ -133,8 +135,8 @@ class PageClock:
     def wait_ns(self, duration_ns: int | None) -> bool:
         """Wait for a wake-up, at most ``duration_ns`` (None: without limit).
 
-        Return True if the loop must stop, else False. If a wake-up comes while the loop is busy,
-        the next wait returns at once.
+        Return whether the loop must stop. If a wake-up comes while the loop is busy, the next wait
+        returns at once.
         """
         if not self._stopped and (duration_ns is None or duration_ns > 0):
             self._seen = self._bell.wait(self._seen, -1 if duration_ns is None else duration_ns)
@@ -151,10 +153,10 @@ class PageClock:
 
 
 class SteppedLoop:
-    """Runs one computed source: computes and publishes its frames, and carries out writes.
+    """Runs one computed source: it computes and publishes frames, and carries out writes.
 
-    In virtual time every step publishes a frame. If a step fails, the frame is bad and gives the
-    reason.
+    In virtual time it publishes a frame for every step. If a step fails, the frame is bad and
+    states the reason.
     """
 
     def __init__(
@@ -174,12 +176,12 @@ class SteppedLoop:
 
         Args:
             source: The computed source.
-            writer: The writing side of the source's block.
+            writer: Writes the source's block.
             schedule: The times at which cycles are due in wall time.
             clock: The loop's clock.
             writable: Patterns of the registers that commands may write.
-            allow_nonfinite: See :class:`CommandProcessor`.
-            inputs: The reader of the source's connected inputs; None if there are none.
+            allow_nonfinite: Patterns of the registers to which NaN and infinities may be written.
+            inputs: Reads the source's connected inputs; None if no input is connected.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
 
@@ -207,11 +209,14 @@ class SteppedLoop:
 
     @property
     def note(self) -> str:
-        """Reason why the quality is not good; empty if it is good."""
+        """Why quality is not good; empty if it is good."""
         return self._quality_log.note
 
     def run(self) -> None:
-        """Compute cycles and steps until the clock stops the loop; then publish a bad frame."""
+        """Compute cycles and steps until the clock tells the loop to stop.
+
+        Then publish a bad frame.
+        """
         try:
             self._begin()
             while not (self._live() if self._page.read().virtual else self._free_run()):
@@ -224,7 +229,7 @@ class SteppedLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def _begin(self) -> None:
-        """Continue from the last image of the previous process, if there is one."""
+        """Continue from the last image of the source's previous process, if there is one."""
         last = self._writer.block.latest()
         if self._output.source_ns:
             self._source.resume(self._output.raw)
@@ -246,7 +251,10 @@ class SteppedLoop:
     # ---- wall time -----------------------------------------------------------------------------------------------
 
     def _free_run(self) -> bool:
-        """Wait for the next cycle of the schedule and compute it; return True if stopped."""
+        """Wait for the next cycle of the schedule and compute it.
+
+        Return whether the loop must stop.
+        """
         state = self._page.last_written()
         if state.virtual:
             return False
@@ -287,9 +295,11 @@ class SteppedLoop:
     # ---- virtual time --------------------------------------------------------------------------------------------
 
     def _live(self) -> bool:
-        """Compute the requested step. Between steps, carry out commands and publish model changes.
+        """Compute a step that was requested.
 
-        Return True if the loop must stop.
+        Between steps, carry out commands and publish new results.
+
+        Return whether the loop must stop.
         """
         state = self._page.read()
         if not state.virtual:
@@ -355,7 +365,10 @@ class SteppedLoop:
             self.commands.carry_out(self._write)
 
     def _write(self, writes: Sequence[Write]) -> list[str]:
-        """Write to the source. If it is prompt, publish a frame before the writes' outcomes."""
+        """Write to the source.
+
+        If the source is ``prompt``, publish a frame before the writes' outcomes.
+        """
         refusals = self._source.write(writes)
         if self._source.prompt:
             self._publish(self._source.begin(), self._writer.now_ns())
@@ -371,12 +384,12 @@ class SteppedLoop:
         self.counters.polls += 1
 
     def _fail(self, cycle: int, reason: str) -> None:
-        """Publish a bad frame; in wall time only if the reason is new."""
+        """Publish a bad frame; in wall time, only if the reason is new."""
         new = self._quality_log.update(Quality.BAD, reason, cycle)
         if new or self._in_virtual_time:
             raw, source_ns = self._output.raw, self._output.source_ns
             self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, Provenance.SIMULATED, reason))
 
     def _utc_ns(self) -> int:
-        """Return the UTC time of the present image; in virtual time, the time of its step."""
+        """Return the UTC time of the present image in ns; in virtual time, the time of its step."""
         return time.time_ns() if self._writer.at_ns is None else self._page.utc_ns(self._writer.at_ns)

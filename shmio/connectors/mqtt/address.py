@@ -31,14 +31,20 @@ _ARROW: Final = " -> "
 
 
 class Place(NamedTuple):
-    """A value in the messages of a topic; ``steps`` is its path in JSON, None: the payload is its text."""
+    """A value in the messages of a topic.
+
+    ``steps`` is the path of the value in JSON. If it is None, the payload is the value as text.
+    """
 
     topic: str
     steps: Steps | None
 
 
 class Metric(NamedTuple):
-    """A metric of Sparkplug B; ``device`` is empty for one of the node itself."""
+    """A metric of Sparkplug B.
+
+    ``device`` is empty if the metric belongs to the edge node itself.
+    """
 
     group: str
     node: str
@@ -47,19 +53,27 @@ class Metric(NamedTuple):
 
     @property
     def owner(self) -> str:
-        """``GROUP/NODE`` or ``GROUP/NODE/DEVICE``."""
+        """The node or device that has the metric: ``GROUP/NODE`` or ``GROUP/NODE/DEVICE``."""
         return "/".join(filter(None, self[:3]))
 
 
 class Address(NamedTuple):
-    """Where a register is read, and where its writes are published: None, at the same place."""
+    """Where a register is read (``source``), and where its writes are published (``target``).
+
+    If ``target`` is None, writes are published at ``source``.
+    """
 
     source: Place | Metric
     target: Place | None
 
 
 def parse(text: str) -> Address:
-    """Read an address; ValueError says what is wrong with it."""
+    """Parse the address of a register.
+
+    Raises:
+        ValueError: The address is wrong; the message says how.
+
+    """
     text = text.strip()
     if not text:
         raise ValueError(f"its `address` is missing; {EXAMPLES}")
@@ -72,7 +86,12 @@ def parse(text: str) -> Address:
 
 
 def place(text: str) -> Place:
-    """Read a topic, and the path in its JSON if there is one; ValueError."""
+    """Parse a topic, with a path in its JSON if the text has one.
+
+    Raises:
+        ValueError: The text is wrong; the message says how.
+
+    """
     text = text.strip()
     found = _JSON.fullmatch(text)
     if found is None:
@@ -84,9 +103,11 @@ def _topic(text: str) -> str:
     if not text:
         raise ValueError(f"the topic is missing; {EXAMPLES}")
     if set("+#") & set(text):
-        raise ValueError(f"{text!r}: a register has one topic: + and # are not allowed in it")
+        raise ValueError(f"{text!r}: a register has exactly one topic: + and # are not allowed in its address")
     if len(text) > MAX_TOPIC or any(_is_no_text(one) for one in text):
-        raise ValueError(f"{text[:60]!r}: a topic has at most {MAX_TOPIC} characters, all of them text")
+        raise ValueError(
+            f"{text[:60]!r}: a topic has at most {MAX_TOPIC} characters, and no control or invalid characters"
+        )
     if text.startswith("$share/"):
         raise ValueError(f"{text!r}: a shared subscription would get only some of the messages: leave out $share/NAME/")
     if text.split("/", 1)[0] == NAMESPACE:
@@ -108,5 +129,5 @@ def _metric(text: str) -> Metric:
 
 
 def _is_no_text(one: str) -> bool:
-    """Return whether brokers refuse a character in a topic (MQTT 5.0, 1.5.4)."""
+    """Return whether brokers refuse topics with this character (MQTT 5.0, 1.5.4)."""
     return category(one) in ("Cc", "Cs") or 0xFDD0 <= ord(one) <= 0xFDEF or ord(one) & 0xFFFE == 0xFFFE

@@ -1,6 +1,7 @@
-"""Lists the topics on which messages come, with the types and addresses that a tag table needs.
+"""Lists the topics of a broker, with the types and addresses that a tag table needs.
 
-It listens for a time, and publishes nothing: the births of Sparkplug nodes must come by themselves.
+It listens to all messages for a time, and publishes nothing. It therefore finds the metrics of a
+Sparkplug node only if the node sends its birth in that time.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from shmio.connectors.mqtt.values import decode_json, is_number
 from shmio.wire import sparkplug_b_pb2 as wire
 
 MAX_BYTES: Final = 1 << 26
-"""Most bytes of all payloads that are kept."""
+"""Largest total size of the payloads kept, in bytes."""
 MAX_TEXT: Final = 254
 _WORDS: Final = frozenset({b"true", b"false", b"on", b"off"})
 _KINDS: Final = {
@@ -35,18 +36,18 @@ _FIRST_ARRAY: Final = 22
 
 
 class Listener:
-    """Keeps the newest message of each topic. The link's thread calls it."""
+    """Keeps the newest message of each topic."""
 
     def __init__(self, options: MqttOptions, wanted: Wanted) -> None:
         self._max_bytes, self._wanted = options.max_payload_bytes, wanted
         self._changed = threading.Condition()
         self._payloads: dict[str, bytes | None] = {}
-        """None for a payload that is too large."""
+        """The newest payload of each topic; None if the payload is too large."""
         self._size = 0
         self.incomplete = ""
 
     def take(self, topic: str, payload: bytes, *, retained: bool) -> None:  # noqa: ARG002  both show what there is
-        """Take a message."""
+        """Store a message. The thread of the connection calls this."""
         sparkplug = topic.startswith(f"{NAMESPACE}/")
         if not sparkplug and not self._wanted.enters(_levels(topic)):
             return
@@ -54,18 +55,18 @@ class Listener:
         with self._changed:
             size = self._size + len(kept or b"") - len(self._payloads.get(topic) or b"")
             if (topic not in self._payloads and len(self._payloads) >= self._wanted.nodes) or size > MAX_BYTES:
-                self.incomplete = "there are more topics: name a part of them by a PATTERN, or set --limit"
+                self.incomplete = "there are more topics: select some of them by a PATTERN, or raise --limit"
                 self._changed.notify_all()
                 return
             self._payloads[topic], self._size = kept, size
 
     def wait(self, until_s: float) -> None:
-        """Listen until a time of CLOCK_MONOTONIC in s, or until there is too much."""
+        """Listen until ``until_s`` (CLOCK_MONOTONIC, in s), or until there are too many messages."""
         with self._changed:
             self._changed.wait_for(lambda: self.incomplete, max(0.0, until_s - time.monotonic()))
 
     def found(self) -> Browsed:
-        """Return what the messages have."""
+        """Return the values in the messages received so far."""
         with self._changed:
             payloads = dict(sorted(self._payloads.items()))
         groups = {topic[:at] for topic in payloads for at in range(len(topic)) if topic[at] == "/"}
@@ -79,17 +80,19 @@ class Listener:
                 offers += _values(topic, names, payload, self._wanted.depth)
         incomplete = self.incomplete
         if quiet and not incomplete:
-            incomplete = f"no birth has come of {', '.join(sorted(quiet)[:5])}: list again while it sends one"
+            incomplete = (
+                f"no birth has arrived from {', '.join(sorted(quiet)[:5])}: list again at a time when it sends one"
+            )
         return Browsed([one for one in offers if self._wanted.takes(one.names)], incomplete)
 
 
 def _levels(topic: str) -> tuple[str, ...]:
-    """Return a topic's levels as names; an empty one has no name."""
+    """Return the levels of a topic as names; an empty level becomes ``_``."""
     return tuple(level or "_" for level in topic.split("/"))
 
 
 def _values(topic: str, names: tuple[str, ...], payload: bytes | None, depth: int) -> Iterator[Offer]:
-    """Yield the values of a topic."""
+    """Yield the values in the payload of a topic."""
     if payload is None:
         yield Offer(names, refused="its payload is larger than max_payload_bytes")
         return
@@ -112,20 +115,24 @@ def _values(topic: str, names: tuple[str, ...], payload: bytes | None, depth: in
             kind = _text(payload.decode())
         except UnicodeDecodeError:
             kind = ""
-        yield _offer(names, kind, Place(topic, None)) if kind else Offer(names, refused="its payload is no short text")
+        yield (
+            _offer(names, kind, Place(topic, None))
+            if kind
+            else Offer(names, refused="its payload is binary, or text that is too long")
+        )
 
 
 def _members(topic: str, names: tuple[str, ...], found: Any, steps: Steps, depth: int) -> Iterator[Offer]:
-    """Yield the values in JSON."""
+    """Yield the values in a part of a JSON document; ``steps`` is the path of this part."""
     kind = _kind(found)
     if kind:
         yield _offer(names, kind, Place(topic, steps))
     elif found is None:
-        yield Offer(names, refused="it is null, and its type is unknown")
+        yield Offer(names, refused="it is null, so that its type is unknown")
     elif isinstance(found, str) or not found:
-        yield Offer(names, refused="it is empty" if not found else "it is no short text")
+        yield Offer(names, refused="it is empty" if not found else "its text is too long")
     elif len(steps) >= min(depth, MAX_STEPS):
-        yield Offer(names, refused=f"it is deeper than {len(steps)} levels")
+        yield Offer(names, refused=f"it is nested deeper than {len(steps)} levels")
     else:
         inside: Iterable[tuple[str | int, Any]] = found.items() if isinstance(found, dict) else enumerate(found)
         for step, one in inside:
@@ -133,7 +140,7 @@ def _members(topic: str, names: tuple[str, ...], found: Any, steps: Steps, depth
 
 
 def _kind(found: Any) -> str:
-    """Return the type of a register for a value of JSON; "" if it has none."""
+    """Return the type of a register for a JSON value; "" if a register cannot hold it."""
     if isinstance(found, bool):
         return "BOOL"
     if isinstance(found, int | float):
@@ -152,7 +159,10 @@ def _text(found: str) -> str:
 
 
 def _metrics(topic: str, payload: bytes | None, all_topics: Mapping[str, object], quiet: set[str]) -> Iterator[Offer]:
-    """Yield the metrics of a birth; note owners of data without a birth as quiet."""
+    """Yield the metrics in a birth.
+
+    Add to ``quiet`` each node or device that has sent only data.
+    """
     levels = topic.split("/")
     if not 4 <= len(levels) <= 5 or levels[2] not in ("NBIRTH", "DBIRTH", "NDATA", "DDATA"):
         return
@@ -165,7 +175,7 @@ def _metrics(topic: str, payload: bytes | None, all_topics: Mapping[str, object]
     try:
         metrics: Sequence[wire.Metric] = wire.Payload.FromString(payload or b"\xff").metrics
     except DecodeError:
-        yield Offer(owner, refused="its birth is no Sparkplug payload, or too large")
+        yield Offer(owner, refused="its birth is not a Sparkplug payload, or is too large")
         return
     for one in metrics:
         if not one.name or one.name == "bdSeq":
@@ -175,7 +185,11 @@ def _metrics(topic: str, payload: bytes | None, all_topics: Mapping[str, object]
         if kind and one.datatype >= _FIRST_ARRAY:
             kind = _array(one, kind)
         address = Metric(levels[1], levels[3], levels[4] if len(levels) == 5 else "", one.name)
-        yield _offer(names, kind, address) if kind else Offer(names, refused=f"data type {one.datatype} is no register")
+        yield (
+            _offer(names, kind, address)
+            if kind
+            else Offer(names, refused=f"a register cannot hold data type {one.datatype}")
+        )
 
 
 def _array(one: wire.Metric, kind: str) -> str:
@@ -187,13 +201,17 @@ def _array(one: wire.Metric, kind: str) -> str:
 
 
 def _offer(names: tuple[str, ...], kind: str, source: Place | Metric) -> Offer:
-    """Return an offer with its address, if an address can name it."""
+    """Return an offer with the address of a value; refused if an address cannot express it."""
     text = _address(source)
     try:
         readable = addresses.parse(text).source == source
     except ValueError:
         readable = False
-    return Offer(names, kind, {"address": text}) if readable else Offer(names, refused="no address can name it")
+    return (
+        Offer(names, kind, {"address": text})
+        if readable
+        else Offer(names, refused="an address cannot express its name")
+    )
 
 
 def _address(source: Place | Metric) -> str:

@@ -1,4 +1,4 @@
-"""Turns writes of registers into messages."""
+"""Turns writes of registers into MQTT messages."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from shmio.layout.values.write import Write
 
 
 class Command:
-    """A message to publish, the writes that it carries out, and what became of it."""
+    """A message to publish, the indices of the writes that it carries out, and its outcome."""
 
     def __init__(self, publication: Publication, writes: set[int]) -> None:
         self.publication, self.writes = publication, writes
         self.number: int | None = None
         self.outcome: str | None = None
-        """"" if the broker has taken it, or why not; None: that is not known."""
+        """Empty if the broker has accepted the message, or why it refused it.
+
+        None if that is not known.
+        """
 
 
 class _Draft:
-    """A message in the making: the values of its registers."""
+    """The registers and values of a message that is still being collected."""
 
     def __init__(self, target: Place | Metric) -> None:
         self.target = target
@@ -39,12 +42,12 @@ class _Draft:
 def plan(store: Store, options: MqttOptions, writes: Sequence[Write]) -> tuple[list[Command], list[str]]:
     """Turn writes into messages.
 
-    All registers of a command with JSON on one topic are in one message, and all metrics of one
-    Sparkplug device. Every register with text has a message of its own.
+    Values for the JSON of one topic share one message, and so do the metrics of one Sparkplug
+    device. Each register whose payload is text has its own message.
 
     Returns:
-        The messages in their order, and for each write "" or why it is refused. A write that is
-        refused is part of no message.
+        The messages in their order, and for each write "" or why it is refused. No message contains
+        values of a refused write.
 
     """
     outcomes = [""] * len(writes)
@@ -81,7 +84,12 @@ def plan(store: Store, options: MqttOptions, writes: Sequence[Write]) -> tuple[l
 
 
 def _touched(store: Store, write: Write, open_drafts: dict[object, _Draft]) -> Iterator[tuple[int, Value]]:
-    """Yield the registers that a write sets, with their values; ValueError."""
+    """Yield the registers that a write sets, with their values.
+
+    Raises:
+        ValueError: The write is refused; the message says why.
+
+    """
 
     def present(index: int) -> Value:
         draft = open_drafts.get(_key(_target(store, index)))
@@ -102,14 +110,19 @@ def _target(store: Store, index: int) -> Place | Metric:
 
 
 def _key(target: Place | Metric) -> object:
-    """Return what the messages of a draft have in common."""
+    """Return a key that is equal for all targets that share a message."""
     if isinstance(target, Metric):
         return "sparkplug", target.owner
     return ("text", target.topic) if target.steps is None else ("json", target.topic)
 
 
 def _message(store: Store, options: MqttOptions, draft: _Draft) -> Publication:
-    """Return the message of a draft; ValueError if it cannot be expressed."""
+    """Return the message of a draft.
+
+    Raises:
+        ValueError: A value cannot be published; the message says why.
+
+    """
     target = draft.target
     if isinstance(target, Metric):
         topic, payload = store.command(

@@ -26,11 +26,11 @@ from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
 
 TIMEOUTS: Final = 4
-"""How many time-outs the whole of a connection may take."""
+"""The longest time that connecting may take, as a multiple of the option ``timeout``."""
 FIRST_S: Final = 0.1
-"""How long a new connection waits for messages that the broker has kept."""
+"""How long a new connection waits for the messages that the broker retains, in s."""
 ECHO_S: Final = 0.2
-"""How long a write waits until its message has come back to this subscriber, after it was confirmed."""
+"""How long a confirmed write waits for its own message to come back from the broker, in s."""
 
 
 class MqttConnector(Connector):
@@ -52,7 +52,7 @@ class MqttConnector(Connector):
 
     @classmethod
     def browse(cls, options: MqttOptions, wanted: Wanted) -> Browsed:
-        """List the topics on which messages come within the time-out, and what is in them."""
+        """List the topics on which messages arrive within the time-out, and the values in them."""
         listener = Listener(options, wanted)
         client_id = options.client_id or f"shmio-browse-{secrets.token_hex(6)}"
         until_s = time.monotonic() + (TIMEOUTS - 1) * options.timeout / 1000
@@ -73,21 +73,23 @@ class MqttConnector(Connector):
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks, in s."""
+        """The longest time that any method may block, in s."""
         return TIMEOUTS * self._options.timeout / 1000
 
     def describe(self) -> str:
-        """Return the broker and how it is reached, for the log."""
+        """Return the broker's address and how the connection reaches it, for the log."""
         version = "5" if self._version == MQTTv5 else "3.1.1"
         secured = "TLS" if self._options.tls else "plain text"
         return f"to {self._options.address} as {self._client_id}, MQTT {version}, {secured}, {self._store.describe()}"
 
     def load(self) -> Load:
-        """Return what is read; no requests, because topics are subscribed to."""
+        """Return the number of subscriptions. A cycle needs no requests."""
         return Load(counted(len(self._store.filters), "subscription"), note="the broker sends their messages")
 
     def connect(self) -> None:
-        """Connect to the broker and subscribe; wait shortly for the messages that it has kept.
+        """Connect to the broker and subscribe.
+
+        Wait for a short time for the messages that it retains.
 
         Raises:
             ConnectorError: The broker cannot be reached, or refuses the client.
@@ -118,7 +120,7 @@ class MqttConnector(Connector):
         link.check()
 
     def _ask(self, link: Link) -> None:
-        """Ask Sparkplug nodes for their births, if that is needed."""
+        """Ask Sparkplug nodes for their births, if some are due."""
         if self._options.rebirth:
             for topic, payload in self._store.requests(time.monotonic_ns()):
                 link.publish(Publication(topic, payload, 0, retain=False))
@@ -141,10 +143,10 @@ class MqttConnector(Connector):
             raise
 
     def read(self) -> bytes:
-        """Return the image of the newest messages, if the broker certainly lives.
+        """Return the image of the newest messages, after checking that the broker still answers.
 
         Raises:
-            ConnectorError: The connection is lost, or the broker is silent or behind.
+            ConnectorError: The connection is lost, or the broker has not answered a ping in time.
 
         """
         link = self._link
@@ -164,10 +166,11 @@ class MqttConnector(Connector):
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Publish messages, which the broker acknowledges.
+        """Publish the written values, and wait until the broker has confirmed the messages.
 
         Raises:
-            WriteLostError: The connection was lost, or the broker did not acknowledge all in time.
+            WriteLostError: The connection was lost, or the broker did not confirm all messages in
+                time.
 
         """
         link = self._link
@@ -214,7 +217,12 @@ class MqttConnector(Connector):
 
 
 def _secrets(options: MqttOptions) -> tuple[str | None, ssl.SSLContext | None]:
-    """Read the files that the keys name, which may have been replaced; ConfigError."""
+    """Read password and certificates again, because their files may have been replaced.
+
+    Raises:
+        ConfigError: A file cannot be read, or its content is wrong.
+
+    """
     password = read_password(options.password_file, "password_file") if options.password_file else None
     if not options.tls:
         return password, None
@@ -222,7 +230,7 @@ def _secrets(options: MqttOptions) -> tuple[str | None, ssl.SSLContext | None]:
 
 
 def _mark(outcomes: list[str | Lost], commands: Sequence[Command], sent: Sequence[Command]) -> None:
-    """Note what is known of each write, which may need several messages."""
+    """Store in ``outcomes`` what is known of each write. A write may need several messages."""
     begun = {id(command) for command in sent}
     needed: dict[int, list[Command]] = {}
     for command in commands:

@@ -1,12 +1,13 @@
-"""The fault of a single value, which turns its register bad and no other."""
+"""The error for a single value, which turns only its own register bad."""
 
 from __future__ import annotations
 
 
 class ValueFaultError(Exception):
-    """A message has no such value, or none that fits.
+    """A message does not contain the value of a register, or a value that does not fit.
 
-    ``code`` is the status of the register, ``source_ns`` the time of the message; 0: unknown.
+    ``code`` is the status of the register. ``source_ns`` is the time of the message in ns since
+    1970; 0 if unknown.
     """
 
     def __init__(self, code: int, reason: str) -> None:

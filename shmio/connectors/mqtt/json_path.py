@@ -18,14 +18,19 @@ _STEP: Final = re.compile(
 
 
 def parse(text: str) -> Steps:
-    """Read a path, which begins with ``$``; ValueError says what is wrong."""
+    """Parse a path, which begins with ``$``.
+
+    Raises:
+        ValueError: The path is wrong; the message says where.
+
+    """
     steps: list[str | int] = []
     at = 1
     while at < len(text):
         found = _STEP.match(text, at)
         if found is None:
             raise ValueError(
-                f"{text!r}: this path is wrong from character {at + 1} on; write such as $.axes[0].pos, "
+                f"{text!r}: this path is wrong from character {at + 1} on; write, for example, $.axes[0].pos, "
                 "$['name with.dots'], or $ for the whole document"
             )
         index = found["index"]
@@ -37,15 +42,20 @@ def parse(text: str) -> Steps:
 
 
 def extract(document: Any, steps: Steps) -> Any:
-    """Return the value at a path of a document; ValueFaultError if it is not there."""
+    """Return the value at a path of a document.
+
+    Raises:
+        ValueFaultError: The document has no such value.
+
+    """
     for step in steps:
         if isinstance(step, int):
             if not isinstance(document, list):
-                raise ValueFaultError(BAD_TYPE_MISMATCH, f"[{step}] is looked up in what is not an array")
+                raise ValueFaultError(BAD_TYPE_MISMATCH, f"the value that should contain [{step}] is not an array")
             if step >= len(document):
                 raise ValueFaultError(BAD_INDEX_RANGE_NO_DATA, f"the array has no element [{step}]")
         elif not isinstance(document, dict):
-            raise ValueFaultError(BAD_TYPE_MISMATCH, f"{step!r} is looked up in what is not an object")
+            raise ValueFaultError(BAD_TYPE_MISMATCH, f"the value that should contain {step!r} is not an object")
         elif step not in document:
             raise ValueFaultError(BAD_NOT_FOUND, f"the JSON has no member {step!r}")
         document = document[step]
@@ -53,10 +63,13 @@ def extract(document: Any, steps: Steps) -> Any:
 
 
 def assign(document: Any, steps: Steps, value: Any) -> Any:
-    """Return a document with a value at a path; it makes the objects and arrays that are missing.
+    """Return the document with ``value`` at a path.
+
+    Objects and arrays that are missing are created.
 
     Raises:
-        ValueError: The document has something else there, or elements before it are missing.
+        ValueError: The path leads through a value of another kind, or array elements before the
+            value are missing.
 
     """
     if not steps:
@@ -65,12 +78,12 @@ def assign(document: Any, steps: Steps, value: Any) -> Any:
     if isinstance(step, int):
         elements = [] if document is None else document
         if not isinstance(elements, list):
-            raise ValueError(f"[{step}] is looked up in what is not an array")
+            raise ValueError(f"the value that should contain [{step}] is not an array")
         if step > len(elements):
             raise ValueError(f"the elements before [{step}] have no value: write them in the same command")
         inside = elements[step] if step < len(elements) else None
         return [*elements[:step], assign(inside, rest, value), *elements[step + 1 :]]
     members = {} if document is None else document
     if not isinstance(members, dict):
-        raise ValueError(f"{step!r} is looked up in what is not an object")
+        raise ValueError(f"the value that should contain {step!r} is not an object")
     return members | {step: assign(members.get(step), rest, value)}

@@ -1,8 +1,8 @@
-"""One connection to a broker, whose packets a thread of its own receives.
+"""One connection to a broker. Its own thread receives the packets.
 
-The connection keeps no session at the broker, so that nothing of an old connection is delivered on
-the next one. A PINGREQ is on its way at least every half time-out: the answer shows that the broker
-lives, and that what it sends is not behind.
+The connection has no session at the broker, so that messages for an old connection are never
+delivered on a new one. A PINGREQ is sent at least every half time-out. The answer shows that the
+broker is alive, and that messages which it sends are not delayed.
 """
 
 from __future__ import annotations
@@ -31,12 +31,18 @@ from shmio.errors import ConnectorError
 from shmio.logs import printable
 
 MAX_PACKET_BYTES: Final = (1 << 24) + (1 << 17)
-"""A larger packet ends the connection. The largest payload that an option allows fits."""
+"""Largest packet accepted; a larger one ends the connection.
+
+It has room for the largest payload that ``max_payload_bytes`` allows.
+"""
 MAX_FILTERS: Final = 8
-"""Most filters of a SUBSCRIBE. Some brokers end the connection for more (AWS IoT Core)."""
+"""Largest number of filters in a SUBSCRIBE.
+
+Some brokers disconnect clients that send more (AWS IoT Core).
+"""
 MAX_IN_FLIGHT: Final = 20
 HEAD_BYTES: Final = 128
-"""Maximum size of the parts of a PUBLISH other than topic and payload."""
+"""Largest size of a PUBLISH without its topic and payload."""
 CLOSE_S: Final = 0.5
 _TURN_S: Final = 1.0
 # Reason codes: MQTT 5.0, section 2.4. Paho uses the same numbers for MQTT 3.1.1.
@@ -49,18 +55,18 @@ log = logging.getLogger("shmio.source.mqtt")
 
 
 class Deliver(Protocol):
-    """Takes messages."""
+    """Function that receives the messages of a connection."""
 
     def __call__(self, topic: str, payload: bytes, *, retained: bool) -> None:
-        """Take a message."""
+        """Receive a message; ``retained`` if the broker had stored it."""
 
 
 class UnsupportedVersionError(ConnectorError):
-    """The broker does not know the version of MQTT."""
+    """The broker does not support this version of MQTT."""
 
 
 class _Client(Client):
-    """A paho client with limits, which says when packets arrive."""
+    """A paho client that limits the size of packets and reports the answers to its pings."""
 
     def __init__(self, opened: socket.socket, client_id: str, version: MQTTProtocolVersion, after: int) -> None:
         super().__init__(
@@ -73,22 +79,28 @@ class _Client(Client):
         self._opened = opened
         self.tls_error: ssl.SSLError | None = None
         self.violation = ""
-        """What the broker did that ends the connection."""
+        """What the broker did against the protocol, so that the connection ends.
+
+        Empty if it did nothing.
+        """
         self.on_pong: Callable[[], None] = lambda: None
         self.pings = self.pongs = 0
-        """How many PINGREQs were sent and answered. Paho sends some, too."""
+        """How many PINGREQs were sent and answered. Paho also sends some by itself."""
         self.pinged_ns = 0
-        """When the oldest PINGREQ without an answer was sent, or else the last one, ns of CLOCK_MONOTONIC."""
+        """When the oldest unanswered PINGREQ was sent, in ns of CLOCK_MONOTONIC.
+
+        If all were answered, the time of the last one.
+        """
         self._pinging = threading.Lock()
         self._last_mid = after
 
     @property
     def last_number(self) -> int:
-        """The last packet identifier that was used."""
+        """The packet identifier that was used last."""
         return self._last_mid
 
     def ping(self) -> int:
-        """Send a PINGREQ, which paho sends only after its keep-alive time; return its number."""
+        """Send a PINGREQ at once, without paho's keep-alive time; return its number."""
         self._send_pingreq()
         return self.pings
 
@@ -139,7 +151,7 @@ class Publication:
 
 
 class Link:
-    """A connection; create it, then :meth:`open` it."""
+    """A connection to a broker. Create it, then call :meth:`open`."""
 
     def __init__(
         self,
@@ -156,12 +168,13 @@ class Link:
         Args:
             options: The source's keys.
             client_id: The client's id.
-            password: The password of the user.
-            context: For TLS; None: plain text.
-            deliver: Called in the thread with each message.
-            wake: Called in the thread when the connection is lost.
-            last_number: The last packet identifier of the connection before: a late acknowledgement
-                of that one never fits this one.
+            password: The password of the user; None if there is none.
+            context: The TLS context; None for plain text.
+            deliver: Called in the receiving thread with each message.
+            wake: Called in the receiving thread when the connection is lost.
+            last_number: The last packet identifier of the previous connection. Identifiers continue
+                after it, so that a late acknowledgement of that connection fits no message of this
+                one.
 
         """
         self._options, self._client_id, self._password, self._context = options, client_id, password, context
@@ -175,7 +188,7 @@ class Link:
         self._subacks: dict[int, Sequence[ReasonCode]] = {}
         self._acks: dict[int, ReasonCode] = {}
         self._in_flight: set[int] = set()
-        """The messages of the present writes, acknowledged or not."""
+        """The packet identifiers of the present writes' messages, whether acknowledged or not."""
         self._limits: dict[str, Any] = {}
         self.last_number = last_number
         self.version: MQTTProtocolVersion = MQTTv5
@@ -192,14 +205,14 @@ class Link:
 
         Args:
             version: The version of MQTT.
-            filters: What to subscribe to.
+            filters: The topic filters to subscribe to.
             until_s: When to give up, s of CLOCK_MONOTONIC.
 
         Returns:
             The filters that the broker refuses.
 
         Raises:
-            UnsupportedVersionError: The broker does not know the version.
+            UnsupportedVersionError: The broker does not support the version.
             ConnectorError: The broker cannot be reached, or refuses the client.
 
         """
@@ -225,10 +238,10 @@ class Link:
         assert self._connack is not None  # noqa: S101 - for the type checker
         if self._connack.is_failure:
             if str(self._connack) == _UNSUPPORTED:
-                raise UnsupportedVersionError(f"{self.peer} does not know this version of MQTT: set version")
+                raise UnsupportedVersionError(f"{self.peer} does not support this version of MQTT: set version")
             raise ConnectorError(f"{self.peer} refuses the connection: {self._refusal(self._connack)}")
         if self._options.retain and not self._limits.get("RetainAvailable", 1):
-            raise ConnectorError(f"{self.peer} keeps no messages: remove retain = true")
+            raise ConnectorError(f"{self.peer} does not retain messages: remove retain = true")
         return self._subscribe(client, list(filters), until_s)
 
     def _connected_socket(self, until_s: float) -> socket.socket:
@@ -255,7 +268,7 @@ class Link:
             raise ConnectorError(f"{peer}: {_tls(error)}") from None
 
     def _soon(self, until_s: float) -> float:
-        """Return until when to wait for one answer, s of CLOCK_MONOTONIC."""
+        """Return when to stop waiting for a single answer, s of CLOCK_MONOTONIC."""
         return min(until_s, time.monotonic() + self._options.timeout / 1000)
 
     def _subscribe(self, client: Client, filters: list[str], until_s: float) -> list[str]:
@@ -300,7 +313,12 @@ class Link:
     # -- the connection as it is ---------------------------------------------------------------------------------------
 
     def check(self) -> None:
-        """Raise ConnectorError if the connection is lost, or the broker does not answer in time."""
+        """Check the connection, and send a ping if one is due.
+
+        Raises:
+            ConnectorError: The connection is lost, or the broker has not answered a ping in time.
+
+        """
         client = self._client
         if client is None or self._failure:
             raise ConnectorError(self._failure or f"not connected to {self.peer}")
@@ -316,26 +334,31 @@ class Link:
         return self._client.ping() if self._client is not None else 0
 
     def answered(self, number: int) -> bool:
-        """Return whether a PINGREQ was answered, or the connection is lost."""
+        """Return whether the broker has answered this PINGREQ, or the connection is lost."""
         return self._client is None or self._client.pongs >= number or bool(self._failure)
 
     # -- publishing ----------------------------------------------------------------------------------------------------
 
     def fits(self, publication: Publication) -> bool:
-        """Return whether the broker accepts a message of this size."""
+        """Return whether the message is small enough for the broker."""
         size = HEAD_BYTES + len(publication.topic.encode()) + len(publication.payload)
         return bool(size <= self._limits.get("MaximumPacketSize", size))
 
     def await_room(self, until_s: float) -> None:
-        """Wait until few enough messages are not acknowledged; ConnectorError if that takes too long."""
+        """Wait until another message may be sent, because few enough are unacknowledged.
+
+        Raises:
+            ConnectorError: This has not happened by ``until_s``, or the connection is lost.
+
+        """
         most = min(MAX_IN_FLIGHT, self._limits.get("ReceiveMaximum", MAX_IN_FLIGHT))
         self._wait(lambda: len(self._in_flight - self._acks.keys()) < most, until_s, "to PUBLISH")
 
     def publish(self, publication: Publication) -> int | None:
-        """Publish a message, without waiting.
+        """Publish a message, without waiting for its acknowledgement.
 
         Returns:
-            Its number, for :meth:`outcome`; None if it has QoS 0.
+            The message's number, for :meth:`outcome`; None if the message has QoS 0.
 
         Raises:
             ConnectorError: The connection is lost, and nothing was sent.
@@ -358,29 +381,42 @@ class Link:
         return info.mid
 
     def wait_acknowledged(self, numbers: Iterable[int], until_s: float) -> None:
-        """Wait until messages are acknowledged; ConnectorError if that does not happen in time."""
+        """Wait until the broker has acknowledged these messages.
+
+        Raises:
+            ConnectorError: It has not done so by ``until_s``, or the connection is lost.
+
+        """
         wanted = set(numbers)
         self._wait(lambda: wanted <= self._acks.keys(), until_s, "to PUBLISH")
 
     def outcome(self, number: int, topic: str, *, retain: bool) -> str | None:
-        """Return "" if the broker has taken a message, or why it refuses it; None: no answer."""
+        """Return "" if the broker has accepted a message, or why it refused it.
+
+        None if it has not answered.
+        """
         code = self._acks.get(number)
         if code is None:
             return None
         if code.is_failure:
-            return f"the broker refuses it: {code}"
+            return f"the broker refuses the message: {code}"
         if code.value == _NO_SUBSCRIBERS and not retain:
-            return f"nobody subscribes to {topic}: the broker dropped it"
+            return f"nobody subscribes to {topic}: the broker dropped the message"
         return ""
 
     def forget(self) -> None:
-        """Forget the messages of the last writes, whose numbers will be used again."""
+        """Forget the messages of the last writes, because their numbers will be used again."""
         with self._condition:
             self._in_flight.clear()
             self._acks.clear()
 
     def wait_processed(self, until_s: float) -> None:
-        """Wait until the broker has read all that was published; ConnectorError if it does not say so."""
+        """Wait until the broker has read all published messages, as its answer to a new ping shows.
+
+        Raises:
+            ConnectorError: The answer has not come by ``until_s``, or the connection is lost.
+
+        """
         number = self.ping()
         self._wait(lambda: self._client is not None and self._client.pongs >= number, until_s, "to PUBLISH")
 
@@ -401,7 +437,9 @@ class Link:
             while not self._closing and client.loop(_TURN_S) == MQTTErrorCode.MQTT_ERR_SUCCESS:
                 pass
         except Exception as error:  # noqa: BLE001  paho raises all kinds for wrong packets
-            why = f"{self.peer} sent what cannot be read: {type(error).__name__}: {printable(str(error))[:200]}"
+            why = (
+                f"{self.peer} sent a packet that cannot be read: {type(error).__name__}: {printable(str(error))[:200]}"
+            )
         _close_socket(client)
         self._fail(why or self._why(client))
 
@@ -479,7 +517,7 @@ class Link:
 
 
 def version_of(name: str) -> MQTTProtocolVersion:
-    """Return paho's number of a version."""
+    """Return paho's constant for a version of MQTT."""
     return MQTTv311 if name == "3.1.1" else MQTTv5
 
 

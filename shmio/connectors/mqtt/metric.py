@@ -29,11 +29,14 @@ _FLOAT32_MAX: Final = 3.4028234663852886e38
 
 
 def decode(metric: wire.Metric, datatype: int) -> Any:
-    """Return the value of a metric as JSON would have it; ValueFaultError if it has none.
+    """Return the value of a metric as a JSON value.
 
     Args:
         metric: The metric.
-        datatype: Its data type, which a birth says.
+        datatype: The metric's data type, as its birth states it.
+
+    Raises:
+        ValueFaultError: The metric has no value, or a wrong one.
 
     """
     field = metric.WhichOneof("value")
@@ -57,11 +60,17 @@ def decode(metric: wire.Metric, datatype: int) -> Any:
             return _decode_array(found, datatype)
     else:
         raise ValueFaultError(BAD_NOT_SUPPORTED, f"metrics of data type {datatype} cannot be read")
-    raise ValueFaultError(BAD_DECODING_ERROR, f"the metric has a {field}, which data type {datatype} does not have")
+    raise ValueFaultError(
+        BAD_DECODING_ERROR, f"the metric has its value in {field}, which data type {datatype} does not use"
+    )
 
 
 def _signed(found: int, bits: int, field: str) -> int:
-    """Return a signed number; implementations differ in the number of bits of negative ones."""
+    """Return a signed number.
+
+    Implementations of Sparkplug send a negative number either with the bits of its type or with all
+    bits of the field.
+    """
     wide = 32 if field == "int_value" else 64
     if found >> (wide - 1):
         return found - (1 << wide)
@@ -75,11 +84,11 @@ def _decode_array(data: bytes, datatype: int) -> list[Any]:
         try:
             return [one.decode() for one in data.split(b"\0")[:-1]]
         except UnicodeDecodeError:
-            raise ValueFaultError(BAD_DECODING_ERROR, "the array has what is no text in UTF-8") from None
+            raise ValueFaultError(BAD_DECODING_ERROR, "the array contains text that is not UTF-8") from None
     if datatype == _BOOLEANS:
         count = _COUNT.unpack_from(data)[0] if len(data) >= _COUNT.size else -1
         if len(data) != _COUNT.size + -(-count // 8):
-            raise ValueFaultError(BAD_DECODING_ERROR, "the array of bits has another length than it says")
+            raise ValueFaultError(BAD_DECODING_ERROR, "the array of bits does not have the length that it states")
         bits: list[Any] = (
             np.unpackbits(np.frombuffer(data, np.uint8, offset=_COUNT.size), count=count).astype(bool).tolist()
         )
@@ -92,13 +101,16 @@ def _decode_array(data: bytes, datatype: int) -> list[Any]:
 
 
 def encode(metric: wire.Metric, datatype: int, value: Any, field: str | None) -> None:
-    """Set the value of a metric; ValueError if its data type does not have it.
+    """Set the value of a metric in a command.
 
     Args:
-        metric: The metric of a command.
-        datatype: Its data type, as the birth says.
+        metric: The metric of the command.
+        datatype: The metric's data type, as its birth states it.
         value: The value.
-        field: The field of the message that the birth has for it; None: that is not known.
+        field: The field of the message that has the value in the birth; None if this is not known.
+
+    Raises:
+        ValueError: The value does not fit the data type.
 
     """
     metric.datatype = datatype
@@ -108,7 +120,7 @@ def encode(metric: wire.Metric, datatype: int, value: Any, field: str | None) ->
         if datatype == _DOUBLE:
             metric.double_value = value
         elif math.isfinite(value) and abs(value) > _FLOAT32_MAX:
-            raise ValueError(f"{value} does not fit the metric, a Float")
+            raise ValueError(f"{value} does not fit the metric, which is a Float")
         else:
             metric.float_value = value
     elif datatype == BOOLEAN and isinstance(value, bool):
@@ -126,10 +138,10 @@ def _encode_whole(metric: wire.Metric, datatype: int, value: Any, field: str | N
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if not isinstance(value, int) or isinstance(value, bool):
-        raise ValueError(f"the metric is a whole number (data type {datatype}), which {value!r} is not")
+        raise ValueError(f"the metric is a whole number (data type {datatype}), but the written value is {value!r}")
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     if not least <= value <= most:
-        raise ValueError(f"{value} does not fit the metric, which is from {least} to {most}")
+        raise ValueError(f"{value} does not fit the metric, whose range is from {least} to {most}")
     if bits == 64 or field == "long_value":
         metric.long_value = value & ((1 << 64) - 1)
     else:

@@ -17,14 +17,17 @@ _Texts = Annotated[list[_Text], msgspec.Meta(min_length=1, max_length=100)]
 
 
 class Will(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """A topic that says whether a device is there, which is usually the last will of the device."""
+    """A topic that says whether a device is online.
+
+    Usually, the device's last will is published on it.
+    """
 
     topic: _Text
     """The topic, with a path if its payload is JSON."""
     good: _Texts = msgspec.field(default_factory=lambda: ["online", "true", "1", "on"])
-    """The texts that say that it is there; every other one says that it is not."""
+    """The texts that mean that the device is online; every other text means that it is offline."""
     match: _Text | _Texts = "**"
-    """Patterns of the registers of the device."""
+    """Patterns of the registers that belong to the device."""
 
     @property
     def patterns(self) -> list[str]:
@@ -33,40 +36,48 @@ class Will(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True
 
 
 class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Address of the broker, and what counts as a good value; ValueError for keys that contradict."""
+    """Address of the broker, and what counts as a good value.
+
+    Raises:
+        ValueError: Some keys contradict each other.
+
+    """
 
     url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
-    """Milliseconds for connecting, for each answer of the broker, and for the writes of a cycle."""
+    """Time-out for connecting, for each answer of the broker, and for the writes of a cycle, in ms."""
     version: Literal["auto", "5", "3.1.1"] = "auto"
-    """Version of MQTT; auto: 5, and 3.1.1 if the broker does not know that."""
+    """Version of MQTT. With ``auto``, version 5 is tried first, and then 3.1.1."""
     client_id: Annotated[str, msgspec.Meta(min_length=1, max_length=128)] | None = None
     keep_alive_s: Annotated[int, msgspec.Meta(ge=5, le=3600)] = 30
     qos: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
     """QoS of the subscriptions."""
     write_qos: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
     retain: bool = False
-    """Whether the broker keeps what is written."""
+    """Whether the broker is to retain written values."""
     max_age_ms: _Age | dict[_Text, _Age] | None = None
-    """Milliseconds after which the last message is too old, for all registers or by pattern; 0: never."""
+    """Age in ms above which a topic's last message is too old; 0: never.
+
+    One number is for all registers, and a table has numbers by pattern.
+    """
     will: _Text | Annotated[list[Will], msgspec.Meta(max_length=1000)] = msgspec.field(default_factory=list)
     time: _Text | None = None
-    """Path of the source time in JSON payloads."""
+    """Path of the source time in JSON payloads; None: the time when the message was received."""
     texts: tuple[_Text, _Text] = ("false", "true")
-    """What is written for a BOOL as text: for false, for true."""
+    """The texts published for a BOOL register: the first for false, the second for true."""
     templates: Annotated[dict[_Text, str], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=dict)
-    """The JSON into which written values are set, by topic; without one it is an empty object."""
+    """By topic, the JSON document into which written values are inserted; default: an empty object."""
     rebirth: bool = True
     """Whether Sparkplug nodes are asked for their births."""
     max_payload_bytes: Annotated[int, msgspec.Meta(ge=100, le=1 << 24)] = 1 << 20
-    """The largest payload that is read."""
+    """The largest payload whose values are read, in bytes."""
     username: Annotated[str, msgspec.Meta(min_length=1, max_length=256)] | None = None
     password_file: str | None = None
     ca: str | None = None
     certificate: str | None = None
     key: str | None = None
     insecure: bool = False
-    """Allow plain text beyond loopback."""
+    """Allow plain text to hosts other than this one."""
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
@@ -81,15 +92,15 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
             if getattr(self, name) is not None and not self.tls:
                 raise ValueError(f"{name}: has no effect without TLS: write url = 'mqtts://…'")
         if self.texts[0].strip().casefold() == self.texts[1].strip().casefold():
-            raise ValueError("texts: those for false and for true must differ")
+            raise ValueError("texts: the text for false and the text for true must differ")
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate: give both certificate and key, or neither")
         if self.password_file is not None and self.username is None:
-            raise ValueError("username: set it, because password_file holds the password of this user")
+            raise ValueError("username: this key is needed, because password_file contains this user's password")
         if not (self.tls or self.address.loopback or self.insecure):
             raise ValueError(
-                f"url: {self.address} would get plain text over the network; that needs mqtts://, or insecure = true "
-                "beside it"
+                f"url: shmio would send {self.address} plain text over the network: write mqtts:// instead, or set "
+                "insecure = true"
             )
 
     @property
@@ -105,5 +116,5 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
 
     @property
     def wills(self) -> list[Will]:
-        """The topics that say whether a device is there."""
+        """The topics that say whether a device is online."""
         return [Will(topic=self.will)] if isinstance(self.will, str) else self.will

@@ -1,8 +1,9 @@
 """Sparkplug B as a host application sees it: births, data and deaths of edge nodes. No I/O.
 
-A node is believed from its birth on, and as long as its sequence numbers have no gap: its messages
-name metrics by aliases of the birth, and after a gap another birth may be missing. Then all its
-registers are bad, and it is asked for a new birth (Eclipse Sparkplug Specification 3.0.0, 5 and 6).
+The messages of a node may name metrics by aliases, which its birth defines. A node's data are
+therefore used only after its birth, and only while its sequence numbers have no gap: in a gap,
+another birth may have been lost. After a gap, all registers of the node are bad, and the node is
+asked for a new birth (Eclipse Sparkplug Specification 3.0.0, 5 and 6).
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from shmio.wire import sparkplug_b_pb2 as wire
 
 REBIRTH: Final = "Node Control/Rebirth"
 MAX_METRICS: Final = 100_000
-"""Most metrics of a message."""
+"""Largest number of metrics in a message."""
 MAX_ALIASES: Final = 1_000_000
-"""Most metrics of a node and all its devices."""
+"""Largest number of aliases of a node and all its devices."""
 ASK: Final = Backoff(1.0, 60.0)
-"""Waits before a node is asked again for its birth."""
+"""The waiting times before a node is asked again for its birth."""
 CALM_NS: Final = 120_000_000_000
-"""After this time without a question, the waits are short again."""
+"""If a node was not asked for this time in ns, the waiting times begin again with the shortest."""
 KINDS: Final = ("NBIRTH", "NDATA", "NDEATH", "DBIRTH", "DDATA", "DDEATH")
 _SEQUENCE: Final = 256
 _BAD: Final = 0x80000000
@@ -47,13 +48,13 @@ log = logging.getLogger("shmio.source.mqtt")
 
 
 class _Known(NamedTuple):
-    """What a birth says of a metric."""
+    """What a birth says about a metric."""
 
     name: str
     alias: int | None
     datatype: int
     field: str | None
-    """The field of the protobuf message with its value; None if it was null."""
+    """The field of the protobuf message that has the value; None if the value was null."""
 
 
 class Device(Origin):
@@ -62,9 +63,9 @@ class Device(Origin):
     def __init__(self, node: Node, name: str) -> None:
         self.node, self.name = node, name
         self.wanted: dict[str, list[int]] = {}
-        """The registers of each metric."""
+        """The indices of the registers that have each metric, by the metric's name."""
         self.metrics: dict[str, _Known] = {}
-        """The wanted metrics that the birth has."""
+        """The metrics in the device's birth that registers have, by name."""
         self.born = False
         self.died = False
         self._birth_order = 0
@@ -75,14 +76,17 @@ class Device(Origin):
 
     @property
     def fault(self) -> int:
-        """Why no register has a good value."""
+        """Why none of the device's registers has a good value: a status.
+
+        GOOD if there is no reason.
+        """
         if self.born:
             return GOOD
         return BAD_NO_COMMUNICATION if self.died else BAD_WAITING_FOR_INITIAL_DATA
 
     @property
     def offline(self) -> str:
-        """Why a command would reach nobody."""
+        """Why a command would not reach the device; empty if the device is online."""
         if self.born:
             return ""
         return f"{self} is not online: it {'has died' if self.died else 'has sent no birth'}"
@@ -93,10 +97,15 @@ class Device(Origin):
         return self._birth_order if found is None else found[1]
 
     def find(self, index: int) -> Found:
-        """Return the newest value of a register; ValueFaultError if the birth has no such metric."""
+        """Return the newest value of a register.
+
+        Raises:
+            ValueFaultError: The birth has no such metric, or the metric has no usable value.
+
+        """
         found = self._found.get(index)
         if found is None:
-            raise ValueFaultError(BAD_NOT_FOUND, f"the birth of {self} has no such metric")
+            raise ValueFaultError(BAD_NOT_FOUND, f"the birth of {self} does not contain the metric of this register")
         if isinstance(found[0], ValueFaultError):
             raise found[0]
         return found[0]
@@ -107,18 +116,18 @@ class Device(Origin):
         self.end(died=False)
 
     def end(self, *, died: bool) -> None:
-        """Believe nothing of the device until its next birth."""
+        """Use no values of the device until its next birth."""
         self.born, self.died = False, died
         self.metrics.clear()
         self._found.clear()
 
     def begin(self, order: int) -> None:
-        """Begin a new life, with the metrics of a birth."""
+        """Discard all values and metrics, because a birth of the device has arrived."""
         self.end(died=False)
         self.born, self._birth_order = True, order
 
     def take(self, known: _Known, one: wire.Metric, message: Message, sent_ms: int) -> None:
-        """Take a value of a metric."""
+        """Store a value of a metric."""
         at_ms = one.timestamp if one.HasField("timestamp") else sent_ms
         source_ns = at_ms * 1_000_000 if 0 < at_ms <= _MAX_MS else message.utc_ns
         found: Found | ValueFaultError
@@ -131,7 +140,12 @@ class Device(Origin):
             self._found[index] = found, message.order
 
     def command(self, values: Mapping[str, Any], now_ms: int) -> tuple[str, bytes]:
-        """Return topic and payload of a command; ValueError if the device cannot take it."""
+        """Return topic and payload of a command with these values by metric.
+
+        Raises:
+            ValueError: The device is offline, or a value does not fit its metric.
+
+        """
         payload = wire.Payload(timestamp=now_ms)
         for name, value in values.items():
             known = self.metrics.get(name)
@@ -153,7 +167,7 @@ class Node:
         self._group, self._name = group, name
         self.devices: dict[str, Device] = {}
         self._aliases: dict[int, tuple[Device, _Known] | None] = {}
-        """Metrics by their aliases; None for those that no register has."""
+        """Metrics by their aliases; None for a metric that no register has."""
         self._asks = 0
         self._asked_ns = -CALM_NS
         self.reset()
@@ -162,25 +176,25 @@ class Node:
         return f"{self._group}/{self._name}"
 
     def topic(self, kind: str, device: str = "") -> str:
-        """Return the topic of a kind of message."""
+        """Return the topic of the node's or a device's messages of a kind, such as ``DDATA``."""
         return "/".join((NAMESPACE, self._group, kind, self._name, *((device,) if device else ())))
 
     @property
     def filters(self) -> list[str]:
-        """What to subscribe to: all messages of the node, because a gap may be in any of them."""
+        """The topic filters for all messages of the node. A gap may be in messages of any kind."""
         return [self.topic(kind, "+" if kind.startswith("D") else "") for kind in KINDS]
 
     @property
     def born(self) -> bool:
-        """Whether the node is believed."""
+        """Whether the node has sent a birth, and no message since then is missing."""
         return self._born
 
     def device(self, name: str) -> Device:
-        """Return a device, or the node itself for an empty name."""
+        """Return the device with this name; an empty name is the node itself."""
         return self.devices.setdefault(name, Device(self, name))
 
     def reset(self) -> None:
-        """Forget all messages, and ask for a birth."""
+        """Forget all messages, and note that the node must be asked for its birth."""
         self._born, self._ask = False, True
         self._session: int | None = None
         self._next: int | None = None
@@ -191,10 +205,10 @@ class Node:
     # -- messages ------------------------------------------------------------------------------------------------------
 
     def take(self, kind: str, device: str, message: Message) -> None:
-        """Take a message of the node or of one of its devices."""
+        """Process a message of the node or of one of its devices."""
         payload = self._payload(message)
         if payload is None:
-            self._lose("sent what is no Sparkplug payload")
+            self._lose("it sent a message that is not a Sparkplug payload")
         elif kind == "NDEATH":
             self._death(payload)
         elif kind == "NBIRTH":
@@ -254,7 +268,10 @@ class Node:
             self._data(device, payload, message)
 
     def _begin(self, device: Device | None, payload: wire.Payload, message: Message) -> None:
-        """Take the birth of a device; None: one that no register has."""
+        """Process the metrics of a birth.
+
+        ``device`` is None if no register belongs to the device.
+        """
         if device is not None:
             self._aliases = {
                 alias: known for alias, known in self._aliases.items() if known is None or known[0] is not device
@@ -270,7 +287,7 @@ class Node:
                 device.metrics[one.name] = known
                 device.take(known, one, message, payload.timestamp)
         if len(self._aliases) > MAX_ALIASES:
-            self._lose(f"has more than {MAX_ALIASES} metrics")
+            self._lose(f"it has more than {MAX_ALIASES} metrics")
             self._aliases.clear()
 
     def _data(self, device: Device | None, payload: wire.Payload, message: Message) -> None:
@@ -288,14 +305,14 @@ class Node:
                 found[0].take(found[1], one, message, payload.timestamp)
 
     def _lose(self, why: str) -> None:
-        """Believe nothing of the node until its next birth, and ask for that."""
-        log.warning("%s: %s; it is asked for a new birth", self, why)
+        """Use no values of the node until its next birth, and note that it must be asked for that."""
+        log.warning("%s: %s; shmio asks the node for a new birth", self, why)
         self._born, self._ask = False, True
         for one in self.devices.values():
             one.end(died=False)
 
     def request(self, now_ns: int) -> tuple[str, bytes] | None:
-        """Return topic and payload of the command to ask for a birth, if one is needed now."""
+        """Return topic and payload of the command that asks for a birth; None if none is due."""
         if not self._ask or now_ns - self._asked_ns < self._wait_ns:
             return None
         self._asks = self._asks + 1 if now_ns - self._asked_ns < CALM_NS else 0
@@ -311,15 +328,15 @@ class Node:
 
 
 class Host:
-    """All nodes of a layout."""
+    """All Sparkplug nodes of a layout."""
 
     def __init__(self, *, max_bytes: int) -> None:
-        """Create it; a message with more than ``max_bytes`` counts as one that cannot be read."""
+        """Create it. A message of more than ``max_bytes`` counts as unreadable."""
         self._max_bytes = max_bytes
         self._nodes: dict[tuple[str, str], Node] = {}
 
     def origin(self, address: Metric, index: int) -> Device:
-        """Return the device of a metric, and note that a register has this metric."""
+        """Return the node or device of a metric, and note that the register ``index`` has this metric."""
         node = self._nodes.setdefault((address.group, address.node), Node(address.group, address.node))
         device = node.device(address.device)
         device.wanted.setdefault(address.name, []).append(index)
@@ -333,16 +350,16 @@ class Host:
 
     @property
     def filters(self) -> list[str]:
-        """What to subscribe to."""
+        """The topic filters to subscribe to."""
         return [one for node in self._nodes.values() for one in node.filters]
 
     @property
     def complete(self) -> bool:
-        """Whether all nodes and devices are born."""
+        """Whether all nodes and devices have sent their births."""
         return all(node.born and all(device.born for device in node.devices.values()) for node in self._nodes.values())
 
     def take(self, message: Message, topic: str) -> None:
-        """Take a message; those that the broker has kept are of another time."""
+        """Process a message, unless it is a retained one, which may be from an earlier session."""
         levels = topic.split("/")
         if message.retained or not 4 <= len(levels) <= 5 or levels[2] not in KINDS:
             return
@@ -354,7 +371,7 @@ class Host:
         node.take(levels[2], levels[4] if len(levels) == 5 else "", message)
 
     def requests(self, now_ns: int) -> Iterator[tuple[str, bytes]]:
-        """Yield topics and payloads of the commands that ask nodes for their births."""
+        """Yield topics and payloads of the commands that are due to ask nodes for their births."""
         for node in self._nodes.values():
             if (found := node.request(now_ns)) is not None:
                 yield found
@@ -366,7 +383,10 @@ class Host:
 
 
 def _session(payload: wire.Payload) -> int | None:
-    """Return the number of the session, by which a birth and a last will belong together."""
+    """Return the session number in a birth or a last will; None if it has none.
+
+    A last will belongs to the birth with the same number.
+    """
     for one in payload.metrics:
         if one.name == "bdSeq":
             field = one.WhichOneof("value")
@@ -376,7 +396,7 @@ def _session(payload: wire.Payload) -> int | None:
 
 
 def _quality(one: wire.Metric) -> int:
-    """Return the status of a metric with the property Quality (6.4.8.1)."""
+    """Return the status that a metric states in its property Quality (6.4.8.1)."""
     for key, value in zip(one.properties.keys, one.properties.values, strict=False):
         if key == "Quality":
             return _QUALITIES.get(value.int_value, GOOD)

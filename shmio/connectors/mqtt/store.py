@@ -1,4 +1,4 @@
-"""The newest messages of all topics of a layout, and the image that they give."""
+"""The newest messages of all topics of a layout, and the image made of them."""
 
 from __future__ import annotations
 
@@ -38,22 +38,27 @@ log = logging.getLogger("shmio.source.mqtt")
 
 _SPARKPLUG: Final = f"{NAMESPACE}/"
 _NONE: Final = -1
-"""No status yet."""
+"""No status has been shown yet."""
 
 
 class Group:
-    """Registers with one origin, one limit of age, and the same wills."""
+    """Registers with the same origin, the same maximum age and the same wills."""
 
     def __init__(self, origin: Origin, max_age_ns: int, watches: tuple[Watch, ...]) -> None:
         self.origin, self.max_age_ns, self.watches = origin, max_age_ns, watches
         self.registers: list[int] = []
         self.shown = _NONE
-        """The status that the image shows of all registers; GOOD: each has one of its own."""
+        """The status that the image shows for all registers; GOOD: each register has its own."""
         self.seen: Message | None = None
-        """The message that the image shows."""
+        """The message whose values the image shows; None if there is none."""
 
     def state(self, now_ns: int) -> int:
-        """Return the status that all registers have at a time of CLOCK_MONOTONIC; GOOD: each its own."""
+        """Return the status of all registers at ``now_ns``.
+
+        GOOD if each register has its own status.
+
+        ``now_ns`` is a time of CLOCK_MONOTONIC.
+        """
         message = self.origin.message
         for watch in self.watches:
             if fault := watch.fault(message):
@@ -71,18 +76,26 @@ class Group:
 
 
 class Store:
-    """All origins of a layout. One thread delivers messages, another makes images."""
+    """The newest messages of a layout's topics.
+
+    One thread delivers messages, another makes images.
+    """
 
     def __init__(self, layout: Layout, options: MqttOptions) -> None:
-        """Read the addresses of a layout; ConfigError if one is wrong, or does not fit its register."""
+        """Parse the addresses of a layout.
+
+        Raises:
+            ConfigError: An address is wrong, or does not fit its register.
+
+        """
         self.layout, self._options = layout, options
         log.filters[:] = [LogRateLimit()]  # a process has one source
         self._changed = threading.Condition()
-        """Locks all below, and is notified with each message."""
+        """Locks all attributes below, and is notified of each message."""
         self.addresses: list[Address] = []
         self.fittings: list[Fitting] = []
         self.host = Host(max_bytes=options.max_payload_bytes)
-        """The nodes of Sparkplug."""
+        """The Sparkplug nodes."""
         self._topics: dict[str, Topic] = {}
         self._watches = [Watch(will) for will in options.wills]
         self._watched: dict[str, list[Watch]] = {}
@@ -95,7 +108,7 @@ class Store:
         self._codes = [GOOD] * len(layout.registers)
         self._order = 0  # goes on from one connection to the next
         self._expected: dict[str, bytes] = {}
-        """Payloads that were published on topics that are also read, and have not come back."""
+        """Payloads that were published on topics that are also read, and have not come back yet."""
         for index in range(len(layout.registers)):
             self._add(index)
         for watch in self._watches:
@@ -110,12 +123,12 @@ class Store:
             self.fittings.append(Fitting(register, self._options.texts))
             for place in (address.source, address.target):
                 if register.dims and isinstance(place, Place) and place.steps is None:
-                    raise ValueError(f"an array is JSON: write {place.topic} $, or a path in it such as $.values")
+                    raise ValueError(f"an array is read from JSON: write {place.topic} $, or a path such as $.values")
             source = address.source
             if register.writable and isinstance(source, Place) and source.steps is not None and not address.target:
                 raise ValueError(
-                    "say where to publish what is written: append such as -> plant/robot/set $.pos, because it is not "
-                    "known which other members that JSON must have"
+                    "append the topic on which to publish writes, such as -> plant/robot/set $.pos, because shmio does "
+                    "not know which other members this JSON must have"
                 )
         except ValueError as error:
             raise ConfigError(f"layout: {register.path}: {error}") from None
@@ -137,19 +150,19 @@ class Store:
         return topic
 
     def describe(self) -> str:
-        """Return what is read, for the log."""
+        """Return how many topics and Sparkplug nodes are read, for the log."""
         found = [counted(len(self._topics), "topic")] if self._topics else []
         return ", ".join([*found, *([counted(len(self.host), "Sparkplug node")] if self.host else [])])
 
     @property
     def filters(self) -> list[str]:
-        """What to subscribe to."""
+        """The topic filters to subscribe to."""
         return list(dict.fromkeys((*self._topics, *self._watched, *self.host.filters)))
 
     # -- the thread that receives --------------------------------------------------------------------------------------
 
     def take(self, topic: str, payload: bytes, *, retained: bool) -> None:
-        """Take a message."""
+        """Store a message."""
         with self._changed:
             self._order += 1
             message = Message(payload, retained, self._order, time.monotonic_ns(), time.time_ns())
@@ -166,7 +179,7 @@ class Store:
     # -- the poll thread -----------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Forget all messages: all registers wait for their first value."""
+        """Forget all messages, so that all registers wait for their first value."""
         with self._changed:
             for topic in self._topics.values():
                 topic.reset()
@@ -176,7 +189,7 @@ class Store:
             self._expected.clear()
 
     def refuse(self, topic: str) -> None:
-        """Note that the broker refuses a subscription."""
+        """Note that the broker refuses the subscription to a topic."""
         log.warning("the broker refuses the subscription to %s", topic)
         with self._changed:
             if topic in self._topics:
@@ -185,7 +198,7 @@ class Store:
                 watch.refuse()
 
     def image(self, now_ns: int) -> bytes:
-        """Return the image of the newest messages at a time of CLOCK_MONOTONIC."""
+        """Return the image of the newest messages at ``now_ns``, a time of CLOCK_MONOTONIC."""
         image = self._image
         if image is None:
             raise ConnectorError("the layout has no status area")
@@ -219,7 +232,12 @@ class Store:
                 self._note(index, BAD_OUT_OF_RANGE if fault else GOOD, fault)
 
     def _find(self, index: int, origin: Origin) -> tuple[Value, int, int]:
-        """Return the value of a register, its source time and its status; ValueFaultError."""
+        """Return the value of a register, its source time in ns and its status.
+
+        Raises:
+            ValueFaultError: The register has no usable value.
+
+        """
         found = origin.find(index)
         fitting = self.fittings[index]
         try:
@@ -230,7 +248,7 @@ class Store:
         return value, found.source_ns, found.code
 
     def _note(self, index: int, code: int, reason: str) -> None:
-        """Log the fault of a register's value when it begins."""
+        """Log a fault of a register's value when the fault begins."""
         if code != self._codes[index] and code != GOOD:
             log.warning("%s: %s", self.layout.registers[index].path, reason)
         self._codes[index] = code
@@ -238,13 +256,21 @@ class Store:
     # -- for writes ----------------------------------------------------------------------------------------------------
 
     def offline(self, index: int) -> str:
-        """Return why a command to a register would reach nobody; "" if that is not known."""
+        """Return why a command to a register would not reach its device.
+
+        "" if that is not known.
+        """
         with self._changed:
             group = self._group_of[index]
             return next((watch.problem for watch in group.watches if watch.problem), group.origin.offline)
 
     def present(self, index: int) -> Value:
-        """Return the present value of a register; ValueRangeError if there is none."""
+        """Return the present value of a register.
+
+        Raises:
+            ValueRangeError: The register has no good value.
+
+        """
         with self._changed:
             group = self._group_of[index]
             if group.state(time.monotonic_ns()) == GOOD:
@@ -252,13 +278,13 @@ class Store:
                     return self._find(index, group.origin)[0]
                 except ValueFaultError:
                     pass
-        raise ValueRangeError("there is no present value")
+        raise ValueRangeError("the present value is not known")
 
     def command(self, values: Mapping[int, Any]) -> tuple[str, bytes]:
-        """Return topic and payload of a Sparkplug command to the metrics of registers of one device.
+        """Return topic and payload of a Sparkplug command; all registers must belong to one device.
 
         Raises:
-            ValueError: The device cannot take it.
+            ValueError: The device is offline, or a value does not fit its metric.
 
         """
         with self._changed:
@@ -272,27 +298,30 @@ class Store:
             return device.command(named, time.time_ns() // 1_000_000)
 
     def requests(self, now_ns: int) -> list[tuple[str, bytes]]:
-        """Return topics and payloads of what Sparkplug nodes are to be asked."""
+        """Return topics and payloads of the commands that are due to ask nodes for their births."""
         if not self.host:
             return []
         with self._changed:
             return list(self.host.requests(now_ns))
 
     def expect(self, topic: str, payload: bytes) -> None:
-        """Expect a payload that is about to be published, if its topic is also read."""
+        """Note that a payload is about to be published, if its topic is also read."""
         with self._changed:
             if topic in self._topics and not self._topics[topic].refused:
                 self._expected[topic] = payload
 
     def await_expected(self, until_s: float) -> None:
-        """Wait until what is expected has come, at most until a time of CLOCK_MONOTONIC in s."""
+        """Wait until the published payloads have come back, at most until ``until_s``.
+
+        ``until_s`` is a time of CLOCK_MONOTONIC.
+        """
         self.wait(lambda: not self._expected, until_s)
         with self._changed:
             self._expected.clear()
 
     @property
     def complete(self) -> bool:
-        """Whether all topics have a message."""
+        """Whether all topics, wills and Sparkplug devices have sent a first message."""
         return (
             all(one.message is not None or one.refused for one in self._topics.values())
             and all(watch.there is not None for watch in self._watches)
@@ -300,18 +329,21 @@ class Store:
         )
 
     def wait(self, condition: Callable[[], bool], until_s: float) -> bool:
-        """Wait until a condition of the messages holds, at most until a time of CLOCK_MONOTONIC in s."""
+        """Wait until ``condition`` holds, at most until ``until_s``; return whether it holds.
+
+        ``until_s`` is a time of CLOCK_MONOTONIC. The condition is checked after each message.
+        """
         with self._changed:
             return self._changed.wait_for(condition, max(0.0, until_s - time.monotonic()))
 
     def wake(self) -> None:
-        """Wake a thread that waits for a message."""
+        """Wake a thread in :meth:`wait`, so that it checks its condition again."""
         with self._changed:
             self._changed.notify_all()
 
 
 class _Ages:
-    """The limits of age, by pattern."""
+    """The maximum age of messages, by pattern of registers."""
 
     def __init__(self, options: MqttOptions) -> None:
         given = options.max_age_ms
@@ -322,14 +354,19 @@ class _Ages:
             raise ConfigError(f"max_age_ms: {error}") from None
 
     def of(self, path: str, *, needed: bool) -> int:
-        """Return the limit of a register in ns, 0: none; ConfigError if it is needed and not given."""
+        """Return the maximum age for a register in ns; 0: there is no limit.
+
+        Raises:
+            ConfigError: No pattern matches the register, although it is ``needed``.
+
+        """
         for glob, age_ns in self._rules:
             if glob.matches(path):
                 return age_ns
         if needed:
             raise ConfigError(
                 f"max_age_ms: {path} would stay good for ever after its device has died: say after how many ms its "
-                "last message is too old (0: never), or name the topic of the device's last will with will"
+                "last message is too old (0: never), or set will to the topic of the device's last will"
             )
         return 0
 
@@ -339,14 +376,19 @@ def _time_path(options: MqttOptions) -> Steps | None:
         return None
     try:
         if not options.time.startswith("$"):
-            raise ValueError(f"{options.time!r} is no path: write such as $.timestamp")
+            raise ValueError(f"{options.time!r} is not a path: write, for example, $.timestamp")
         return json_path.parse(options.time)
     except ValueError as error:
         raise ConfigError(f"time: {error}") from None
 
 
 def _check_templates(options: MqttOptions, addresses: Sequence[Address]) -> None:
-    """Raise ConfigError if a template is no JSON, or is never used."""
+    """Check that each template is JSON and is used.
+
+    Raises:
+        ConfigError: A template is not JSON, or no register is written to its topic.
+
+    """
     written = {one.target.topic for one in addresses if one.target is not None and one.target.steps}
     for topic, template in options.templates.items():
         if topic not in written:

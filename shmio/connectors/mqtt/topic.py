@@ -1,4 +1,4 @@
-"""Where registers have their values: the newest message of a topic."""
+"""Where registers get their values: the newest message of a topic or of a Sparkplug device."""
 
 from __future__ import annotations
 
@@ -15,32 +15,35 @@ from shmio.model.statuses import BAD_OUT_OF_RANGE, BAD_USER_ACCESS_DENIED, GOOD
 
 _MAX_NS: Final = (1 << 63) - 1
 _UNITS: Final = ((1e11, 10**9), (1e14, 10**6), (1e17, 10**3))
-"""Up to which number a time has which unit, in ns: seconds, ms, µs; a larger one is in ns."""
+"""Pairs (number, unit in ns): a time below the number is in this unit.
+
+These are s, ms and µs. A larger time is in ns.
+"""
 
 
 class Message(NamedTuple):
-    """A message; ``order`` counts the messages of the connection."""
+    """A received message; ``order`` is its number since the source started."""
 
     payload: bytes
     retained: bool
-    """Whether the broker had kept it: when it was published is unknown."""
+    """Whether the broker had retained it, so that the time of its publication is unknown."""
     order: int
     monotonic_ns: int
     utc_ns: int
 
 
 class Found(NamedTuple):
-    """What a message has for a register: bytes of text, or a value as in JSON."""
+    """What a message contains for a register: text as bytes, or a JSON value."""
 
     value: Any
     source_ns: int
     code: int = GOOD
     text: bool = False
-    """Whether the value is the payload, which is text."""
+    """Whether ``value`` is the payload itself, which is text."""
 
 
 class Origin(ABC):
-    """What registers have their values of: a topic, or a device of Sparkplug."""
+    """Where registers get their values: a topic, or a device of Sparkplug."""
 
     message: Message | None = None
     """The newest message; None if there is none."""
@@ -48,11 +51,11 @@ class Origin(ABC):
     @property
     @abstractmethod
     def fault(self) -> int:
-        """Why no register has a good value; GOOD if there is no reason."""
+        """Why none of the registers has a good value: a status; GOOD if there is no reason."""
 
     @property
     def offline(self) -> str:
-        """Why a command would reach nobody; "" if that is not known."""
+        """Why a command would not reach the device; "" if that is not known."""
         return ""
 
     @abstractmethod
@@ -61,7 +64,12 @@ class Origin(ABC):
 
     @abstractmethod
     def find(self, index: int) -> Found:
-        """Return what the newest message has for a register; ValueFaultError if it has nothing."""
+        """Return what the newest message contains for a register.
+
+        Raises:
+            ValueFaultError: The message has no usable value for it.
+
+        """
 
     @abstractmethod
     def reset(self) -> None:
@@ -69,13 +77,20 @@ class Origin(ABC):
 
 
 class Topic(Origin):
-    """A topic with text or JSON."""
+    """A topic whose payloads are text or JSON."""
 
     def __init__(self, name: str, time: Steps | None, max_bytes: int) -> None:
-        """Create it: ``time`` is the path of the source time, ``max_bytes`` the size of the largest payload."""
+        """Create the topic.
+
+        Args:
+            name: The topic's name.
+            time: The path of the source time in JSON; None: the time when a message was received.
+            max_bytes: The size of the largest payload that is read.
+
+        """
         self.name = name
         self.places: dict[int, Steps | None] = {}
-        """The path in the JSON of each register; None: the payload is its text."""
+        """By register index, the path of its value in JSON; None: the payload is the value as text."""
         self.refused = False
         """Whether the broker refuses the subscription."""
         self._time, self._max_bytes = time, max_bytes
@@ -84,7 +99,7 @@ class Topic(Origin):
 
     @property
     def fault(self) -> int:
-        """Why no register has a good value."""
+        """Why none of the registers has a good value: a status; GOOD if there is no reason."""
         return BAD_USER_ACCESS_DENIED if self.refused else GOOD
 
     def order_of(self, index: int) -> int:  # noqa: ARG002  a message has all of them
@@ -92,7 +107,7 @@ class Topic(Origin):
         return self.message.order if self.message is not None else 0
 
     def find(self, index: int) -> Found:
-        """Return what the newest message has for a register."""
+        """Return what the newest message contains for a register."""
         message = self.message
         assert message is not None  # noqa: S101 - as the group's state says
         if len(message.payload) > self._max_bytes:
@@ -129,7 +144,10 @@ class Topic(Origin):
 
 
 def time_ns(found: Any) -> int:
-    """Return a time of JSON as ns since 1970, 0 if it is none: a number of s, ms, µs or ns, or ISO 8601."""
+    """Return a time in JSON as ns since 1970; 0 if the value is not a time.
+
+    A time is a number of s, ms, µs or ns, or text in ISO 8601.
+    """
     if isinstance(found, str):
         try:
             at = datetime.datetime.fromisoformat(found[:64])

@@ -1,4 +1,4 @@
-"""Fits texts and JSON values to registers, and values of registers to texts and JSON."""
+"""Converts texts and JSON values to values of registers, and back."""
 
 from __future__ import annotations
 
@@ -29,19 +29,23 @@ _WHOLE: Final = re.compile(r"[+-]?[0-9]{1,20}")
 _NO_NUMBER: Final = {"nan": math.nan, "inf": math.inf, "infinity": math.inf, "-inf": -math.inf, "-infinity": -math.inf}
 _BOOLS: Final = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
 _EXACT: Final = 1 << 53
-"""Up to here, every whole number is a float of its own."""
+"""Every whole number up to this one has an exact float."""
 SHOWN: Final = 40
-"""Characters of a wrong value in a message."""
+"""Largest number of characters that a message shows of a wrong value."""
 
 
 class Fitting:
-    """Converts between what messages have and the values of a register."""
+    """Converts between values in messages and the values of one register."""
 
     def __init__(self, register: Register, texts: Sequence[str] = ("false", "true")) -> None:
-        """Take the register, and the texts for false and true.
+        """Create the converter for a register.
+
+        Args:
+            register: The register.
+            texts: The texts for false and for true.
 
         Raises:
-            ValueError: Messages cannot have its type.
+            ValueError: MQTT messages cannot carry values of the register's type.
 
         """
         base = register.element.base
@@ -53,11 +57,11 @@ class Fitting:
     # -- reading -------------------------------------------------------------------------------------------------------
 
     def from_text(self, payload: bytes) -> Value:
-        """Return the value of a register for a payload that is plain text.
+        """Return the value of the register for a payload that is plain text.
 
         Raises:
-            ValueFaultError: It is no such value.
-            ValueRangeError: The register cannot hold it.
+            ValueFaultError: The payload is not a value of the register's type.
+            ValueRangeError: The register cannot hold the value.
 
         """
         if not payload:
@@ -68,7 +72,10 @@ class Fitting:
             raise ValueFaultError(BAD_DECODING_ERROR, "the payload is not text in UTF-8") from None
 
     def from_json(self, found: Any) -> Value:
-        """Return the value of a register for a value of JSON; the errors are those of :meth:`from_text`."""
+        """Return the value of the register for a JSON value.
+
+        It raises the errors of :meth:`from_text`.
+        """
         register = self._register
         if not register.dims:
             return self._element(found)
@@ -79,7 +86,7 @@ class Fitting:
         flat = list(_flat(found, len(register.dims)))
         if len(flat) != register.count:
             raise ValueFaultError(
-                BAD_INDEX_RANGE_NO_DATA, f"the array has {len(flat)} elements, the register {register.count}"
+                BAD_INDEX_RANGE_NO_DATA, f"the array has {len(flat)} elements, but the register has {register.count}"
             )
         return nest([self._element(one) for one in flat], register.shape)
 
@@ -122,7 +129,12 @@ class Fitting:
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def to_text(self, value: Value) -> bytes:
-        """Return a payload for a value of the register; ValueError if it has none."""
+        """Return the payload, as text, for a value of the register.
+
+        Raises:
+            ValueError: The value cannot be published.
+
+        """
         plain = self._plain(value)
         if isinstance(plain, bool):
             return self._texts[plain].encode()
@@ -131,7 +143,12 @@ class Fitting:
         return str(plain).encode()
 
     def to_json(self, value: Value) -> Any:
-        """Return what JSON has for a value of the register; ValueError if it has nothing."""
+        """Return the JSON value for a value of the register.
+
+        Raises:
+            ValueError: JSON cannot express the value.
+
+        """
         found = self.to_value(value)
         for one in flatten(found, self._register.shape, self._register.path):
             if isinstance(one, float) and not math.isfinite(one):
@@ -139,16 +156,21 @@ class Fitting:
         return found
 
     def to_value(self, value: Value) -> Any:
-        """Return the device's value, or nested lists of them, for a value of the register; ValueError."""
+        """Return the value for the device: without the register's scale, and an array as nested lists.
+
+        Raises:
+            ValueError: The value is not valid.
+
+        """
         register = self._register
         if not register.dims:
             return self._plain(value)
         return nest([self._plain(one) for one in flatten(value, register.shape, register.path)], register.shape)
 
     def _plain(self, value: Any) -> bool | int | float | str:
-        """Return the device's value for that of a register, without the scale."""
+        """Return a value for the device, without the register's scale."""
         if value is None:
-            raise ValueError("this is no valid value")
+            raise ValueError("the value is not valid")
         if self._scale is None or isinstance(value, str | bool):
             plain: bool | int | float | str = value
             return plain
@@ -157,7 +179,12 @@ class Fitting:
 
 
 def decode_json(payload: bytes) -> Any:
-    """Return the document of a payload; ValueFaultError if it is no JSON."""
+    """Return the document in a payload.
+
+    Raises:
+        ValueFaultError: The payload is not JSON.
+
+    """
     if not payload:
         raise ValueFaultError(BAD_NO_DATA, "the payload is empty")
     try:
@@ -169,7 +196,7 @@ def decode_json(payload: bytes) -> Any:
 
 
 def is_number(text: bytes) -> bool:
-    """Return whether a payload is a number as text."""
+    """Return whether a payload is the text of a number."""
     return _NUMBER.fullmatch(text.decode("latin1")) is not None
 
 
@@ -185,7 +212,7 @@ def _parse_number(text: str) -> int | float:
 
 
 def _flat(found: Any, depth: int) -> Iterator[Any]:
-    """Yield the elements of lists in lists, as deep as the register has dimensions."""
+    """Yield the elements of nested lists, down to ``depth`` levels."""
     for one in found:
         if depth > 1 and isinstance(one, list):
             yield from _flat(one, depth - 1)
@@ -194,7 +221,7 @@ def _flat(found: Any, depth: int) -> Iterator[Any]:
 
 
 def _show(found: Any) -> str:
-    """Return a wrong value for a message, on one line and shortened."""
+    """Return a wrong value as text for a message, on one line and shortened."""
     if isinstance(found, dict):
         return "an object"
     if isinstance(found, list):

@@ -1,4 +1,4 @@
-"""Whether a device is there, by the topic of its last will."""
+"""Tells whether a device is online, from the topic of its last will."""
 
 from __future__ import annotations
 
@@ -19,10 +19,15 @@ MAX_TEXT: Final = 4096
 
 
 class Watch:
-    """Follows the topic of a will."""
+    """Follows the topic that says whether a device is online."""
 
     def __init__(self, will: Will) -> None:
-        """Take the will; ConfigError if its topic or a pattern is wrong."""
+        """Create it for a will of the configuration.
+
+        Raises:
+            ConfigError: The topic or a pattern of the will is wrong.
+
+        """
         try:
             self.place = place(will.topic)
             self._globs = [Glob(pattern) for pattern in will.patterns]
@@ -32,26 +37,26 @@ class Watch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what the topic said."""
+        """Forget what was received."""
         self.there: bool | None = None
-        """Whether the device is there; None: the topic has not said it."""
+        """Whether the device is online; None if no message has said it yet."""
         self._gone_order = 0
         self._said = ""
 
     @property
     def problem(self) -> str:
-        """Why the device may not be there; "" if it is."""
+        """Why the device may be offline; "" if it is online."""
         if self.there:
             return ""
-        said = "has said nothing yet" if self.there is None else f"says {printable(self._said)[:40]!r}"
-        return f"the device is not there: {self.place.topic} {said}"
+        said = "has had no message yet" if self.there is None else f"says {printable(self._said)[:40]!r}"
+        return f"the device is offline: {self.place.topic} {said}"
 
     def covers(self, path: str) -> bool:
-        """Return whether a register is one of the device."""
+        """Return whether the register with this path belongs to the device."""
         return any(glob.matches(path) for glob in self._globs)
 
     def take(self, message: Message) -> None:
-        """Take a message of the topic."""
+        """Process a message of the topic."""
         try:
             self._said = self._text(message.payload)
             self.there = self._said.strip().casefold() in self._good
@@ -61,8 +66,8 @@ class Watch:
             self._gone_order = message.order
 
     def refuse(self) -> None:
-        """Note that the broker refuses the subscription, so that nothing is known."""
-        self._said, self.there = "nothing: the broker refuses the subscription", False
+        """Note that the broker refuses the subscription, so that the device counts as offline."""
+        self._said, self.there = "unknown: the subscription was refused", False
 
     def _text(self, payload: bytes) -> str:
         if self.place.steps is None or len(payload) > MAX_TEXT:
@@ -71,7 +76,10 @@ class Watch:
         return str(found).lower() if isinstance(found, bool) else str(found)
 
     def fault(self, message: Message | None) -> int:
-        """Return why a message of the device is not valid; GOOD if it is."""
+        """Return the status to show in place of a message of the device.
+
+        GOOD if the message is valid.
+        """
         if self.there is None:
             return BAD_WAITING_FOR_INITIAL_DATA
         if not self.there:

@@ -1,9 +1,10 @@
-"""Addresses of fields: ``TOPIC TYPE FIELD``, such as ``/joint_states sensor_msgs/JointState position[name=j1]``.
+"""Addresses of fields in messages: ``TOPIC TYPE FIELD``.
 
-A field is a path of names with dots. Behind the name of a sequence, ``[2]`` is its third element,
-and ``[name=j1]`` the element at the place where the sequence ``name`` has ``j1``. The sequence with
-the names is in the same message as the other, or in one that contains it. A sequence without
-brackets at the end of a path is a whole array.
+An example is ``/joint_states sensor_msgs/JointState position[name=j1]``. FIELD consists of names
+joined by dots. After the name of a sequence, ``[2]`` selects its third element. ``[name=j1]``
+selects the element with the index that ``j1`` has in the sequence ``name``. That sequence is in the
+same message as the first one, or in a message that contains this message. A sequence without
+brackets at the end of FIELD is a whole array.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ _STEP: Final = re.compile(
 
 
 class FieldError(Exception):
-    """A message has no such field, or not now; ``code`` is the status of the register."""
+    """A message does not contain a field, or not at present.
+
+    ``code`` is the status of the register.
+    """
 
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(reason)
@@ -33,9 +37,10 @@ class FieldError(Exception):
 
 
 class Step(NamedTuple):
-    """A field's name, and which element of the sequence is meant.
+    """The name of a field and, if the field is a sequence, the element that is selected.
 
-    ``place`` is its index; ``key`` is (sequence of names, name). A step has at most one of them.
+    ``place`` is the element's index. ``key`` is a pair: the name of a sequence of names, and the
+    name whose index in it is meant. A step has at most one of the two.
     """
 
     name: str
@@ -44,7 +49,7 @@ class Step(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether the step chooses no element."""
+        """Whether the step selects no element."""
         return self.place is None and self.key is None
 
 
@@ -53,9 +58,9 @@ class Address(NamedTuple):
 
     Attributes:
         topic: The topic's full name.
-        type: The messages' type as given.
+        type: The messages' type as written in the address.
         steps: The path of the field.
-        text: The path as text, for messages.
+        text: The path as text, for messages to the user.
 
     """
 
@@ -66,20 +71,20 @@ class Address(NamedTuple):
 
 
 def parse(text: str) -> Address:
-    """Read an address.
+    """Parse an address.
 
     Raises:
-        ValueError: It is no address; the message says what one looks like.
+        ValueError: The text is not an address; the message shows an example.
 
     """
     parts = text.split(None, 2)
     if len(parts) != 3:
-        raise ValueError(f"{text!r} is no address; {EXAMPLE}" if parts else f"its `address` is missing; {EXAMPLE}")
+        raise ValueError(f"{text!r} is not an address; {EXAMPLE}" if parts else f"its `address` is missing; {EXAMPLE}")
     topic, kind, field = parts[0], parts[1], parts[2].strip()
     if not _TOPIC.fullmatch(topic) or len(topic) > 256:
-        raise ValueError(f"{topic!r} is no topic: write its full name, such as /joint_states")
+        raise ValueError(f"{topic!r} is not a topic: write its full name, such as /joint_states")
     if not TYPE.fullmatch(kind):
-        raise ValueError(f"{kind!r} is no message type: write such as sensor_msgs/JointState")
+        raise ValueError(f"{kind!r} is not a message type: write, for example, sensor_msgs/JointState")
     return Address(topic, kind, _steps(field), field)
 
 
@@ -90,7 +95,7 @@ def _steps(field: str) -> tuple[Step, ...]:
         found = _STEP.match(field, at)
         if found is None:
             raise ValueError(
-                f"{field!r}: this field is wrong from character {at + 1} on; write such as pose.position.x, "
+                f"{field!r}: this field is wrong from character {at + 1} on; write, for example, pose.position.x, "
                 "position[0] or position[name=joint_1]"
             )
         index = None if found["index"] is None else int(found["index"])
@@ -102,7 +107,7 @@ def _steps(field: str) -> tuple[Step, ...]:
 
 
 def leaf_type(address: Address) -> str:
-    """Return the type of an address's field, with ``[]`` for a whole sequence.
+    """Return the type of an address's field; ``[]`` at its end means a whole sequence.
 
     Raises:
         KeyError: The message type is unknown.
@@ -116,7 +121,7 @@ def leaf_type(address: Address) -> str:
     for step in address.steps:
         if kind in PRIMITIVES or kind.endswith("[]"):
             what = f"a {kind}" if kind in PRIMITIVES else "a sequence: choose an element, as in [0]"
-            raise ValueError(f"{address.text}: what {step.name!r} is looked up in is {what}")
+            raise ValueError(f"{address.text}: the value that should contain {step.name!r} is {what}")
         fields = DEFINITIONS[kind]
         if step.name not in fields:
             raise ValueError(f"{address.text}: {kind} has no field {step.name!r}; it has {', '.join(fields)}")
@@ -139,7 +144,7 @@ def extract(message: Any, address: Address) -> Any:
     """Return the value of an address's field in a message.
 
     Raises:
-        FieldError: The message does not have it.
+        FieldError: The message does not contain the field.
 
     """
     scopes: list[Any] = []
@@ -163,13 +168,20 @@ def extract(message: Any, address: Address) -> Any:
 
 
 def place_of(scopes: Sequence[Any], step: Step, address: Address) -> int:
-    """Return the index that a step with a name means, given the messages around it; FieldError."""
+    """Return the index that a step with a ``key`` selects.
+
+    ``scopes`` are the messages that contain the field, the outermost first.
+
+    Raises:
+        FieldError: No sequence of names contains the name.
+
+    """
     assert step.key is not None  # noqa: S101 - for the type checker
     sequence, name = step.key
     for scope in reversed(scopes):
         names = scope.get(sequence)
         if isinstance(names, list):
             if name not in names:
-                raise FieldError(BAD_NOT_FOUND, f"{address.text}: {sequence!r} does not have {name!r}")
+                raise FieldError(BAD_NOT_FOUND, f"{address.text}: the sequence {sequence!r} does not contain {name!r}")
             return names.index(name)
     raise FieldError(BAD_NOT_FOUND, f"{address.text}: the message has no sequence {sequence!r}")

@@ -1,7 +1,9 @@
-"""Turns writes of registers into messages, with all fields of a message together.
+"""Turns writes of registers into ROS messages.
 
-A message takes the fields that are not written from the last message of its topic. Without one, a
-command must write all registers of the topic at once, so that no field is made up.
+A message contains all its fields, not only written ones.
+
+The fields that a command does not write are copied from the last message of the topic. If there was
+none, the command must write all registers of the topic, so that no value is invented.
 """
 
 from __future__ import annotations
@@ -21,11 +23,11 @@ from shmio.layout.values.write import Write
 from shmio.model.statuses import BAD_NO_DATA
 
 _MISSING: Final = object()
-"""An element of a sequence that no register gives."""
+"""Stands for an element of a sequence to which no register gives a value."""
 
 
 class Publication:
-    """A message to publish, and the writes that it carries out."""
+    """A message to publish, and the indices of the writes that it carries out."""
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
@@ -38,8 +40,8 @@ def plan(topics: Topics, writes: Sequence[Write]) -> tuple[list[Publication], li
     """Turn writes into messages.
 
     Returns:
-        The messages in their order, and for each write "" or why it is refused. A write that is
-        refused is part of no message.
+        The messages in their order, and for each write "" or why it is refused. No message contains
+        values of a refused write.
 
     """
     drafts: list[Publication] = []
@@ -75,7 +77,10 @@ def plan(topics: Topics, writes: Sequence[Write]) -> tuple[list[Publication], li
 
 
 def mark_lost(outcomes: list[str | Lost], publications: Sequence[Publication], place: int) -> None:
-    """Mark the writes without an answer; the message at ``place`` may have been published."""
+    """Mark the writes whose messages were not confirmed.
+
+    The message ``place`` may have been published.
+    """
     done = {number for publication in publications[:place] for number in publication.writes}
     for number in publications[place].writes:
         if outcomes[number] == "":
@@ -87,13 +92,18 @@ def mark_lost(outcomes: list[str | Lost], publications: Sequence[Publication], p
 
 
 def stamped(topics: Topics, topic: Topic) -> bool:
-    """Return whether a register has the stamp of a topic's header."""
+    """Return whether a register of the topic contains the time stamp of its messages' header."""
     paths = ([step.name for step in topics.addresses[index].steps[:2]] for index in topic.registers)
     return ["header", "stamp"] in paths
 
 
 def _touched(topics: Topics, write: Write, open_drafts: Mapping[str, Publication]) -> Iterator[tuple[int, Value]]:
-    """Yield the registers that a write sets, with their values; ValueError."""
+    """Yield the registers that a write sets, with their values.
+
+    Raises:
+        ValueError: The write is refused; the message says why.
+
+    """
     for index, value in touched(topics.layout, write, lambda index: _present(topics, index, open_drafts)):
         topic = topics.by_name[topics.addresses[index].topic]
         if not topic.writable or topics.fittings[index].kind is None:
@@ -103,7 +113,12 @@ def _touched(topics: Topics, write: Write, open_drafts: Mapping[str, Publication
 
 
 def _present(topics: Topics, index: int, open_drafts: Mapping[str, Publication]) -> Value:
-    """Return the present value of an array of which elements are written; ValueRangeError."""
+    """Return the present value of an array register, to which a write of some elements is added.
+
+    Raises:
+        ValueRangeError: The last message does not contain the array.
+
+    """
     topic = topics.by_name[topics.addresses[index].topic]
     draft = open_drafts.get(topic.name)
     if draft is not None and index in draft.values:
@@ -117,8 +132,10 @@ def _present(topics: Topics, index: int, open_drafts: Mapping[str, Publication])
 def _message(topics: Topics, draft: Publication, base: Any) -> Any:
     """Return the message of a publication.
 
+    ``base`` is the message from which other fields are copied.
+
     Raises:
-        ValueError: It cannot be expressed.
+        ValueError: The message would be incomplete, or a value does not fit its field.
 
     """
     topic, layout = draft.topic, topics.layout
@@ -139,11 +156,14 @@ def _message(topics: Topics, draft: Publication, base: Any) -> Any:
             return message
         except FieldError as error:
             if missing:
-                raise ValueError(f"the last message of {topic.name} does not fit: {error}") from None
+                raise ValueError(
+                    f"the last message of {topic.name} has no place for a written value: {error}"
+                ) from None
     if missing:
         shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
         raise ValueError(
-            f"there was no complete message on {topic.name} yet: write all its registers in one command, also {shown}"
+            f"no complete message has arrived on {topic.name} yet: "
+            f"write all registers of the topic in one command, including {shown}"
         )
     message = default(kind)
     try:
@@ -158,14 +178,19 @@ def _message(topics: Topics, draft: Publication, base: Any) -> Any:
 
 
 def _full(message: Any, name: str, sequence: str) -> bool:
-    """Return whether a sequence at the top of a message is as long as that of its names."""
+    """Return whether a sequence at the top level of a message has as many elements as it has names."""
     if name not in message or sequence not in message:
         return True
     return len(message[name]) == len(message[sequence])
 
 
 def _assign(message: Any, kind: str, address: Address, value: Any, *, grow: bool) -> None:
-    """Set a field; ``grow`` lengthens sequences, and adds names. FieldError if it is not there."""
+    """Set a field of a message. If ``grow``, lengthen sequences and add names as needed.
+
+    Raises:
+        FieldError: The message does not contain the field.
+
+    """
     scopes: list[Any] = []
     found = message
     for step in address.steps:

@@ -24,30 +24,37 @@ if TYPE_CHECKING:
     from shmio.connectors.ros.participant import Participant
 
 POLL_S: Final = 0.005
-"""How often discovery is looked at while the connector waits for a first publisher."""
+"""Period in s at which the connector looks for a first publisher while it connects."""
 
 log = logging.getLogger("shmio.source")
 
 
 class Ros2Options(TopicOptions, frozen=True, kw_only=True):
-    """Domain and network interface, and how to read topics; ValueError for keys that contradict."""
+    """Domain and network interface, and how topics are read.
+
+    Raises:
+        ValueError: Some keys contradict each other.
+
+    """
 
     domain: Annotated[int, msgspec.Meta(ge=0, le=232)] = 0
     """``ROS_DOMAIN_ID`` of the robot."""
     interface: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.:@-]{1,40}$")] = "lo"
-    """The network interface; lo: this host only."""
+    """The name of the network interface; ``lo`` is for this host only."""
     peers: Annotated[
         list[Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.:-]{1,253}$")]], msgspec.Meta(max_length=100)
     ] = msgspec.field(default_factory=list)
-    """Hosts that are asked without multicast."""
+    """Hosts to contact directly, without multicast."""
     reliability: Literal["best_effort", "reliable"] = "best_effort"
-    """What is requested of publishers."""
+    """The reliability that readers request of publishers."""
     max_message_bytes: Annotated[int, msgspec.Meta(ge=1000, le=1 << 26)] = 1 << 20
-    """Larger messages are dropped."""
+    """The largest message that is received, in bytes; larger ones are dropped."""
 
     def __post_init__(self) -> None:
         if self.interface == "lo" and self.peers:
-            raise ValueError("peers: other hosts need an interface: set interface to the name of one, such as eth0")
+            raise ValueError(
+                "peers: to reach other hosts, set interface to the name of a network interface, such as eth0"
+            )
 
 
 class Ros2Connector(Connector):
@@ -67,7 +74,7 @@ class Ros2Connector(Connector):
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks, in s."""
+        """The longest time that any method may block, in s."""
         return 3 * self._options.timeout / 1000
 
     @property
@@ -75,18 +82,18 @@ class Ros2Connector(Connector):
         return f"domain {self._options.domain} on {self._options.interface}"
 
     def describe(self) -> str:
-        """Return the domain and what is read, for the log."""
+        """Return the domain and the number of topics, for the log."""
         return f"to DDS {self._where}, {len(self._topics.by_name)} topics"
 
     def load(self) -> Load:
-        """Return what is read; no requests, because topics are subscribed to."""
+        """Return the number of topics. A cycle needs no requests."""
         return Load(counted(len(self._topics.by_name), "topic"), note="their publishers send messages")
 
     def connect(self) -> None:
-        """Join the domain, and wait for a publisher of a topic, or for a subscriber of a command topic.
+        """Join the domain, and wait until another participant publishes or subscribes to a topic.
 
         Raises:
-            ConnectorError: There is none.
+            ConnectorError: No participant has done so within the time-out.
 
         """
         from shmio.connectors.ros import participant  # noqa: PLC0415  its library is optional
@@ -108,21 +115,22 @@ class Ros2Connector(Connector):
             if time.monotonic() > end_s:
                 self.close()
                 raise ConnectorError(
-                    f"no answer within {options.timeout} ms: no topic has a publisher in DDS {self._where}; compare "
-                    "ROS_DOMAIN_ID, names and types"
+                    f"no answer within {options.timeout} ms: none of the topics has a publisher or subscriber in DDS "
+                    f"{self._where}; compare ROS_DOMAIN_ID, names and types"
                 )
             time.sleep(POLL_S)
 
     def _met(self, joined: Participant) -> bool:
-        """Return whether another participant has something to do with the topics."""
+        """Return whether another participant publishes or subscribes to one of the topics."""
         names = self._topics.by_name
         return any(joined.publishers(name) or joined.subscribers(name) for name in names)
 
     def read(self) -> bytes:
-        """Return the image of the newest messages, if a publisher or a subscriber is there.
+        """Return the image of the newest messages.
 
         Raises:
-            ConnectorError: There is none any more.
+            ConnectorError: No other participant publishes or subscribes to one of the topics any
+                more.
 
         """
         joined = self._participant
@@ -130,15 +138,15 @@ class Ros2Connector(Connector):
             raise ConnectorError(f"this process has not joined DDS {self._where}")
         self._pull(joined)
         if not self._met(joined):
-            raise ConnectorError(f"all publishers of its topics have left DDS {self._where}")
+            raise ConnectorError(f"all publishers and subscribers of this source's topics have left DDS {self._where}")
         for topic in self._topics.by_name.values():
             gone = not topic.writable and topic.received_ns and not joined.publishers(topic.name)
             topic.fault = BAD_NO_COMMUNICATION if gone else GOOD
             if not topic.received_ns and topic.name not in self._incompatible and joined.incompatible(topic.name):
                 self._incompatible.add(topic.name)
                 log.warning(
-                    "%s: its publisher offers less than is requested: leave it out of latched, or set reliability to "
-                    "best_effort", topic.name,
+                    "%s: the topic's publisher offers less than this source requests: remove the topic from latched, "
+                    "or set reliability to best_effort", topic.name,
                 )  # fmt: skip
         return self._topics.image(time.monotonic_ns())
 
@@ -153,7 +161,7 @@ class Ros2Connector(Connector):
             self._participant = None
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Publish messages, each confirmed when all reliable subscribers have it.
+        """Publish messages. A message is confirmed once all reliable subscribers have received it.
 
         Raises:
             WriteLostError: A subscriber did not acknowledge a message in time.
@@ -179,7 +187,7 @@ class Ros2Connector(Connector):
     def _publish(self, joined: Participant, publication: Publication, until_s: float) -> str:
         name, message = publication.topic.name, publication.message
         if not joined.subscribers(name):
-            return f"no node subscribes to {name}: nobody would receive it"
+            return f"no node subscribes to {name}: nobody would receive the message"
         now_ns = time.time_ns()
         if "header" in message and not stamped(self._topics, publication.topic):
             message["header"]["stamp"] = _time(now_ns)

@@ -1,4 +1,4 @@
-"""The message types as DDS types, with the names that ROS 2 gives them, and messages as samples of these."""
+"""Converts messages to samples of DDS and back. DDS types have the names that ROS 2 gives them."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _PRIMITIVES: Final[dict[str, Any]] = {
 
 
 def dds_topic(topic: str) -> str:
-    """Return the DDS topic of a ROS topic."""
+    """Return the name that a ROS topic has in DDS."""
     return f"rt{topic}"
 
 
 def dds_type(kind: str) -> str:
-    """Return the DDS name of a type ``package/Name``."""
+    """Return the name that a type ``package/Name`` has in DDS."""
     package, _, name = kind.partition("/")
     return f"{package}::msg::dds_::{name}_"
 
 
 @lru_cache(maxsize=256)
 def sample_type(kind: str) -> Any:
-    """Return the class of a type's samples."""
+    """Return the class whose instances are samples of a type."""
     annotations = {name: _annotation(inner) for name, inner in DEFINITIONS[kind].items()}
 
     def fill(namespace: dict[str, Any]) -> None:
@@ -48,7 +48,7 @@ def _annotation(kind: str) -> Any:
 
 
 def to_message(sample: Any, kind: str) -> Any:
-    """Return the value of a field, or a whole sample, as dictionaries and lists."""
+    """Return a sample, or the value of one of its fields, as dictionaries and lists."""
     if kind.endswith("[]"):
         inner = kind[:-2]
         return list(sample) if inner in _PRIMITIVES else [to_message(one, inner) for one in sample]
@@ -58,7 +58,7 @@ def to_message(sample: Any, kind: str) -> Any:
 
 
 def to_sample(message: Any, kind: str) -> Any:
-    """Return a message that conforms to its type as a sample."""
+    """Return a message as a sample. The message must conform to its type."""
     if kind.endswith("[]"):
         return [to_sample(one, kind[:-2]) for one in message]
     if kind in _PRIMITIVES:

@@ -1,7 +1,7 @@
 """The message types that the connectors know, from the public definitions of ROS 2.
 
-A type is ``package/Name``. The type of a field is a primitive, ``string`` or another message type,
-with ``[]`` behind it for a sequence. Messages are dictionaries and lists, as in JSON.
+A type is ``package/Name``. The type of a field is a primitive, ``string`` or another message type;
+``[]`` at its end makes it a sequence. Messages are dictionaries and lists, as in JSON.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ INTEGERS: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
     {f"int{bits}": (-(1 << bits - 1), (1 << bits - 1) - 1) for bits in (8, 16, 32, 64)}
     | {f"uint{bits}": (0, (1 << bits) - 1) for bits in (8, 16, 32, 64)}
 )
-"""The least and the greatest value of each type of whole numbers."""
+"""The smallest and the largest value of each integer type."""
 PRIMITIVES: Final = frozenset({"bool", "string", *FLOATS, *INTEGERS})
 TYPE: Final = re.compile(r"([a-z][a-z0-9_]*)/(?:msg/)?([A-Z][A-Za-z0-9]*)")
 
@@ -64,12 +64,12 @@ DEFINITIONS: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType({
 
 
 def plain(name: str) -> str:
-    """Return a type as ``package/Name``, also for ``package/msg/Name``."""
+    """Return a type as ``package/Name``; the argument may also be ``package/msg/Name``."""
     return name.replace("/msg/", "/")
 
 
 def default(kind: str) -> Any:
-    """Return the value that a field of a known type has by default: zero, empty, or a message of these."""
+    """Return the default value of a field: zero, empty, or a message of default values."""
     if kind.endswith("[]"):
         return []
     if kind in PRIMITIVES:
@@ -78,7 +78,7 @@ def default(kind: str) -> Any:
 
 
 def conforms(message: Any, kind: str) -> bool:
-    """Return whether a value has all fields of a known type, and each has its type."""
+    """Return whether a value has all fields of a known type, each with the right type."""
     if kind.endswith("[]"):
         return isinstance(message, list) and all(conforms(one, kind[:-2]) for one in message)
     if kind in ("bool", "string"):
@@ -93,7 +93,7 @@ def conforms(message: Any, kind: str) -> bool:
 
 
 def finite(message: Any) -> bool:
-    """Return whether all numbers of a message are finite."""
+    """Return whether no number in a message is NaN or infinite."""
     if isinstance(message, dict):
         return all(map(finite, message.values()))
     if isinstance(message, list):

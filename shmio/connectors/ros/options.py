@@ -10,13 +10,16 @@ _Topic = Annotated[str, msgspec.Meta(min_length=2, max_length=256)]
 
 
 class TopicOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """What counts as a good value."""
+    """Time-outs, and what counts as a good value."""
 
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
-    """Milliseconds for connecting, for each answer, and for the writes of a cycle."""
+    """Time-out for connecting, for each answer, and for the writes of a cycle, in ms."""
     max_age: Annotated[int, msgspec.Meta(ge=0, le=86_400_000)] = 1000
-    """Milliseconds after which the last message of a topic is too old; 0: never."""
+    """Age in ms above which the last message of a topic is too old; 0: never."""
     latched: Annotated[list[_Topic], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=list)
-    """Topics whose last message stays valid without a limit of age."""
+    """Topics whose last message stays valid for ever."""
     time: Literal["stamp", "receipt"] = "stamp"
-    """The source time: of the message's header if it has one, or when it was received."""
+    """The source time: ``stamp`` is that in the message's header, if it has one.
+
+    ``receipt`` is when it came.
+    """

@@ -1,4 +1,4 @@
-"""A participant in a DDS domain, with a reader for each topic, and a writer for those of commands."""
+"""A participant in a DDS domain, with a reader for each topic and a writer for each command topic."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from shmio.connectors.ros.topics import Topic
 from shmio.errors import ConnectorError
 
 MAX_PARTICIPANTS: Final = 60
-"""Participants of a host that are found without multicast."""
+"""Largest number of participants on a host that are found without multicast."""
 WRITER_DEPTH: Final = 10
 _HEARTBEAT: Final = '<HeartbeatInterval min="2 ms" minsched="2 ms" max="1 s">5 ms</HeartbeatInterval>'
-"""Asks subscribers soon for their acknowledgements: the poll loop waits for these."""
+"""Makes the writer ask for acknowledgements at short intervals, because the poll loop waits."""
 
 log = logging.getLogger("shmio.source")
 
@@ -61,10 +61,10 @@ def _sockets() -> Iterator[int]:
 def _keep_to_loopback(before: set[int]) -> None:
     """Let the sockets that are not in ``before`` receive from this host only.
 
-    Cyclone DDS sends by the interface of its configuration, but receives from all.
+    Cyclone DDS sends by the configured interface, but receives from all interfaces.
 
     Raises:
-        ConnectorError: The kernel does not allow it.
+        ConnectorError: The kernel does not allow this.
 
     """
     for descriptor in set(_sockets()) - before:
@@ -75,12 +75,12 @@ def _keep_to_loopback(before: set[int]) -> None:
                 made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
             except OSError as error:
                 raise ConnectorError(
-                    f"cannot keep other hosts out: {error.strerror}; use Linux 5.7 or later, or name an interface"
+                    f"cannot restrict DDS to this host: {error.strerror}; use Linux 5.7 or later, or set interface"
                 ) from None
 
 
 class _Endpoint:
-    """The reader of a topic, and its writer if it has one."""
+    """The reader of a topic, and the writer of a command topic."""
 
     def __init__(self, participant: Any, topic: Topic, *, reliable: bool, blocking_ns: int) -> None:
         self.topic, self.kind = topic, plain(topic.type)
@@ -99,7 +99,7 @@ class _Endpoint:
 
 
 class Participant:
-    """One participant; it has joined the domain until it is closed."""
+    """A participant in a DDS domain; it leaves the domain when it is closed."""
 
     def __init__(
         self, domain: int, configured: str, topics: Iterable[Topic], timeout_s: float, *, reliable: bool, loopback: bool
@@ -108,11 +108,11 @@ class Participant:
 
         Args:
             domain: The domain's id.
-            configured: What :func:`configuration` returns.
-            topics: The topics to read, and those of them to write.
-            timeout_s: How long a write may wait for room.
-            reliable: Whether publishers must be reliable.
-            loopback: Whether other hosts are kept out.
+            configured: The configuration of Cyclone DDS, from :func:`configuration`.
+            topics: The topics to read. Those that are writable are also written.
+            timeout_s: How long a write may wait for room in the queue.
+            reliable: Whether readers require reliable publishers.
+            loopback: Whether to receive from this host only.
 
         Raises:
             ConnectorError: The interface does not exist, or the domain cannot be joined.
@@ -148,20 +148,25 @@ class Participant:
         self._participant = self._domain = None
 
     def publishers(self, topic: str) -> int:
-        """Return how many publishers a topic has, without this participant."""
+        """Return how many publishers a topic has, not counting this participant."""
         return len(self._endpoints[topic].reader.get_matched_publications())
 
     def subscribers(self, topic: str) -> int:
-        """Return how many subscribers a command topic has, without this participant."""
+        """Return how many subscribers a command topic has, not counting this participant."""
         writer = self._endpoints[topic].writer
         return 0 if writer is None else len(writer.get_matched_subscriptions())
 
     def incompatible(self, topic: str) -> bool:
-        """Return whether a publisher offers less than the reader of the topic requests."""
+        """Return whether a publisher of the topic offers less than the reader requests."""
         return bool(self._endpoints[topic].reader.get_requested_incompatible_qos_status().total_count)
 
     def take(self) -> Iterator[tuple[str, Any]]:
-        """Yield the newest message of each topic that has a new one; None for one that cannot be decoded."""
+        """Yield each topic that has a new message, with the newest; None if that cannot be decoded.
+
+        Raises:
+            ConnectorError: The library reports an error.
+
+        """
         for name, endpoint in self._endpoints.items():
             try:
                 for sample in endpoint.reader.take(1):
@@ -174,13 +179,13 @@ class Participant:
                 yield name, None
 
     def publish(self, topic: str, message: Any, until_s: float) -> bool:
-        """Publish a message, and wait until all reliable subscribers have it.
+        """Publish a message, and wait until all reliable subscribers have received it.
 
         Returns:
-            Whether all have it.
+            Whether all have received it by ``until_s``.
 
         Raises:
-            ConnectorError: It cannot be sent.
+            ConnectorError: The message cannot be sent.
 
         """
         endpoint = self._endpoints[topic]

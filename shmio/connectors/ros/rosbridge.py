@@ -25,17 +25,22 @@ from shmio.layout.values.write import Write
 
 DEFAULT_PORT: Final = 9090
 FIRST_S: Final = 0.1
-"""How long a new connection waits for the first messages."""
+"""How long a new connection waits for first messages, in s."""
 
 
 class RosbridgeOptions(TopicOptions, frozen=True, kw_only=True):
-    """Address of the server, and how to read it; ValueError for a wrong URL."""
+    """Address of the server, and how topics are read.
+
+    Raises:
+        ValueError: The URL is wrong.
+
+    """
 
     url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
     max_message_bytes: Annotated[int, msgspec.Meta(ge=1000, le=1 << 26)] = 1 << 20
-    """The largest message that is accepted."""
+    """The largest message that is accepted, in bytes."""
     throttle_ms: Annotated[int, msgspec.Meta(ge=0, le=3_600_000)] = 0
-    """The shortest time between two messages of a topic that the server sends."""
+    """The shortest time in ms between two messages of a topic that the server may send."""
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
@@ -76,15 +81,15 @@ class RosbridgeConnector(Connector):
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks, in s."""
+        """The longest time that any method may block, in s."""
         return 3 * self._options.timeout / 1000
 
     def describe(self) -> str:
-        """Return the peer and what is read, for the log."""
+        """Return the server's address and the number of topics, for the log."""
         return f"to {self._options.address}, {len(self._topics.by_name)} topics by rosbridge"
 
     def load(self) -> Load:
-        """Return what is read; no requests, because topics are subscribed to."""
+        """Return the number of topics. A cycle needs no requests."""
         return Load(counted(len(self._topics.by_name), "topic"), note="the server sends their messages")
 
     def connect(self) -> None:
@@ -115,10 +120,10 @@ class RosbridgeConnector(Connector):
             raise
 
     def read(self) -> bytes:
-        """Return the image of the newest messages, if the server is certainly alive.
+        """Return the image of the newest messages, after checking that the server still answers.
 
         Raises:
-            ConnectorError: The connection is lost, or the server is silent.
+            ConnectorError: The connection is lost, or the server has not answered in time.
 
         """
         link = self._link
@@ -139,7 +144,7 @@ class RosbridgeConnector(Connector):
             self._link = None
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Publish messages, each confirmed when the server sends it back.
+        """Publish messages. A message is confirmed once the server has sent it back.
 
         Raises:
             WriteLostError: The server did not send a message back, or the connection was lost.
@@ -170,7 +175,10 @@ class RosbridgeConnector(Connector):
         return link.publish(topic.name, self._stampless(message, publication), f"write:{next(self._numbers)}", until_s)
 
     def _stampless(self, message: Any, publication: Publication) -> Any:
-        """Return the message without its stamp, which the server then sets, unless a register has it."""
+        """Return the message without its time stamp, which the server then sets.
+
+        The stamp is kept if a register contains it.
+        """
         if "header" not in message or stamped(self._topics, publication.topic):
             return message
         return message | {"header": {name: one for name, one in message["header"].items() if name != "stamp"}}

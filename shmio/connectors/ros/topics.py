@@ -1,4 +1,4 @@
-"""The topics of a layout: the last message of each, and the image that they give."""
+"""The topics of a layout with their last messages, and the image made of them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from shmio.model.statuses import (
 )
 
 MAX_REPORTED: Final = 20
-"""Faults of a connection that are reported by name."""
+"""Largest number of faults logged with their registers in each connection."""
 MAX_SEC: Final = 1 << 33
 
 log = logging.getLogger("shmio.source")
 
 
 class Topic:
-    """A topic, the registers with its fields, and its last message."""
+    """A topic, the registers that have its fields, and its last message."""
 
     def __init__(self, name: str, kind: str) -> None:
         self.name, self.type = name, kind
@@ -37,15 +37,18 @@ class Topic:
         self.writable = False
         self.latched = False
         self.message: Any = None
-        """The last message; None before the first, and after one that cannot be read."""
+        """The last message; None before the first one, and if the last one cannot be read."""
         self.received_ns = 0
-        """When it was received, ns of CLOCK_MONOTONIC; 0: never."""
+        """When the last message was received, ns of CLOCK_MONOTONIC; 0: never."""
         self.utc_ns = 0
         self.fault = GOOD
-        """Why the topic has no good values at present; GOOD if there is no reason."""
+        """Why none of the topic's registers has a good value: a status.
+
+        GOOD if there is no reason.
+        """
         self.changed = False
         self.shown = GOOD
-        """The fault that the image shows."""
+        """The fault that the image shows at present."""
 
     def reset(self) -> None:
         """Forget the last message."""
@@ -57,12 +60,12 @@ class Topics:
     """All topics of a layout."""
 
     def __init__(self, layout: Layout, options: TopicOptions, *, known_types: bool) -> None:
-        """Read the addresses of a layout.
+        """Parse the addresses of a layout.
 
         Args:
             layout: The layout of the source's block.
-            options: What counts as a good value.
-            known_types: Whether only the types of ``messages.py`` can be read.
+            options: The source's keys.
+            known_types: Whether all message types must be among those of ``messages.py``.
 
         Raises:
             ConfigError: An address is wrong, or does not fit its register.
@@ -91,12 +94,16 @@ class Topics:
                 kind = leaf_type(address)
             except KeyError as error:
                 if known_types or register.writable:
-                    what = "be read" if known_types else "be written; shmio reads it if writable is left out"
-                    raise ValueError(f"the message type {error.args[0]} is not one of those that can {what}") from None
+                    what = "be read" if known_types else "be written; remove writable = true to read them"
+                    raise ValueError(
+                        f"shmio does not know the type {error.args[0]}: its messages cannot {what}"
+                    ) from None
                 kind = None
             topic = self.by_name.setdefault(address.topic, Topic(address.topic, address.type))
             if plain(topic.type) != plain(address.type):
-                raise ValueError(f"another register says that {topic.name} is a {topic.type}, not a {address.type}")
+                raise ValueError(
+                    f"another register gives {topic.name} the message type {topic.type}, not {address.type}"
+                )
             self.fittings.append(Fitting(register, kind))
         except ValueError as error:
             raise ConfigError(f"layout: {register.path}: {error}") from None
@@ -105,14 +112,14 @@ class Topics:
         topic.writable = topic.writable or register.writable
 
     def reset(self) -> None:
-        """Forget all messages; all registers wait again."""
+        """Forget all messages, so that all registers wait for a value."""
         self._reported.clear()
         for topic in self.by_name.values():
             topic.reset()
             self._fail(topic, BAD_WAITING_FOR_INITIAL_DATA)
 
     def take(self, name: str, message: Any, received_ns: int, utc_ns: int) -> None:
-        """Take the newest message of a topic; None if one came that cannot be read."""
+        """Store the newest message of a topic; None stands for a message that cannot be read."""
         topic = self.by_name.get(name)
         if topic is None:
             return
@@ -123,7 +130,7 @@ class Topics:
         """Return the image of the last messages.
 
         Args:
-            now_ns: The time of CLOCK_MONOTONIC in ns.
+            now_ns: The present time of CLOCK_MONOTONIC in ns.
 
         """
         if self._image is None:
@@ -169,22 +176,25 @@ class Topics:
         return (stamp_ns(topic.message) if self._stamps else 0) or topic.utc_ns
 
     def report(self, index: int, what: str) -> None:
-        """Log a fault of a register once for each connection, the first ones by name."""
+        """Log a fault of a register once in each connection.
+
+        After ``MAX_REPORTED``, log no more names.
+        """
         if len(self._reported) > MAX_REPORTED or (index, what) in self._reported:
             return
         self._reported.add((index, what))
         if len(self._reported) <= MAX_REPORTED:
             log.warning("%s: %s", self.layout.registers[index].path, what)
         else:
-            log.warning("more registers are bad: shmio get shows all")
+            log.warning("more registers are bad: use shmio get to see all")
 
     def waiting(self) -> Iterable[str]:
-        """Yield the topics without a message."""
+        """Yield the names of topics that have not had a message."""
         return (topic.name for topic in self.by_name.values() if not topic.received_ns)
 
 
 def stamp_ns(message: Any) -> int:
-    """Return the time in a message's header, ns since 1970; 0 if there is none."""
+    """Return the time stamp in a message's header, ns since 1970; 0 if it has none."""
     header = message.get("header") if isinstance(message, dict) else None
     stamp = header.get("stamp") if isinstance(header, dict) else None
     if not isinstance(stamp, dict):

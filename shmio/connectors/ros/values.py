@@ -1,4 +1,4 @@
-"""Fits values of fields to registers, and values of registers to fields."""
+"""Converts values of message fields to values of registers, and back."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ class Fitting:
     """Converts between the values of a field and those of its register."""
 
     def __init__(self, register: Register, kind: str | None) -> None:
-        """Take the register and the type of its field; None if that is unknown.
+        """Create the converter for a register and the type of its field.
+
+        None if the type is unknown.
 
         Raises:
-            ValueError: They never fit.
+            ValueError: No value of the field can fit the register.
 
         """
         base = register.element.base
@@ -51,11 +53,11 @@ class Fitting:
             raise ValueError(f"the field is a {kind}, which does not fit {_named(register)}{hint}")
 
     def value(self, found: Any) -> Value:
-        """Return the register's value for that of a field.
+        """Return the register's value for a value of the field.
 
         Raises:
             FieldError: The field's value has another type or another length.
-            ValueRangeError: The register cannot hold it.
+            ValueRangeError: The register cannot hold the value.
 
         """
         register = self._register
@@ -65,7 +67,8 @@ class Fitting:
             raise FieldError(BAD_TYPE_MISMATCH, f"found {type(found).__name__}, expected a sequence")
         if len(found) != register.count:
             raise FieldError(
-                BAD_INDEX_RANGE_NO_DATA, f"the sequence has {len(found)} elements, the register {register.count}"
+                BAD_INDEX_RANGE_NO_DATA,
+                f"the sequence has {len(found)} elements, but the register has {register.count}",
             )
         return nest([self._element(one) for one in found], register.shape)
 
@@ -94,7 +97,12 @@ class Fitting:
         )
 
     def field(self, value: Value) -> Any:
-        """Return what a message has for a value of the register; ValueError if it cannot have it."""
+        """Return the field's value for a value of the register.
+
+        Raises:
+            ValueError: The value does not fit the field.
+
+        """
         register = self._register
         if not register.dims:
             return self._back(value)
@@ -103,7 +111,7 @@ class Fitting:
     def _back(self, value: Any) -> Any:
         kind = (self.kind or "").removesuffix("[]")
         if value is None:
-            raise ValueError("this is no valid value")
+            raise ValueError("the value is not valid")
         if kind in ("bool", "string"):
             return value
         number = value if self._scale is None else (value - self._scale[1]) / self._scale[0]

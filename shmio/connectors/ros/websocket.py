@@ -1,4 +1,4 @@
-"""A connection of the rosbridge protocol: JSON over a WebSocket, received in a thread of its own.
+"""A connection by the rosbridge protocol: JSON over a WebSocket. Its own thread receives messages.
 
 The protocol is rosbridge v2: ROSBRIDGE_PROTOCOL.md of rosbridge_suite.
 """
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 CLOSE_S: Final = 0.2
 MAX_REPORTED: Final = 20
 MAX_FRAGMENTS: Final = 10_000
-"""Most fragments of a message."""
+"""Largest number of fragments of a message."""
 _SEND_TIMEOUT: Final = struct.Struct("@ll")
 
 log = logging.getLogger("shmio.source")
 
 
 class Received(NamedTuple):
-    """The newest message of a topic, as JSON."""
+    """The newest message of a topic as JSON, and when it was received."""
 
     json: msgspec.Raw
     monotonic_ns: int
@@ -41,7 +41,10 @@ class Received(NamedTuple):
 
 
 class _Envelope(msgspec.Struct):
-    """What all operations have; ``msg`` is a message, or the text of a status."""
+    """The fields of the operations that the server sends.
+
+    ``msg`` is the message of a topic, or the text of a status.
+    """
 
     op: str
     topic: str = ""
@@ -57,17 +60,17 @@ class Link:
     """A connection to a rosbridge server."""
 
     def __init__(self, url: str, peer: Address, timeout_s: float, max_bytes: int, topics: Collection[str]) -> None:
-        """Connect.
+        """Connect to the server.
 
         Args:
             url: The server's URL.
-            peer: Its host and port.
-            timeout_s: Time-out for the connection, and for the silence of the server.
+            peer: The server's host and port.
+            timeout_s: Time-out for connecting, and for each answer of the server.
             max_bytes: The largest message that is accepted.
             topics: The topics whose messages are kept.
 
         Raises:
-            ConnectorError: The server cannot be reached, or is no WebSocket.
+            ConnectorError: The server cannot be reached, or is not a WebSocket server.
 
         """
         from websockets.exceptions import WebSocketException  # noqa: PLC0415  the library is optional
@@ -116,27 +119,37 @@ class Link:
         self._thread.join(CLOSE_S)
 
     def send(self, **message: Any) -> None:
-        """Send an operation; ConnectorError."""
+        """Send an operation.
+
+        Raises:
+            ConnectorError: The connection is lost.
+
+        """
         try:
             self._socket.send(msgspec.json.encode(message).decode())
         except self._closed_errors as error:
             raise ConnectorError(self._failure or f"the connection to {self._peer} was lost: {_why(error)}") from None
 
     def newest(self) -> Mapping[str, Received]:
-        """Return what has been received since the last call."""
+        """Return the newest message of each topic that has had one since the last call."""
         with self._condition:
             found, self._newest = self._newest, {}
         return found
 
     def wait_newest(self, until_s: float) -> None:
-        """Wait until each topic has a message, at most until a time of CLOCK_MONOTONIC in s."""
+        """Wait until each topic has a message, at most until ``until_s`` (CLOCK_MONOTONIC, in s)."""
         with self._condition:
             self._condition.wait_for(
                 lambda: self._failure or len(self._newest) == len(self._topics), max(0.0, until_s - time.monotonic())
             )
 
     def check(self) -> None:
-        """Raise ConnectorError if the connection is lost, or the server is silent."""
+        """Check the connection, and send a ping if the server has been silent.
+
+        Raises:
+            ConnectorError: The connection is lost, or the server has not answered a ping in time.
+
+        """
         if self._failure:
             raise ConnectorError(self._failure)
         now_ns, timeout_ns = time.monotonic_ns(), round(self._timeout_s * 1e9)
@@ -163,10 +176,10 @@ class Link:
             until_s: When to stop waiting, s of CLOCK_MONOTONIC.
 
         Returns:
-            "" or why the server refused it.
+            "" if the message came back, or why the server refused it.
 
         Raises:
-            ConnectorError: Nothing is known of the message.
+            ConnectorError: The message may or may not have been published.
 
         """
         with self._condition:
@@ -208,9 +221,13 @@ class Link:
         self._socket.close_socket()
 
     def _texts(self) -> Iterator[str]:
-        """Yield the messages until the server closes the connection; ConnectorError if one is not acceptable.
+        """Yield the messages until the server closes the connection.
 
-        The library limits the bytes of a message, but not into how many fragments it is divided.
+        The library limits the bytes of a message, but not the number of its fragments.
+
+        Raises:
+            ConnectorError: A message is binary, or has too many fragments.
+
         """
         from websockets.exceptions import ConnectionClosedOK  # noqa: PLC0415  the library is optional
 
@@ -256,7 +273,7 @@ class Link:
         with self._condition:
             if envelope.level == "error" and self._expected is not None and self._expected[1] == envelope.id:
                 self._outcome, self._expected = (
-                    f"the server refuses it: {text}" if text else "the server refuses it",
+                    f"the server refuses the message: {text}" if text else "the server refuses the message",
                     None,
                 )
                 self._condition.notify_all()
@@ -267,7 +284,7 @@ class Link:
 
 
 def decode(json: msgspec.Raw) -> Any:
-    """Return a message of JSON; None if it is wrong, or is no message."""
+    """Return the document in a JSON message; None if it is not valid JSON."""
     try:
         return msgspec.json.decode(json)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
@@ -275,7 +292,7 @@ def decode(json: msgspec.Raw) -> Any:
 
 
 def _contains(found: Any, expected: Any) -> bool:
-    """Return whether a message has all fields of the one that was published, and their values."""
+    """Return whether ``found`` has all fields of ``expected``, with the same values."""
     if isinstance(expected, dict):
         return isinstance(found, dict) and all(
             name in found and _contains(found[name], value) for name, value in expected.items()

@@ -217,7 +217,7 @@ def test_failing_model_fails_the_step_with_its_reason(instance: str) -> None:
         coordinator.step()
         with pytest.raises(TimeError, match=r"^step 2: sim: model 'adder': no solution$"):
             coordinator.step()
-        with pytest.raises(TimeError, match=r"^step 3: sim: model 'adder': it gave no reason$"):
+        with pytest.raises(TimeError, match=r"^step 3: sim: model 'adder': it failed without giving a reason$"):
             coordinator.step()
         assert summed(latest(segment, "sim")) == 1
         coordinator.step()

@@ -40,10 +40,10 @@ def test_addresses(text: str, address: Address) -> None:
     [
         ("", "missing"), ("a/+/b", "one topic"), ("#", "one topic"), ("a $.", "from character 2"),
         ("a $.b[x]", "from character 4"), ("a $.b..c", "from character 4"), ("a $" + ".b" * 17, "16 steps"),
-        ("a\0b", "text"), ("a" * 1001, "1000"), ("$share/g/a", "shared"), ("spBv1.0/G/DDATA/N/D", "sparkplug GROUP"),
+        ("a\0b", "control"), ("a" * 1001, "1000"), ("$share/g/a", "shared"), ("spBv1.0/G/DDATA/N/D", "sparkplug GROUP"),
         ("sparkplug G/N", "metric NAME"), ("sparkplug G metric a", "GROUP"), ("sparkplug G/N/D/E metric a", "GROUP/"),
         ("sparkplug G/+ metric a", "without +"), ("sparkplug G//D metric a", "GROUP"), ("a -> ", "missing"),
-        ("a -> b/#", "one topic"), (" -> b", "missing"), ("\ud800", "text"),
+        ("a -> b/#", "one topic"), (" -> b", "missing"), ("\ud800", "or invalid characters"),
     ],
 )  # fmt: skip
 def test_wrong_addresses(text: str, words: str) -> None:
@@ -69,15 +69,19 @@ def make(tags: dict[str, Any], **options: Any) -> None:
     ("tags", "options", "words"),
     [
         ({"a": ("INT", "a/+")}, {}, "layout: a: 'a/\\+'"),
-        ({"a": ("ARRAY[1..2] OF INT", "a")}, {}, r"an array is JSON: write a \$"),
+        ({"a": ("ARRAY[1..2] OF INT", "a")}, {}, r"an array is read from JSON: write a \$"),
         ({"a": ("DATE", "a")}, {}, "a DATE cannot be read"),
-        ({"a": {"type": "INT", "address": "a $.b", "writable": True}}, {}, "say where to publish"),
+        (
+            {"a": {"type": "INT", "address": "a $.b", "writable": True}},
+            {},
+            "append the topic on which to publish writes",
+        ),
         ({"a": ("INT", "a")}, {"max_age_ms": None}, "max_age_ms: a would stay good for ever"),
         ({"a": ("INT", "a")}, {"max_age_ms": {"b/**": 5}}, "max_age_ms: a would stay good for ever"),
         ({"a": ("INT", "a")}, {"max_age_ms": {"a//b": 5}}, "max_age_ms: .*pattern"),
         ({"a": ("INT", "a")}, {"will": "b/#"}, "will: .*one topic"),
         ({"a": ("INT", "a")}, {"will": [{"topic": "b", "match": "x/**"}]}, r"will: no register matches"),
-        ({"a": ("INT", "a")}, {"time": "at"}, "time: 'at' is no path"),
+        ({"a": ("INT", "a")}, {"time": "at"}, "time: 'at' is not a path"),
         ({"a": ("INT", "a")}, {"templates": {"b": "{}"}}, "templates: no register is written to 'b'"),
         (
             {"a": {"type": "INT", "address": "a -> b $.x", "writable": True}},
@@ -102,7 +106,7 @@ def test_layouts_and_keys_that_do_not_fit(tags: dict[str, Any], options: dict[st
         ({"url": "mqtt://10.1.2.3"}, "plain text over the network"),
         ({"url": "mqtt://127.0.0.1", "ca": "x"}, "has no effect"),
         ({"url": "mqtts://10.1.2.3", "certificate": "x"}, "both certificate and key"),
-        ({"url": "mqtt://127.0.0.1", "password_file": "x"}, "username: set it"),
+        ({"url": "mqtt://127.0.0.1", "password_file": "x"}, "username: this key is needed"),
         ({"url": "mqtt://127.0.0.1", "qos": 2}, "qos"),
         ({"url": "mqtt://127.0.0.1", "texts": ["on", "ON"]}, "texts: .*differ"),
     ],

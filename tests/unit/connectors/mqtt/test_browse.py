@@ -22,7 +22,7 @@ b
     value  BOOL  b/lamp 1
     name  STRING  b/lamp 1/name
   pos  LREAL  b/pos
-  raw  (its payload is no short text)
+  raw  (its payload is binary, or text that is too long)
   state
     axes
       0
@@ -30,7 +30,7 @@ b
         on  BOOL  b/state $.axes[0].on
     list  ARRAY[0..2] OF LREAL  b/state $.list
     my.name  STRING  b/state $['my.name']
-    none  (it is null, and its type is unknown)
+    none  (it is null, so that its type is unknown)
 Line 1
   cell
     robot

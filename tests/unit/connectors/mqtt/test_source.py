@@ -221,7 +221,7 @@ def test_writes_that_are_refused(plant: Plant) -> None:
     with connected(plant.address, WRITABLE, will=[{"topic": "w/there", "match": "lamp"}]) as source:
         outcomes = source.write(read=1, fixed=1, x=math.nan, lamp=True, speed=1.0)
         for outcome, words in zip(
-            outcomes, ("set `writable", "Not authorized", "neither NaN", "is not there", ""), strict=True
+            outcomes, ("set `writable", "Not authorized", "neither NaN", "is offline", ""), strict=True
         ):
             assert words in outcome
             assert bool(words) == bool(outcome)

@@ -188,7 +188,7 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch, name: str, 
 
 def test_what_is_wrong_is_said_before_anything_starts() -> None:
     pytest.importorskip("cyclonedds")
-    with pytest.raises(ConfigError, match="can be read"):
+    with pytest.raises(ConfigError, match="cannot be read"):
         Ros2Connector(Ros2Options(), layout_of({"r": ("LREAL", "/a my_msgs/Thing x")}))
     with pytest.raises(ValueError, match="peers"):
         Ros2Options(peers=["10.0.0.1"])

@@ -188,7 +188,7 @@ def test_a_joint_command_names_its_joints(bridge: Bridge) -> None:
         assert bridge.ask("last", "/command")["position"] == [7.0, 6.0]
         bridge.ask("publish", "/command", joint_state(["a"], [5.0]))
         source.until(lambda: source.code("b") == statuses.BAD_NOT_FOUND)
-        assert "does not have 'b'" in source.write(b=7.0)[0]
+        assert "does not contain 'b'" in source.write(b=7.0)[0]
     gap = {"v": {"type": "LREAL", "address": "/other sensor_msgs/JointState velocity[1]", "writable": True}}
     with connected(bridge.url, gap) as source:
         assert "without a value" in source.write(v=1.0)[0]
@@ -197,7 +197,7 @@ def test_a_joint_command_names_its_joints(bridge: Bridge) -> None:
 def test_what_the_server_refuses_or_does_not_send_back(bridge: Bridge) -> None:
     with connected(bridge.url, TWIST, timeout=300) as source:
         bridge.ask("refuse", "/cmd_vel", "not in this state")
-        assert source.write(vx=1.0, wz=0.5) == ["the server refuses it: not in this state"] * 2
+        assert source.write(vx=1.0, wz=0.5) == ["the server refuses the message: not in this state"] * 2
         bridge.ask("refuse", "/cmd_vel", "")
         bridge.freeze()
         try:

@@ -171,7 +171,7 @@ def test_a_rejoining_model_gets_the_last_values(instance: str) -> None:
     ("given", "reason"),
     [
         ({"failure": "no\n solution\x1b[2J"}, "model 'raw': no solution\\x1b[2J"),
-        ({"failure": ""}, "model 'raw': it gave no reason"),
+        ({"failure": ""}, "model 'raw': it failed without giving a reason"),
         ({"assignments": assigned(**{"axis/count": 70_000})}, "model 'raw': axis/count: "),
         ({"assignments": assigned(target=1.0)}, "target: it is not an output of drive"),
         ({"assignments": assigned(**{"axis/coumt": 1})}, "near: axis/count"),
