@@ -176,8 +176,8 @@ class Cell(Held, Protocol):
 
     :func:`shmio.attach` returns a cell on this host, :func:`shmio.connect` a remote one, by gRPC.
     The methods raise the errors of :mod:`shmio.errors`. Every method raises NotRunningError if the
-    instance has ended or cannot be reached, except ``sources`` and ``clock`` of a cell on this
-    host: these return the last state.
+    instance has ended or cannot be reached. Exceptions are ``sources`` and ``clock`` of a cell on
+    this host, which then return the last state.
     """
 
     @property

@@ -1,10 +1,11 @@
 """The status area of an image: a status code and a source time for each register.
 
 An image of a layout with :attr:`Layout.status_offset` ends in this area, so that rings, recordings
-and replays carry it like all other bytes. It holds two arrays in the order of the
-layout's registers: the OPC UA status codes (u32, OPC 10000-4, section 7.39), padded to 8 bytes, and
-the source times (i64, ns since 1970 UTC; 0: unknown, so that the time of the frame applies). They
-have the byte order of the layout.
+and replays carry it like all other bytes. It has two arrays in the order of the layout's registers,
+in the byte order of the layout:
+
+- the OPC UA status codes (u32, OPC 10000-4, section 7.39), padded to 8 bytes;
+- the source times (i64, ns since 1970 UTC; 0: unknown, so that the time of the frame applies).
 """
 
 from __future__ import annotations

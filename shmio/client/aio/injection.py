@@ -1,4 +1,4 @@
-"""Injections of a program: shadows, to which it gives values, and declared injections."""
+"""A program's injections: shadows, whose values the program gives, and declared injections."""
 
 from __future__ import annotations
 

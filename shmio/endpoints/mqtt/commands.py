@@ -218,7 +218,7 @@ class _Reply:
 
 
 def _value(payload: bytes, register: Register, *, json: bool) -> Any:
-    """Decode a payload: a plain text, or as JSON a value or an object with a value.
+    """Decode a payload: a plain text, or with ``json`` a JSON value or an object with ``value``.
 
     Raises:
         ValueRangeError: The payload is not a value of the register.

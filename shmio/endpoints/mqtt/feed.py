@@ -135,12 +135,12 @@ class Feed:
         return False
 
     def step(self) -> None:
-        """Publish the changes of the present step, if steps drive this block."""
+        """Publish the changes of the present step, if this block publishes only by steps."""
         if self.step_driven and (frame := self.follower.newest()):
             self.take(frame)
 
     def take(self, frame: Frame) -> None:
-        """Make a frame the current one, and mark the topics that it changes."""
+        """Make a frame the current frame, and mark the topics that it changes."""
         old = self.follower.frame
         change = self.follower.take(frame)
         if old is None or change in (QualityChange.RECOVERED, QualityChange.BAD):

@@ -83,7 +83,7 @@ class TopicRules:
         return next((found for found in self._rules if found[0].matches(full)), (None, DEFAULT))
 
     def frames(self, source: str) -> MqttTopic | None:
-        """Return the rule for a source's whole frames, or None if these are not published."""
+        """Return the rule for a source's whole frames, or None if they are not published."""
         rule = self._frames.get(source)
         return rule if rule and rule.publish else None
 
@@ -111,7 +111,7 @@ class Channel(Protocol):
     def message(self, *, late: bool = False) -> Message:
         """Make the message from the current state.
 
-        If ``late`` is True, it is not sent now, but when there is a broker again.
+        If ``late`` is True, the message is sent later, when there is a broker again.
         """
 
 
@@ -173,7 +173,7 @@ class RegisterChannel(_RuledChannel):
         return None if area is None else area.quality(image, area.index(self._register))
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message. If there is no good value, a text is empty, and JSON has the reason."""
+        """Make the message. Without a good value, a text is empty, and JSON has the reason."""
         return self._message(self._json(late=late) if self.json else self._text(), late=late)
 
     def _text(self) -> bytes:

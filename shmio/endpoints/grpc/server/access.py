@@ -240,10 +240,10 @@ def holder_of(
 
 
 def client_of(peer: str, token: str | None) -> str:
-    """Return a name for the client, which determines what counts towards its limits.
+    """Return the name under which a client's calls count towards its limits.
 
-    It is the client's token. A client without a token is known by its host, and a client on this
-    host by its connection.
+    It is the name of the client's token. Without a token, it is the client's host, or for a client
+    on this host its connection.
     """
     if token is not None:
         return f"token {token}"

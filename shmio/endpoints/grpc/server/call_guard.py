@@ -214,7 +214,7 @@ class CallGuard(grpc.aio.ServerInterceptor):
     async def intercept_service(
         self, continuation: Callable[[Any], Awaitable[Handler]], handler_call_details: Any
     ) -> Handler:
-        """Return the call's handler, preceded by the checks."""
+        """Return a handler that checks a call, and then runs the call's own handler."""
         method: str = handler_call_details.method
         if method not in self._handlers:
             self._handlers[method] = self._guarded(method, await continuation(handler_call_details))
@@ -384,6 +384,6 @@ class CoreServer(AioServer):  # type: ignore[misc]
 
 
 def _kept(request: asyncio.Task[Any]) -> asyncio.Future[Any]:
-    """Shield the wait for a call from cancellation, because the core writes to its memory."""
+    """Shield a request for a call from cancellation, because the core writes to its memory."""
     request.add_done_callback(lambda done: done.cancelled() or done.exception())  # else asyncio may log the error
     return asyncio.shield(request)

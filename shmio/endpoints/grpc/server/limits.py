@@ -12,9 +12,9 @@ from typing import Any, Final, TypeVar
 # ---- file descriptors ------------------------------------------------------------------------------------
 
 OWN: Final = 256
-"""File descriptors that are reserved for everything but connections; more than enough."""
+"""Number of file descriptors that are reserved for everything but connections. It is ample."""
 EACH: Final = 1
-"""File descriptors that are reserved for each connection."""
+"""Number of file descriptors that are reserved for each connection."""
 FEW: Final = 64
 """The endpoint reports a shortage if it can serve fewer connections than this."""
 

@@ -174,7 +174,7 @@ class Injection(InjectionFollower):
         return self._laid.done() and self.feed.commands.ready(values)
 
     async def give(self, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None) -> None:
-        """Send values as those of this injection.
+        """Send values to the source as the given values of this injection.
 
         Args:
             values: Values by register path.

@@ -44,7 +44,7 @@ class StepsCall:
     async def messages(self, requests: AsyncIterator[wire.StepsRequest]) -> AsyncIterator[bytes]:
         """Yield serialised StepsResponses.
 
-        The answers to all steps that are made while one response is being sent share the next
+        While a response is being sent, the answers to further steps are collected for the next
         response.
 
         Raises:

@@ -325,7 +325,7 @@ class EventCalls:
         self._open: set[EventsCall] = set()
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Return the handler of the call, by name. The call serialises its messages itself."""
+        """Return the handler of the call, by name. The handler yields serialised messages."""
         return {"Events": grpc.unary_stream_rpc_method_handler(self.events, wire.EventsRequest.FromString)}
 
     async def events(self, request: wire.EventsRequest, context: Context) -> AsyncIterator[bytes]:

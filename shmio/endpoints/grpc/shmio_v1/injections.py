@@ -128,7 +128,7 @@ class ByteRanges:
         )
 
     def differing(self, image: bytes, before: bytes | None) -> bytes:
-        """Return each range from its first to its last changed byte, as fields of an ``Update``.
+        """Return, as fields of an ``Update``, each range from its first to its last changed byte.
 
         If ``before`` is None, all bytes count as changed.
         """
@@ -137,7 +137,7 @@ class ByteRanges:
         return b"".join(self._pieces(new, changed))
 
     def touched(self, image: bytes, mask: bytes) -> bytes:
-        """Return each range from its first to its last byte in a mask, as fields of an ``Update``."""
+        """Return, as fields of an ``Update``, each range from its first to its last masked byte."""
         return b"".join(self._pieces(np.frombuffer(image, np.uint8), np.frombuffer(mask, np.uint8)))
 
     def _pieces(self, image: Array, changed: Array) -> Iterator[bytes]:

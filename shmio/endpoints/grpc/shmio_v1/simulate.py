@@ -33,7 +33,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 
 class OutputEncoder:
-    """Encodes the outputs of a model into an image of the block. It caches lookups."""
+    """Encodes the outputs of a model into an image of the block. It caches the lookups."""
 
     def __init__(self, selection: Selection) -> None:
         self._selection = selection
@@ -336,7 +336,10 @@ class SimulateCall:
         return ask if ask.until_ns > time.monotonic_ns() else None
 
     def _work(self, ask: ModelRequest) -> bytes:
-        """Return a serialised ``Do``. The first has all inputs; the others have changed inputs."""
+        """Return a serialised ``Do``, which requests a step.
+
+        The first ``Do`` has all inputs, and the later ones have the changed inputs.
+        """
         before, now = self._given, self._inputs.columns.decode(ask.commanded)
         self._given = now
         work = wire.Do(

@@ -272,7 +272,7 @@ class SubscribeCall:
     def give_up(self) -> None:
         """End a call that is too slow for the steps.
 
-        The call stops following its blocks now. The stream ends when the client reads.
+        The call stops following its blocks now. The stream ends when the client reads again.
         """
         self.late = True
         self.close()
@@ -460,7 +460,7 @@ class SubscribeCalls:
         return self._ended_updates + sum(subscription.updates for subscription in self._open)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """Return the handler of the call, by name. The call serialises its messages itself."""
+        """Return the handler of the call, by name. The handler yields serialised messages."""
         return {"Subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, wire.SubscribeRequest.FromString)}
 
     async def subscribe(self, request: wire.SubscribeRequest, context: Context) -> AsyncIterator[bytes]:

@@ -37,7 +37,7 @@ class LossMonitor:
         self._until_s = 0.0
 
     def offer(self, now_s: float) -> None:
-        """Count one value offered to the client. At the end of a period, decide again."""
+        """Count one value offered to the client. At the end of a period, update ``behind``."""
         if now_s >= self._until_s:
             self.behind = not self.behind and PART * self._lost > self._offered
             self._offered = self._lost = 0

@@ -269,7 +269,7 @@ class Feed:
             self._settle()
 
     def _settle(self) -> None:
-        """Deliver the current value, if it is good, to the listeners that wait for one."""
+        """Deliver the current value, if it is good, to the listeners that wait for a value."""
         if self._held:
             if self._shown is not None:
                 for listener, channel in list(self._owed.items()):
@@ -287,14 +287,14 @@ class Feed:
         self._owed.clear()
 
     def _turn_bad(self, frame: int) -> None:
-        """Drop listeners' values from before ``frame``, because the quality is bad from it on."""
+        """Drop listeners' values older than ``frame``, because its quality is bad."""
         self._shown = None
         for channel in self._channels.values():
             self._lose(channel, frame)
         self._tell(good=False)
 
     def _lose(self, channel: _Channel, frame: int) -> None:
-        """Drop values from before ``frame`` in a channel's streams. They are no longer valid."""
+        """Drop a channel's waiting values older than ``frame``. They are no longer valid."""
         for listener in channel.listeners:
             if listener.since < frame:
                 listener.lose()

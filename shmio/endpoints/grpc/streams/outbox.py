@@ -306,7 +306,7 @@ Lane = StateLane | EventLane
 
 
 class OpenStreams:
-    """Number of open streams of all services together. Use it only in the event loop's thread."""
+    """Counts the open streams of all services together. Use it only in the event loop's thread."""
 
     def __init__(self) -> None:
         self.changed: Callable[[], object] = lambda: None

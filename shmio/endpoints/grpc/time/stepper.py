@@ -83,7 +83,7 @@ class StepDriver:
 
 
 def _brief(wait: StepWait, rest_ns: int) -> bool:
-    """Block the event loop until the block has a new frame or event, for at most ``rest_ns``.
+    """Halt the event loop until the source's block has a new frame or event, at most ``rest_ns``.
 
     Returns:
         True if the block had a new frame or event.
