@@ -1,4 +1,4 @@
-"""Derives declared injections that repeat the injections of a recording."""
+"""Derives, from a recording, declared injections that repeat the recorded injections."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NS = 1e9
 
 @dataclass(slots=True)
 class _HeldValue:
-    """A value that a client has set with an injection, and its time."""
+    """A value that a client gave to an injection, and the time at which it did so."""
 
     place: Place
     since_ns: int
@@ -26,21 +26,21 @@ class _HeldValue:
 
 @dataclass(slots=True)
 class _RecordedInjection:
-    """An injection in the recording; ``place`` is its number among those of its source."""
+    """An injection in the recording. ``place`` is its number among the injections of its source."""
 
     place: int
     name: str
     since_ns: int
     declaration: Declaration | None
-    """The declaration; None if a client has set the values."""
+    """The declaration; None if a client gave the values."""
     priority: int = 0
     held: dict[str, _HeldValue] = field(default_factory=dict)
-    """The last value that the client has set, by path."""
+    """The last value that the client gave to each register, by path."""
 
 
 @dataclass(slots=True)
 class Derived:
-    """Declarations that repeat the injections of a recording, for each source in order.
+    """Declarations that repeat the injections of a recording, in order of the sources.
 
     ``left_out`` has a message for each injection that cannot be repeated.
     """
@@ -50,11 +50,14 @@ class Derived:
 
     @property
     def begin_s(self) -> float:
-        """The earliest start of the declarations in s; 0 if there are none or one has no start."""
+        """The earliest start of all declarations in s.
+
+        0: there are no declarations, or one has no start.
+        """
         return min((one.start_s or 0.0 for one in self.declarations), default=0.0)
 
     def shifted(self, by_s: float) -> list[Declaration]:
-        """Return the declarations with all times ``by_s`` earlier."""
+        """Return the declarations with all starts and ends moved ``by_s`` seconds earlier."""
         return [
             msgspec.structs.replace(
                 one,
@@ -66,12 +69,12 @@ class Derived:
 
 
 def derive(dump: Dump) -> Derived:
-    """Derive declarations that repeat the injections of a recording at the same instance times.
+    """Derive declarations that repeat a recording's injections at the same times of the clock.
 
-    A declared injection keeps its declaration and seed, limited to the time in which it existed.
-    Each value that a client has set over ``/out`` becomes a ``set``, until the next value. A
-    client's injection over ``/in`` cannot be declared, because its values depend on the writes of
-    other clients.
+    A declared injection keeps its declaration and its seed, but lasts no longer than it did in the
+    recording. Each value that a client gave over ``/out`` becomes a ``set``, which lasts until the
+    client's next value. A client's injection over ``/in`` cannot be declared, because its values
+    depend on the writes of other clients.
     """
     found = Derived()
     for source in dump.sources:
@@ -107,7 +110,7 @@ class _Source:
         declaration = None
         if event.writer == NO_WRITER:
             self._found.left_out.append(
-                f"{event.text}: no client has added it, but the configuration or a replayed recording"
+                f"{event.text}: no client created this injection, but the configuration or a replayed recording"
             )
             return
         if "operation" in how:
@@ -118,7 +121,7 @@ class _Source:
                 return
         elif explained.direction == "in":
             self._found.left_out.append(
-                f"{event.text or event.injection}: a client has set its values over /in, which depended on other writes"
+                f"{event.text or event.injection}: a client gave its values over /in, and they depended on other writes"
             )
             return
         priority = how.get("priority", 0)
@@ -132,7 +135,9 @@ class _Source:
         if laid is None:
             if event.injection not in self._unknown:
                 self._unknown.add(event.injection)
-                self._found.left_out.append(f"{event.text or event.injection}: it was added before the recording began")
+                self._found.left_out.append(
+                    f"{event.text or event.injection}: it was created before the recording began"
+                )
             return
         for place in explained.places:
             before = laid.held.get(place.path)
@@ -151,7 +156,7 @@ class _Source:
             self._declare(laid, laid.declaration, None if event.text == "over" else event.clock_ns)
 
     def end(self) -> None:
-        """Add the declarations of the source; injections that are still there get no end time."""
+        """Add the declarations of the source. Injections that exist at the end get no end time."""
         for laid in self._laid.values():
             for held in laid.held.values():
                 self._set(laid, held, None)
@@ -174,7 +179,8 @@ class _Source:
     ) -> None:
         """Add a declaration, limited to a range of time.
 
-        1 ns is added to the times, because readers see a change from the next cycle on.
+        The method adds 1 ns to both times, because readers see a change only from the next cycle
+        on.
         """
         since_s = (max(0, laid.since_ns if since_ns is None else since_ns) + 1) / NS
         if since_s > max(one.start_s or 0.0, 1 / NS):
@@ -186,9 +192,10 @@ class _Source:
 
 
 def _named(found: Derived) -> Iterator[Declaration]:
-    """Yield the declarations with unique names.
+    """Yield the declarations, with unique names.
 
-    A new name changes the random values of an injection, which is noted in ``left_out``.
+    A new name changes the random values of an injection. In that case, add a message to
+    ``left_out``.
     """
     seen: dict[str, int] = {}
     for one in found.declarations:
@@ -199,11 +206,12 @@ def _named(found: Derived) -> Iterator[Declaration]:
         name = f"{one.name}-{count}"
         if one.seed is not None and one.operation != "set":
             found.left_out.append(
-                f"{name}: renamed, because {one.name} exists already; its random values depend on the name and change"
+                f"{name}: this injection was renamed, because {one.name} exists already; "
+                "its random values change, because they depend on the name"
             )
         yield msgspec.structs.replace(one, name=name)
 
 
 def _round(seconds: float) -> float:
-    """Return the time, rounded to the 1 ns resolution of recorded times."""
+    """Round a time to 1 ns, the resolution of recorded times."""
     return round(seconds, 9)

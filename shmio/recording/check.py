@@ -1,4 +1,4 @@
-"""Verifies a recording completely against its format (docs/reference/dump-format.md)."""
+"""Verifies that all of a recording conforms to its format (docs/reference/dump-format.md)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
 
 MAX_TOLD: Final = 1000
-"""Largest number of damaged places and problems that are listed; all are counted."""
+"""Largest number of damaged places, and of problems, that the result lists. It counts all."""
 
 
 @dataclass(slots=True)
@@ -26,9 +26,9 @@ class Findings:
     """Number of intact chunks."""
     messages: int = 0
     damage: list[Damage] = field(default_factory=list)
-    """The first places that cannot be read."""
+    """The first damaged places, which cannot be read."""
     problems: list[str] = field(default_factory=list)
-    """The first places that can be read, but are inconsistent."""
+    """Messages about the first places that can be read, but are inconsistent."""
     count: int = 0
     """Total number of damaged places and problems."""
 
@@ -39,13 +39,13 @@ class Findings:
 
 
 def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findings:
-    """Verify all CRCs and messages, and that each missing frame or event is in a gap.
+    """Verify all CRCs and messages, and that a gap is recorded for each missing frame or event.
 
-    If the file was not closed, the existing part is checked.
+    If the file was not closed, check the part that exists.
 
     Args:
         reader: Reader of the file.
-        at: Called with the present byte offset, as progress.
+        at: Called with the byte offset that the check has reached, to report progress.
 
     Raises:
         RecordingError: The file is not a recording of shmio.
@@ -65,7 +65,10 @@ class _Check:
         self._log = DamageLog(self._damaged)
         self._numbers = _Numbers(self._problem)
         self._chunk: Record | None = None
-        """The last chunk; its messages are compared with the indexes that follow it."""
+        """The last chunk.
+
+        The check compares its messages with the indexes that follow the chunk.
+        """
         self._counts: dict[int, Count] = {}
         self._indexes: dict[int, Count] = {}
 
@@ -158,7 +161,7 @@ class _Check:
     # ---- the checksum of all data ------------------------------------------------------------------------------------
 
     def _check_data(self, record: Record) -> None:
-        """Check the CRC of all data, which also covers metadata, times and indexes."""
+        """Check the CRC of the file's data, which covers chunks, metadata, times and indexes."""
         self._log.end()
         (crc,) = U32.unpack(self._records.read(record.at, U32.size))
         if crc and self._found.whole and self._records.crc(0, record.start) != crc:
@@ -166,7 +169,7 @@ class _Check:
 
 
 class _Numbers:
-    """Checks that each missing number of a block's frames and events is in a gap."""
+    """Checks that there is a gap for each missing number of a block's frames and events."""
 
     def __init__(self, problem: Callable[[str], None]) -> None:
         self._problem = problem
@@ -185,13 +188,13 @@ class _Numbers:
         self._go_on(key, number, number)
 
     def gap(self, gap: Gap) -> None:
-        """Check the numbers in the next gap."""
+        """Check the range of numbers in the next gap."""
         self._go_on((gap.source, gap.block, gap.what), gap.first, gap.last)
 
     def _go_on(self, key: tuple[str, int, str], first: int, last: int) -> None:
         if key not in self._last:
             if len(self._last) >= MAX_BLOCKS:
-                raise RecordingError(f"messages and gaps of more than {MAX_BLOCKS} blocks")
+                raise RecordingError(f"the file has messages and gaps of more than {MAX_BLOCKS} blocks")
             self._first[key] = first
         elif first != self._last[key] + 1:
             self._broken(key, self._last[key], first)

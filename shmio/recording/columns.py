@@ -32,16 +32,17 @@ FIELDS: Final = ("number", "cycle", "source_ns", "quality", "provenance")
 OF_FRAMES: Final = frozenset({"time", "source_time", "number", "cycle", "quality", "provenance"})
 """The names of table columns that do not belong to registers."""
 DECODED_BYTES: Final = 1 << 20
-"""Number of bytes of frames to decode at once."""
+"""Approximate number of bytes of frames to decode at once."""
 
 
 @dataclass(frozen=True)
 class Columns(Mapping[str, Array]):
     """The values of registers of one source in n frames, as a mapping.
 
-    The keys are the paths without the source; the values are arrays of shape (n, …). If the source
-    gave its registers statuses, ``PATH#status`` has the OPC UA status codes of a register, and
-    ``PATH#source_ns`` its times (UTC, ns since 1970; 0: that of the frame).
+    The keys are the paths without the source. The values are arrays of shape (n, …). If the source
+    gave its registers statuses, the key ``PATH#status`` has the OPC UA status codes of a register,
+    and ``PATH#source_ns`` has the register's times (UTC, ns since 1970; 0: the source time of the
+    frame).
 
     Attributes:
         source: Name of the source.
@@ -49,8 +50,8 @@ class Columns(Mapping[str, Array]):
         time_ns: Log times, UTC, in ns, shape (n,).
         number: Numbers of the frames, shape (n,).
         cycle: Cycles of the source's schedule, shape (n,).
-        source_ns: Times at which the source had the values, in ns, shape (n,); 0 while it had none.
-            The values are zeros there.
+        source_ns: Times at which the source had the values, in ns, shape (n,). In frames before the
+            source had any value, the time and all values are 0.
         quality: 0 bad, 1 uncertain, 2 good; shape (n,).
         provenance: 0 live, 1 simulated, 2 replayed, 3 injected; shape (n,).
         values_by_path: The values, by path without the source.
@@ -82,7 +83,7 @@ class Columns(Mapping[str, Array]):
         The columns are time (UTC, ns), source time, number, cycle, quality, provenance, and the
         registers with native types: arrays are lists of fixed size, POINTER and ANY are bytes. A
         value is null if the bytes are not valid for the type, or if the source had no image yet. If
-        a register has the name of another column, its source is put before it.
+        a register has the name of another column, the name of its column begins with the source.
 
         Raises:
             MissingLibraryError: pyarrow is not installed.
@@ -135,14 +136,14 @@ class Columns(Mapping[str, Array]):
 
 
 def heading(source: str, path: str, taken: Collection[str] = OF_FRAMES) -> str:
-    """Return a register's column name: its path, or source and path if the path is in ``taken``."""
+    """Return a register's column name: its path, or source/path if the path is in ``taken``."""
     return f"{source}/{path}" if path in taken else path
 
 
 def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:
     """Yield a column (path, values) for a register, or for each element of an array.
 
-    Values of POINTER and ANY are converted to hex digits.
+    Values of POINTER and ANY become hexadecimal digits.
     """
     if values.dtype.kind == "V":
         texts = [bytes(value).hex() for value in values.reshape(-1)]
@@ -157,7 +158,7 @@ def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:
 
 
 class Collector:
-    """Collects batches of frames into columns."""
+    """Collects batches of frames, and converts them to columns."""
 
     def __init__(self, source: str) -> None:
         self._source = source
@@ -175,7 +176,7 @@ class Collector:
         return self._codec is not None
 
     def begin(self, block: DumpBlock, registers: Sequence[Register]) -> None:
-        """Set the registers of the block whose frames follow.
+        """Set the registers of the block from which the next frames come.
 
         Raises:
             RecordingError: The types of the registers differ from those in the previous block.
@@ -217,7 +218,7 @@ class Collector:
 
     @property
     def bytes(self) -> int:
-        """Approximate number of bytes of the frames added since :meth:`columns`."""
+        """Approximate number of bytes of the frames added since :meth:`columns` was called."""
         return self._waiting_bytes + sum(some.nbytes for some in self._decoded)
 
     def columns(self) -> Columns:
@@ -235,7 +236,7 @@ class Collector:
 
 @lru_cache(maxsize=64)
 def record_codec(registers: tuple[Register, ...], size: int, byte_order: ByteOrder) -> FrameCodec:
-    """Return a codec for registers in the records of a batch.
+    """Return a codec that decodes registers from the records of a batch.
 
     Each record is a header, followed by an image of ``size`` bytes.
     """
@@ -249,7 +250,7 @@ def _categories(arrow: Any, codes: npt.NDArray[np.uint8], names: tuple[str, ...]
 
 
 def _lists(arrow: Any, values: npt.NDArray[Any], unknown: npt.NDArray[np.bool_]) -> Any:
-    """Return values of shape (n, …) as a pyarrow array of n values or nested lists."""
+    """Convert values of shape (n, …) to a pyarrow array of n values or nested lists."""
     mask = np.repeat(unknown, values[0].size) if len(values) and values.ndim > 1 else unknown
     plain = np.ascontiguousarray(values).reshape(-1)
     if plain.dtype.kind in "mM":

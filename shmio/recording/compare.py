@@ -21,14 +21,14 @@ from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.playhead import OWN_WORDS
 
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
-"""The fields of an event that do not depend on the run."""
+"""The fields of an event that are equal if the same happens in two runs."""
 MAX_EVENTS: Final = 4096
-"""Largest number of events with one key in memory.
+"""Largest number of events that are held in memory to match those of one cycle.
 
 While time is paused, one cycle may have any number of events.
 """
 MAX_SHIFT: Final = 64
-"""Largest number of frames with the first common key that one of two recordings may lack."""
+"""Largest number of frames of the first common cycle that one recording may lack."""
 
 T = TypeVar("T", Frame, Event)
 _Pair = tuple[Entry[T] | None, Entry[T] | None]
@@ -39,8 +39,8 @@ _Groups = Iterator[tuple[int, Iterable[Entry[T]]]]
 class RegisterDifference:
     """A register whose values differ in ``count`` frames.
 
-    ``first`` has the log times and ``values`` the values in the first pair of frames that differ.
-    ``largest`` is the largest difference, if the values are numbers.
+    ``first`` and ``values`` have the log times and the values of both frames in the first pair that
+    differs. ``largest`` is the largest difference, if the values are numbers.
     """
 
     count: int
@@ -53,7 +53,8 @@ class RegisterDifference:
 class Difference:
     """The first pair of frames or events that differ.
 
-    It has the log time and the number in each recording; None if one lacks the frame or event.
+    ``times_ns`` and ``numbers`` have the log time and the number in each recording. None: this
+    recording lacks the frame or event.
     """
 
     times_ns: tuple[int | None, int | None]
@@ -63,7 +64,7 @@ class Difference:
 
 @dataclass(slots=True)
 class Side:
-    """The result of comparing either the frames or the events of one source."""
+    """The result of a comparison of the frames, or of the events, of one source."""
 
     compared: int = 0
     differing: int = 0
@@ -78,10 +79,10 @@ class Side:
 
 
 class Timing:
-    """Statistics of the differences between the times of matching frames.
+    """Statistics of the time differences between matching frames.
 
-    Times are relative to the first frame of each recording. Percentiles are accurate to 5 %. Memory
-    use is small for any number of frames.
+    Times are relative to the first frame of each recording. Percentiles are accurate to 5 %. The
+    memory use does not grow with the number of frames.
     """
 
     def __init__(self) -> None:
@@ -119,7 +120,7 @@ class SourceDifference:
     events: Side = field(default_factory=Side)
     registers: dict[str, RegisterDifference] = field(default_factory=dict)
     fields: dict[str, int] = field(default_factory=dict)
-    """Number of frames that differ, by field (quality, reason, source time)."""
+    """Number of frames that differ in a field, by field: quality, reason, source time."""
     missing: list[str] = field(default_factory=list)
     """Registers that only one recording has."""
     timing: Timing = field(default_factory=Timing)
@@ -133,8 +134,8 @@ class SourceDifference:
 IGNORABLE: Final = ("times", "cycle", "reason", "events", "ends")
 """The items that a comparison can ignore.
 
-``ends`` are the frames and events of only one recording that come before the first one, or after
-the last one, that both recordings have.
+``ends`` stands for the frames and events of only one recording that come before the first, or after
+the last, frame or event of both recordings.
 """
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
 
@@ -150,7 +151,7 @@ class Comparison:
         ignore: The items of :data:`IGNORABLE` to ignore.
         only: Paths of the registers to compare, as for :meth:`Dump.select`; empty for all.
         tolerance: Absolute difference up to which REAL and LREAL values count as equal.
-        relative: Relative difference, to the larger value, up to which they count as equal.
+        relative: Difference in relation to the larger value up to which they count as equal.
     """
 
     ignore: Collection[str] = ()
@@ -168,8 +169,8 @@ def compare(
 ) -> Iterator[SourceDifference]:
     """Compare two recordings source by source.
 
-    Frames are matched by cycle. If cycles are ignored, they are matched by source time; if times
-    are ignored, too, by their order.
+    Frames with the same cycle match. If cycles are ignored, frames with the same source time match.
+    If times are also ignored, the frames match in their order.
 
     Args:
         first: The first recording.
@@ -198,7 +199,7 @@ def compare(
 
 
 def _chosen(dump: Dump, how: Comparison) -> Mapping[DumpBlock, Sequence[Register]]:
-    """Return the registers to compare, with their statuses if the source gave them any."""
+    """Return the registers to compare in each block, and their statuses if the source gave any."""
     registers = dump.select(how.only) if how.only else {block: block.layout.registers for block in dump.blocks}
     return {block: (*some, *status_registers(block.layout, some, times=False)) for block, some in registers.items()}
 
@@ -264,10 +265,12 @@ class _Source:
         self._alone(side, self._of_end(since, inside))
 
     def _of_end(self, since: _Alone, inside: _Alone) -> _Alone:
-        """Return the entries that count at an end of the recordings.
+        """Return the unmatched entries at one end of the recordings that count as differences.
 
-        ``since`` are all entries there that only one recording has; ``inside`` are those between
-        the first and the last common frame, which count if ends are ignored.
+        Args:
+            since: All entries at this end that only one recording has.
+            inside: Those of them that lie between the first and the last common frame. Only these
+                count if ends are ignored.
         """
         return inside if "ends" in self._how.ignore else since
 
@@ -336,7 +339,7 @@ class _Source:
 
 
 class _Alone:
-    """Counts the entries that only one recording has, and stores the first of them."""
+    """Counts the entries that only one recording has, and stores the first such entry."""
 
     def __init__(self) -> None:
         self.counts = [0, 0]
@@ -348,7 +351,7 @@ class _Alone:
 
 
 class _Common:
-    """The span in each recording from the first to the last entry that both have."""
+    """The range, in each recording, from the first to the last entry that both recordings have."""
 
     def __init__(self) -> None:
         self._ends: list[tuple[_Position, _Position]] = []
@@ -368,7 +371,7 @@ class _Common:
         )
 
     def has(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
-        """Return whether an entry that only one recording has is within the span."""
+        """Return whether an entry that only one recording has lies within this range."""
         return bool(self._ends) and all(
             entry is None or first <= _position(entry) <= last
             for entry, (first, last) in zip((one, other), self._ends, strict=True)
@@ -379,13 +382,13 @@ _Position = tuple[int, int, bool]
 
 
 def _position(entry: Entry[Any]) -> _Position:
-    """Return the position of an entry by time and number; times are equal while time is paused."""
+    """Return the position of an entry by time and number. Times are equal while time is paused."""
     item = entry.item
     return (entry.time_ns, item.frame, True) if isinstance(item, Event) else (entry.time_ns, item.number, False)
 
 
 class _Registers:
-    """The registers that two blocks have in common."""
+    """Compares the registers that two blocks have in common."""
 
     def __init__(self, blocks: tuple[DumpBlock, DumpBlock], how: Comparison, chosen: _Chosen) -> None:
         first, second = blocks
@@ -403,8 +406,8 @@ class _Registers:
     def differing(self, one: Frame, other: Frame) -> Iterator[tuple[str, tuple[Value, Value]]]:
         """Yield the path and both values of each register or array element that differs.
 
-        The values are those that readers saw. If these are all equal, they are the values that the
-        source delivered, without injections.
+        The values are those that readers saw. For registers in which these are equal, compare the
+        values that the source delivered, without injections.
         """
         seen = set()
         for path, values in self._images(one.image, other.image):
@@ -444,8 +447,8 @@ class _Places:
     ) -> None:
         """Create the comparison for pairs of registers.
 
-        Set ``alike`` if both layouts have them at the same offsets. Then bytes are compared first,
-        which is faster.
+        Set ``alike`` if both layouts have these registers at the same offsets. The comparison is
+        then faster, because it compares bytes first.
         """
         self._pairs = pairs
         self._how = how
@@ -461,7 +464,7 @@ class _Places:
         return _Places(pairs, self._layouts, self._how, alike=self._scan is not None)
 
     def differing(self, one: bytes, other: bytes) -> Iterator[tuple[tuple[Register, Register], tuple[Value, Value]]]:
-        """Yield the pairs of registers that differ in two images, with their values."""
+        """Yield each pair of registers that differs in two images, with both values."""
         if self._scan is not None and one == other:
             return
         places = range(len(self._pairs)) if self._scan is None else self._scan.changed(one, other)
@@ -492,7 +495,7 @@ def _kind(register: Register) -> tuple[str, object]:
 
 
 def _frames(dump: Dump, source: str) -> Iterator[Entry[Frame]]:
-    """Yield the frames of the source, without the bad frames that a replay has added."""
+    """Yield the frames of a source, except the bad frames that a replay has added."""
     if source in dump.sources:
         for entry in dump.frames(source):
             if entry.item.provenance is not Provenance.REPLAYED or not entry.item.reason.startswith(OWN_WORDS):
@@ -500,7 +503,7 @@ def _frames(dump: Dump, source: str) -> Iterator[Entry[Frame]]:
 
 
 def _events(dump: Dump, source: str) -> Iterator[Entry[Event]]:
-    """Yield the events of the source, without those about its process and those of a replay."""
+    """Yield the events of a source, except events about its process or about a replay."""
     if source in dump.sources:
         for entry in dump.events(source):
             if entry.item.kind not in _OF_PROCESSES and not _is_replays(entry.item):
@@ -526,10 +529,12 @@ def _joined(
     second: _Groups[T],
     align: Callable[[Iterable[Entry[T]], Iterable[Entry[T]]], Iterable[_Pair[T]]],
 ) -> Iterator[_Pair[T]]:
-    """Yield pairs of matching entries; an entry that one recording lacks is None.
+    """Yield pairs of matching entries.
 
-    The keys of both recordings must ascend. ``align`` matches the entries of two groups with the
-    same key.
+    If one recording lacks an entry, its place in the pair is None.
+
+    The keys of both recordings must ascend. ``align`` matches the entries of two groups that have
+    the same key.
     """
     one, other = next(first, None), next(second, None)
     while one is not None or other is not None:
@@ -545,17 +550,17 @@ def _joined(
 
 
 class _InOrder:
-    """Pairs the frames of two groups with the same key in their order.
+    """Pairs the frames of two groups, which have the same key, in their order.
 
-    If ``shifted`` is True, one recording may lack the first frames of the first common key. The
-    offset between the groups is then chosen so that most pairs have the same content.
+    If ``shifted`` is True, one recording may lack the first frames of its first group. For these
+    groups, an offset is chosen for which most pairs have the same content.
     """
 
     def __init__(self, *, shifted: bool) -> None:
         self._shifted = shifted
 
     def __call__(self, ones: Iterable[Entry[Frame]], others: Iterable[Entry[Frame]]) -> Iterator[_Pair[Frame]]:
-        """Yield the pairs; a frame that one group lacks is None."""
+        """Yield the pairs. If one group lacks a frame, its place in the pair is None."""
         if self._shifted:
             self._shifted = False
             first, second = iter(ones), iter(others)
@@ -568,10 +573,10 @@ class _InOrder:
 
 
 def _shift(ones: Sequence[Entry[Frame]], others: Sequence[Entry[Frame]]) -> int:
-    """Return the number of entries in ``ones`` before the first one of ``others``.
+    """Return the offset between two groups: how many entries of ``ones`` precede ``others``.
 
-    It is negative if ``others`` begin earlier. With this offset, most pairs have the same content.
-    Of several such offsets, the one with most pairs is returned, then the largest.
+    The offset is negative if ``others`` begin earlier. With this offset, most pairs have the same
+    content. Of several such offsets, return the offset with the most pairs, and then the largest.
     """
 
     def alike(shift: int) -> tuple[int, int, int]:
@@ -586,7 +591,7 @@ def _image(frame: Frame) -> Hashable:
 
 
 def _aligned(ones: Iterable[Entry[Event]], others: Iterable[Entry[Event]]) -> Iterator[_Pair[Event]]:
-    """Pair events with the same content in any order; then by kind and offset, then by kind."""
+    """Pair events in any order: first by equal content, then by kind and offset, then by kind."""
     left: list[Entry[Event]] = list(ones)
     right: list[Entry[Event]] = list(others)
     for alike in (_content, _place, _event_kind):

@@ -1,4 +1,4 @@
-"""Reads recordings from a program: :func:`shmio.open_dump`."""
+"""Lets programs read recordings: :func:`shmio.open_dump`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from shmio.segment.changed_registers import runs
 
 MAX_FILES: Final = 512
 OVERLAP_NS: Final = 1_000_000_000
-"""Longest time by which two consecutive files of a recorder overlap; more than a turn of it."""
+"""A file of a recorder begins at most this time before the end of the previous file."""
 
 Chosen = dict[DumpBlock, list[Register]]
 
@@ -45,23 +45,24 @@ Chosen = dict[DumpBlock, list[Register]]
 def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], damaged: Damaged | None = None) -> Dump:
     """Open a recording that consists of one file, or of several files of one run in any order.
 
-    Opening reads only the index of each file, or the headers of its chunks if it was not closed.
+    This reads only the index of each file; of a file that was not closed, the headers of its
+    chunks.
 
     Args:
         files: The path of a file, or the paths of several files.
-        damaged: Called with the file and the damage for each place that cannot be read; reading
-            continues after it. If None, such a place raises RecordingError when it is read.
+        damaged: Called with the file and the damage for each place that cannot be read. Reading
+            continues after this place. If None, reading such a place raises RecordingError.
 
     Returns:
         The recording, a context manager.
 
     Raises:
         OSError: A file cannot be opened.
-        RecordingError: A file is not a recording, or it comes from another run than the others.
+        RecordingError: A file is not a recording, or the files come from different runs.
     """
     paths = [Path(files)] if isinstance(files, str | os.PathLike) else [Path(file) for file in files]
     if not 0 < len(paths) <= MAX_FILES:
-        raise RecordingError(f"{len(paths)} files: a recording has 1 to {MAX_FILES}")
+        raise RecordingError(f"a recording has 1 to {MAX_FILES} files, but {len(paths)} are given")
     parts: list[Part] = []
     try:
         parts += (Part(path, damaged) for path in paths)
@@ -89,7 +90,7 @@ class Dump:
         self._parts = sorted(parts, key=lambda part: (part.begin_ns, part.end_ns))
         first = self._parts[0]
         self.about = first.reader.about
-        """The metadata about the instance in the first file (docs/reference/dump-format.md)."""
+        """The metadata about the instance, from the first file (docs/reference/dump-format.md)."""
         for part in self._parts[1:]:
             for key in ("instance", "epoch"):
                 if part.reader.about.get(key) != self.about.get(key):
@@ -108,7 +109,7 @@ class Dump:
         )
 
     def _has_twice(self) -> bool:
-        """Return whether a file may repeat frames or events of an earlier file."""
+        """Return whether any file may repeat frames or events of an earlier file."""
         come_to: dict[tuple[DumpBlock, str], int] = {}
         for part, within in zip(self._parts, self._contents, strict=True):
             for number, block in within.blocks.items():
@@ -148,7 +149,7 @@ class Dump:
     def gaps(self) -> list[Gap]:
         """The gaps in the files, at most 1000 of each file.
 
-        ``block`` of a gap is the number of the block in its file.
+        The field ``block`` of a gap is the number that the block has in the gap's file.
         """
         return [gap for part in self._parts for gap in part.found.gaps]
 
@@ -164,8 +165,8 @@ class Dump:
     ) -> Iterator[Entry[Item]]:
         """Iterate over all entries of some sources and of the instance, in recorded order.
 
-        An entry that is in two files is yielded once. Entries that are missing between two files
-        are yielded as a gap.
+        If two files have the same entry, the iterator yields it once. If entries are missing
+        between two files, it yields a gap.
 
         Args:
             sources: Names of the sources; None for all.
@@ -212,7 +213,7 @@ class Dump:
     def events(
         self, sources: str | Collection[str] | None = None, from_ns: int = 0, to_ns: int = MAX_NS
     ) -> Iterator[Entry[Event]]:
-        """Iterate over the events of some sources. Chunks without events are not read.
+        """Iterate over the events of some sources. Read only the chunks that have events.
 
         Args:
             sources: Names of the sources; None for all.
@@ -235,7 +236,7 @@ class Dump:
             time_ns: The time.
 
         Returns:
-            The frame; None if there is none.
+            The frame; None if the source has no frame at or before this time.
 
         Raises:
             PathError: There is no such source.
@@ -251,7 +252,7 @@ class Dump:
         return found
 
     def next_event(self, source: str | None = None, after_ns: int = -1) -> Entry[Event] | None:
-        """Return the first event after a time; None if there is none.
+        """Return the first event after a time; None if no event follows.
 
         Args:
             source: Name of the source; None for any source.
@@ -263,7 +264,7 @@ class Dump:
         return next(self.events(source, after_ns + 1), None)
 
     def next_change(self, path: str, after_ns: int = -1, to_ns: int = MAX_NS) -> Entry[Frame] | None:
-        """Return the first frame after a time in which readers saw a change of some registers.
+        """Return the first frame after a time in which readers saw that registers had changed.
 
         Args:
             path: A register, a structure or a pattern of one source.
@@ -294,7 +295,7 @@ class Dump:
     def batches(
         self, source: str | None = None, from_ns: int = 0, to_ns: int = MAX_NS, *, raw: bool = False
     ) -> Iterator[tuple[DumpBlock, Batch]]:
-        """Iterate over the frames of a source as arrays, chunk by chunk.
+        """Iterate over the frames of a source as arrays, one chunk at a time.
 
         Args:
             source: Name of the source; None if there is only one.
@@ -323,8 +324,8 @@ class Dump:
     ) -> Columns:
         """Read registers of one source as numpy arrays, with one value for each frame.
 
-        The arrays have the types of the registers. Frames of blocks without any of the registers
-        are skipped. The whole result is in memory.
+        The arrays have the types of the registers. The result has no frames of blocks that have
+        none of these registers. All of it is in memory.
 
         Args:
             paths: Registers, elements, structures or patterns.
@@ -351,7 +352,7 @@ class Dump:
         return collector.columns()
 
     def select(self, paths: Iterable[str]) -> dict[DumpBlock, list[Register]]:
-        """Return the registers that the paths name, by block. Paths are as in :meth:`columns`.
+        """Return the registers that paths name, by block. The paths are as for :meth:`columns`.
 
         Raises:
             PathError: There is no such register.
@@ -359,7 +360,7 @@ class Dump:
         return self._names.select(paths)
 
     def _channels(self, source: str, from_ns: int, to_ns: int) -> Iterator[tuple[Part, int, DumpBlock]]:
-        """Yield the channels that may have frames of a source in a range, in order.
+        """Yield the channels that may have frames of a source in a range of time, in order.
 
         Each item is a file, the number of the channel, and its block.
         """
@@ -413,10 +414,13 @@ class _Names:
         self.sources = tuple(dict.fromkeys(block.source for block in blocks))
 
     def one(self, name: str | None) -> str:
-        """Check and return the name of a source; for None, return that of the only source.
+        """Check and return the name of a source.
+
+        If ``name`` is None, return the name of the only source.
 
         Raises:
-            PathError: There is no such source, or several.
+            PathError: There is no such source; or ``name`` is None, and there is not exactly one
+                source.
         """
         if name is None and len(self.sources) == 1:
             return self.sources[0]
@@ -426,7 +430,9 @@ class _Names:
         return name
 
     def several(self, names: str | Collection[str] | None) -> set[str]:
-        """Check and return the names of sources; for None, return all names.
+        """Check and return the names of sources.
+
+        If ``names`` is None, return the names of all sources.
 
         Raises:
             PathError: There is no such source.
@@ -446,7 +452,7 @@ class _Names:
         for path in paths:
             topic = parse_topic(path, self.sources, default)
             if topic.direction == "in":
-                raise PathError(f"{path}: a recording has only outputs of a source; leave out /in")
+                raise PathError(f"{path}: a recording has only the outputs of a source; leave out /in")
             for block, registers in self._named(path, topic).items():
                 chosen.setdefault(block, {}).update((register.path, register) for register in registers)
         return {block: list(chosen[block].values()) for block in self._blocks if block in chosen}
@@ -460,11 +466,14 @@ class _Names:
         chosen = self.select([paths] if isinstance(paths, str) else paths)
         sources = sorted({block.source for block in chosen})
         if len(sources) != 1:
-            raise PathError(f"registers of {' and '.join(sources) or 'no source'}: name those of one source at a time")
+            raise PathError(
+                f"these registers belong to {' and '.join(sources) or 'no source'}: "
+                "choose registers of one source at a time"
+            )
         return chosen
 
     def _named(self, path: str, topic: Topic) -> Chosen:
-        """Return the registers of a topic by block, because blocks may have different layouts."""
+        """Return the registers that a topic names, by block: blocks may have different layouts."""
         found: Chosen = {}
         problem = PathError(f"{path}: no register of this recording has such a path")
         for block in self._blocks:
@@ -484,7 +493,7 @@ class _Names:
 class _FileJoin:
     """Joins the frames and events of several files by their numbers.
 
-    It removes duplicates, and finds the entries that are missing between two files.
+    It leaves out duplicates, and finds gaps between files.
     """
 
     def __init__(self) -> None:
@@ -492,9 +501,10 @@ class _FileJoin:
         """The file, number and log time of the last frame or event, by block and kind."""
 
     def next(self, file: Contents, block: DumpBlock, time_ns: int, item: Item) -> tuple[Gap | None, Item | None]:
-        """Return the gap before an item, or None; and the item, or None if it came before.
+        """Return the gap before an item, if any, and the item.
 
-        If the item is a gap that came before in part, only the rest of it is returned.
+        The item is None if an earlier file has it. If the item is a gap that an earlier file has in
+        part, only the remaining part of the gap is returned.
         """
         if isinstance(item, Gap):
             what, first, last = item.what, item.first, item.last
@@ -523,7 +533,7 @@ _Bytes = npt.NDArray[np.uint8]
 
 
 def _register_bytes(registers: Sequence[Register]) -> tuple[npt.NDArray[np.intp], _Bytes]:
-    """Return the offset and the mask of each byte of an image that belongs to the registers."""
+    """Return the offset and the mask of each byte of an image that has bits of these registers."""
     places: list[int] = []
     masks: list[int] = []
     for register in registers:
@@ -534,14 +544,14 @@ def _register_bytes(registers: Sequence[Register]) -> tuple[npt.NDArray[np.intp]
 
 
 class _Changes:
-    """Compares the bytes of each frame with those of the previous frame."""
+    """Compares each frame with the previous one, in the bytes of the chosen registers."""
 
     def __init__(self, chosen: Mapping[DumpBlock, Sequence[Register]]) -> None:
         self._bytes = {block: _register_bytes(registers) for block, registers in chosen.items()}
         self._before: dict[DumpBlock, npt.NDArray[Any]] = {}
 
     def begin(self, block: DumpBlock, image: bytes) -> None:
-        """Set the image with which the first frame of a block is compared."""
+        """Set the image with which to compare the first frame of a block."""
         if block in self._bytes:
             self._before[block] = self._of(block, np.frombuffer(image, np.uint8)[None, :])[0]
 
@@ -551,9 +561,9 @@ class _Changes:
         return found
 
     def first(self, block: DumpBlock, batch: Batch) -> int | None:
-        """Return the index of the first frame that differs from the one before; None if none does.
+        """Return the index of the first frame that differs from the frame before it, or None.
 
-        The first frame of a block counts as unchanged.
+        If :meth:`begin` was not called, the first frame of a block counts as unchanged.
         """
         if block not in self._bytes:
             return None

@@ -1,4 +1,4 @@
-"""Exports recordings for other programs: as tables (CSV, Parquet), or as MCAP with JSON."""
+"""Exports recordings for other programs: as tables (CSV, Parquet), or as MCAP files with JSON."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from shmio.segment.explain import Explainer, cells_of, kind_of, object_of
 from shmio.version import __version__
 
 PIECE_BYTES: Final = 8 << 20
-"""Approximate size of a piece in memory, in bytes."""
+"""Approximate size in bytes, in memory, of the pieces that :func:`pieces` yields."""
 GROUP_BYTES: Final = 16 << 20
-"""Approximate size of a row group, in bytes.
+"""Approximate size of a row group of a Parquet file, in bytes.
 
 Each row group takes some hundred bytes of memory per column until the file is closed.
 """
@@ -44,7 +44,10 @@ _EVENT_COLUMNS: Final = (
 _EVENT_BATCH: Final = 4096
 _FRAME: Final = "frame"
 _FRAME_FIELDS: Final = {"number": "integer", "cycle": "integer", "quality": "integer", "provenance": "integer"}
-"""The header fields of a frame with their JSON types; a message has them under the key _FRAME."""
+"""The header fields of a frame, with their JSON types.
+
+They are under the key _FRAME of a message.
+"""
 _JSON_TYPES: Final = {"b": "boolean", "i": "integer", "u": "integer", "f": "number", "m": "integer"}
 _EVENT_TYPES: Final = {
     "kind": "string", "text": "string", "quality": "string", "number": "integer", "frame": "integer",
@@ -63,7 +66,7 @@ def pieces(
     *,
     raw: bool = False,
 ) -> Iterator[tuple[DumpBlock, Columns]]:
-    """Yield the values of chosen registers of one source in pieces; each is of one block.
+    """Yield the values of chosen registers of one source in pieces. Each piece is of one block.
 
     Raises:
         PathError: There is no such source.
@@ -85,8 +88,8 @@ def pieces(
 class CsvTable:
     """A CSV file with a column for each register and each element of an array.
 
-    Times are in UTC. Durations are numbers in the unit of their type. A cell is empty if the bytes
-    are not a valid value of the type, or if the source had no value yet.
+    Times are in UTC. Durations are numbers in the unit of their type. A cell is empty if the
+    register's bytes are not a valid value, or if the source had no value yet.
     """
 
     def __init__(self, stream: IO[bytes], registers: Sequence[Register]) -> None:  # noqa: ARG002  all tables take it
@@ -117,13 +120,16 @@ class CsvTable:
         self.rows += len(columns.time_ns)
 
     def close(self) -> None:
-        """Flush the text. The stream stays open."""
+        """Write the buffered text to the stream, which stays open."""
         self._text.flush()
         self._text.detach()
 
 
 def _texts(values: npt.NDArray[Any], suffix: str = "") -> list[Any]:
-    """Convert values for CSV; floats have the fewest digits that give the same value when read."""
+    """Convert values for CSV.
+
+    A float has the fewest digits from which the same value can be read.
+    """
     kind = values.dtype.kind
     if kind == "b":
         values = np.where(values, "true", "false")
@@ -153,7 +159,7 @@ class ParquetTable:
         self._stream = stream
         self._writer: Any = None
         self._waiting: list[Any] = []
-        """The tables that together become the next row group."""
+        """The tables that will become the next row group."""
 
     def write(self, columns: Columns) -> None:
         """Write the next rows."""
@@ -194,7 +200,7 @@ TABLES: dict[str, Callable[[IO[bytes], Sequence[Register]], Table]] = {"parquet"
 
 @contextmanager
 def _new_folder(path: Path) -> Iterator[None]:
-    """Create a folder and its missing parents; remove the created ones again after an error."""
+    """Create a folder and its missing parents. After an error, remove those that were created."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -207,10 +213,16 @@ def _new_folder(path: Path) -> Iterator[None]:
 
 
 class BlockTables:
-    """Writes a file for each block, named after its source, with a number for later blocks."""
+    """Writes a file for each block.
+
+    It is named after the source; later blocks get a number, too.
+    """
 
     def __init__(self, stack: ExitStack, output: Path, form: str, chosen: Chosen, *, named: bool) -> None:
-        """Create the writer; ``output`` is the only file if ``named``, else a folder."""
+        """Create the writer.
+
+        ``output`` is the only file if ``named`` is set; otherwise it is a folder.
+        """
         self._stack = stack
         self._output = output
         self._form = form
@@ -275,7 +287,7 @@ def export_events(
 def _event_rows(
     dump: Dump, sources: Collection[str], from_ns: int, to_ns: int, progress: Callable[[int], None]
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of the events with the columns of _EVENT_COLUMNS; times are in ns."""
+    """Yield a row with the columns of _EVENT_COLUMNS for each event. Times are in ns."""
     explainers: dict[DumpBlock, Explainer] = {}
     for time_ns, block, event in dump.events(sources, from_ns, to_ns):
         if block is None:
@@ -412,9 +424,9 @@ def _channel(writer: Writer, topic: str, name: str, properties: dict[str, Any]) 
 
 
 def _tree(registers: Sequence[Register], source: str) -> dict[str, Any]:
-    """Return a tree of the registers by path segments; its leaves are indices of registers.
+    """Return a tree of the registers by path segments. Its leaves are the indices of the registers.
 
-    If a register has the name of a field of the frame, its source is put before it.
+    If a register has the name of a field of the frame, its path begins with the source.
     """
     tree: dict[str, Any] = {}
     for place, register in enumerate(registers):
@@ -452,7 +464,7 @@ def _schema(tree: dict[str, Any], columns: Columns) -> dict[str, Any]:
 def _plain(values: npt.NDArray[Any]) -> list[Any]:
     """Convert values for JSON.
 
-    Durations become numbers, and dates texts. Invalid and infinite values become null.
+    Durations become numbers, and dates become texts. Invalid and infinite values become null.
     """
     kind = values.dtype.kind
     found: Any = values

@@ -1,4 +1,4 @@
-"""Writes new recordings from others: a part, several joined, or what is intact in a damaged one."""
+"""Makes new recordings: a part of one, several joined, or the intact entries of a damaged one."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ _TYPES: Final = {".json": JSON, ".toml": TOML}
 
 
 class _Track:
-    """A block in the new file, with its channels and its last frame and event."""
+    """A block in the new file, with its channels and the numbers of its last frame and event."""
 
     def __init__(self) -> None:
         self.number = 0
         self.channels: Channels | None = None
         self.waiting: list[Entry[Item]] = []
-        """Gaps before the first frame or event, which are not written yet."""
+        """Gaps before the first frame or event of the block. They are not written yet."""
         self.last: dict[str, int] = {}
         self.last_ns = 0
 
 
 class Rewriter:
-    """Writes entries to a new file like a recorder: each missing frame or event is in a gap."""
+    """Writes entries to a new file like a recorder, with gaps for missing frames and events."""
 
     def __init__(self, stream: IO[bytes], dump: Dump, made: str, *, whole: bool) -> None:
-        """Begin the file; the arguments are those of :func:`rewrite`."""
+        """Begin the file. The arguments are as for :func:`rewrite`."""
         self._whole = whole
         about = {**dump.about, "made_by": made, "made_version": __version__}
         self._writer = Writer(stream, about)
@@ -56,7 +56,7 @@ class Rewriter:
         """Number of frames and events that could not be read; the new file has gaps for them."""
 
     def attach(self) -> None:
-        """Copy the intact attachments, except layouts, which are written with their blocks."""
+        """Copy the intact attachments, except layouts: these are written with their blocks."""
         seen: set[str] = set()
         for reader in self._dump.readers:
             for name in reader.attachments:
@@ -146,7 +146,7 @@ class Rewriter:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[IO[bytes]]:
-    """Create a file that only this user may read; after an error, remove it again.
+    """Create a file that only this user may read. After an error, remove it again.
 
     Raises:
         RecordingError: The file exists already.
@@ -178,15 +178,15 @@ def rewrite(
     whole: bool = True,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Rewriter:
-    """Write entries of a recording to a new file. After an error, no new file is left.
+    """Write entries of a recording to a new file. After an error, remove the new file.
 
     Args:
         dump: The recording, whose attachments and metadata are copied.
         path: The new file.
         made: Name of the command that makes the file, for its metadata.
         entries: The entries in order: ``dump.items()``, or those of :func:`part`.
-        whole: True if missing entries at the beginning of a block are a gap; False if they were
-            not selected.
+        whole: True: if entries are missing at the beginning of a block, write a gap. False: they
+            were not selected.
         progress: Called with the length in ns of the part that is done.
 
     Returns:
@@ -213,15 +213,17 @@ def part(
     sources: Collection[str] | None = None,
     registers: Sequence[str] = (),
 ) -> Iterator[Entry[Item]]:
-    """Return the entries of a part of a recording, for :func:`rewrite` with ``whole=False``.
+    """Return the entries of a part of a recording.
+
+    Write them by :func:`rewrite` with ``whole=False``.
 
     Args:
         dump: The recording.
         from_ns: Start of the range of time.
         to_ns: End of the range of time.
         sources: Names of the sources; None for all.
-        registers: Paths of the registers; empty for all. An element selects its whole array. All
-            other bytes of a frame become zero.
+        registers: Paths of the registers; empty for all. An element selects its whole array. The
+            bytes of all other registers become zero.
 
     Returns:
         The entries in order.
@@ -249,15 +251,15 @@ def _part(
         raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
     if not anything:
         raise RecordingError(
-            f"nothing of {dump.files[0]} is in that time; it was recorded {span(dump.begin_ns, dump.end_ns)}"
+            f"{dump.files[0]} has nothing in that time: it was recorded {span(dump.begin_ns, dump.end_ns)}"
         )
 
 
 class _Parts:
-    """Reduces the entries of a recording to some registers; all other bytes become zero."""
+    """Reduces the entries of a recording to some registers. The bytes of others become zero."""
 
     def __init__(self, dump: Dump, paths: Sequence[str]) -> None:
-        """Find the registers; an element selects its whole array.
+        """Find the registers. An element selects its whole array.
 
         Raises:
             PathError: There is no such register.
@@ -270,7 +272,7 @@ class _Parts:
         return list(dict.fromkeys(block.source for block in self._parts))
 
     def of(self, entry: Entry[Item]) -> Entry[Item] | None:
-        """Return an entry with only these registers; None if its block has none of them."""
+        """Return an entry, reduced to these registers; None if its block has none of them."""
         if entry.block is None:
             return entry
         if entry.block not in self._parts:
@@ -281,7 +283,7 @@ class _Parts:
 
 
 def _reduced(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, RecordedRegisters]:
-    """Return a block with only these registers, and an object that reduces its frames to them."""
+    """Return a block, reduced to these registers, and an object that reduces its frames."""
     paths = {holder(block.layout, register) for register in registers}
     whole = tuple(register for register in block.layout.registers if register.path in paths)
     part = RecordedRegisters(block.layout, whole)

@@ -17,9 +17,9 @@ from shmio.segment import Block, Frame
 
 
 class RecordedRegisters:
-    """The registers of a block to record; ``layout`` has only these, at their original offsets.
+    """The registers of a block to record. ``layout`` has only these, at their original offsets.
 
-    A status area has the statuses of these registers only, and is shorter.
+    If the block has a status area, the recorded one is shorter: it has only their statuses.
     """
 
     def __init__(self, layout: Layout, registers: Sequence[Register] | None = None) -> None:
@@ -38,7 +38,7 @@ class RecordedRegisters:
         self._mask, self._taken = _with_statuses(layout, self.layout, mask[: layout.status_offset])
 
     def keep(self, frame: Frame) -> Frame:
-        """Return the frame, with the bits of all other registers set to zero."""
+        """Return the frame, reduced to these registers: all other bits are zero."""
         if self._mask is None:
             return frame
         effective = None if frame.effective is None else self._kept(frame.effective, self._mask)
@@ -51,9 +51,9 @@ class RecordedRegisters:
 def _with_statuses(
     whole: Layout, part: Layout, mask: npt.NDArray[np.uint8]
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.intp]]:
-    """Return the mask of the reduced image, and from where in the whole image each of its bytes comes.
+    """Return the mask of a reduced image with statuses, and the offset to copy each byte from.
 
-    ``mask`` is that of the values.
+    The offsets are those in the whole image. ``mask`` is the mask of the values, without statuses.
     """
     old, new = StatusArea(whole), StatusArea(part)
     kept, taken = np.zeros(part.size, np.uint8), np.zeros(part.size, np.intp)
@@ -68,7 +68,7 @@ def _with_statuses(
 class Selection:
     """The sources and registers to record.
 
-    ``sources`` are the names of the sources, or None for all. ``registers`` are patterns as for
+    ``sources`` are the names of the sources; None for all. ``registers`` are patterns as for
     ``shmio get``; empty for all. A pattern that names an element selects its whole array.
     """
 
@@ -79,7 +79,7 @@ class Selection:
     def part(self, block: Block, sources: Collection[str]) -> RecordedRegisters | None:
         """Return the registers of a block to record; None if there are none.
 
-        ``sources`` are the names of all sources.
+        ``sources`` are the names of all sources of the instance.
         """
         if self._sources is not None and block.source not in self._sources:
             return None
@@ -110,7 +110,7 @@ class Selection:
 
 
 def _near(pattern: str, layouts: Mapping[str, Layout]) -> str:
-    """Return the end of a message with similar paths; empty if there are none."""
+    """Return the end of a message, which suggests similar paths; empty if there are none."""
     try:
         topic = parse_topic(pattern, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     except PathError:

@@ -49,7 +49,7 @@ TEXT: Final = "text/plain"
 
 
 class Output(Protocol):
-    """The protocol of a recording's output, such as the recorder's output or a binary file."""
+    """Where a recording is written to, such as a binary file."""
 
     def write(self, data: bytes, /) -> object:
         """Append data."""
@@ -58,7 +58,7 @@ class Output(Protocol):
         """Return the number of bytes written so far."""
 
     def flush(self) -> None:
-        """Pass all appended data on to the file."""
+        """Pass all buffered data on to the file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Writer:
     """Writes one recording. Use it from one thread only."""
 
     def __init__(self, output: Output, about: Mapping[str, str]) -> None:
-        """Begin the recording; ``about`` is the metadata about the instance."""
+        """Begin the recording. ``about`` is the metadata about the instance."""
         self._output = output
         self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._mcap.start(PROFILE, f"shmio {__version__}")
@@ -83,12 +83,12 @@ class Writer:
         self.flush()
 
     def places(self, places: Mapping[int, BlockPosition]) -> None:
-        """Write the positions by section at which the previous recording ended."""
+        """Write the position in each block at which the previous recording ended, by section."""
         if places:
             self._mcap.add_metadata(PLACES, {str(section): encode_position(place) for section, place in places.items()})
 
     def attach(self, name: str, media_type: str, data: bytes, now_ns: int, changed_ns: int = 0) -> None:
-        """Attach a file; ``changed_ns`` is the time of its last change."""
+        """Attach a file. ``changed_ns`` is the time of the file's last change, UTC; 0: unknown."""
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
     def open_block(
@@ -107,8 +107,8 @@ class Writer:
             number: Number of the block in this recording.
             after_frame: Number of the frame before the first recorded one.
             after_event: Number of the event before the first recorded one.
-            layout: Layout of the recorded registers; None for that of the block.
-            of: Hash of the whole layout, if it is not that of ``block``.
+            layout: Layout of the recorded registers; None for the layout of the block.
+            of: Hash of the source's whole layout, if it is not the layout of ``block``.
         """
         layout = layout or block.layout
         self.flush()  # readers without an index need a channel's record in the chunk of its first message
@@ -148,11 +148,11 @@ class Writer:
         self._mcap.add_message(channels.events, log_ns, encode_event(event), told_ns, event.number & 0xFFFFFFFF)
 
     def gap(self, gap: Gap, log_ns: int) -> None:
-        """Add a gap; call it before the entry after the gap is added."""
+        """Add a gap. Call this before you add the entry that follows the gap."""
         self._mcap.add_message(self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA), log_ns, encode_json(gap), log_ns)
 
     def step(self, mark: StepMark, log_ns: int) -> None:
-        """Add the end of a step; call it after all frames of the step were added."""
+        """Add the end of a step. Call this after you have added all frames of the step."""
         channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
         self._mcap.add_message(channel, log_ns, encode_json(mark), log_ns, mark.step & 0xFFFFFFFF)
 
@@ -162,7 +162,7 @@ class Writer:
         self._mcap.add_message(channel, log_ns, encode_json(change), log_ns)
 
     def _channel(self, topic: str, schema: str, text: bytes) -> int:
-        """Return the number of a channel of the instance; create the channel if necessary."""
+        """Return the number of a channel that belongs to no block. Create it if necessary."""
         if topic not in self._own:
             self.flush()
             number = self._mcap.register_schema(schema, "jsonschema", text)

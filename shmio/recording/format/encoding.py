@@ -27,24 +27,24 @@ PROFILE: Final = "shmio"
 ABOUT: Final = "shmio"
 """Name of the metadata record about the instance."""
 SUPERVISED: Final = "supervised"
-"""Value of the key ``recorder`` in this record if the supervisor has started the recorder."""
+"""Value of the key ``recorder`` in the record ABOUT if the supervisor has started the recorder."""
 PLACES: Final = "places"
-"""Name of the metadata record with the positions after which the recording begins."""
+"""Name of the metadata record with the position in each block after which the recording begins."""
 GAPS_TOPIC: Final = "gaps"
 STEPS_TOPIC: Final = "steps"
 PROCESSES_TOPIC: Final = "processes"
 
 FRAME: Final = "shmio.frame.v1"
 FRAME_V2: Final = "shmio.frame.v2"
-"""FRAME with five fields as differences from the message's header: see :func:`differ`."""
+"""Like FRAME, but five fields are differences from the message's header: see :func:`differ`."""
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"
 GAP: Final = "gap"
 STEP: Final = "step"
 PROCESS: Final = "process"
-"""Encodings of gaps, steps and process changes in this code.
+"""GAP, STEP and PROCESS: how the code calls the encodings of gaps, steps and process changes.
 
-In the file, all three have the encoding PLAIN, and different topics.
+In the file, all three have the encoding PLAIN. Their topics differ.
 """
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
@@ -97,23 +97,23 @@ class Reason(StrEnum):
     NOT_RUNNING = "not running"
     """The entries were overwritten while no recorder ran."""
     ELSEWHERE = "elsewhere"
-    """The file of the previous recorder is not in the folder.
+    """The entries are in the file of the previous recorder, but this file is not in the folder.
 
     It was moved, or ``recorder.directory`` has changed.
     """
     NO_ROOM = "no room"
-    """The disk was full or too slow, so that the recorder's buffer was full."""
+    """The disk was full or too slow, so the recorder's buffer overflowed."""
     UNSURE = "unsure"
-    """The entries are in the previous file, but may be lost because its fsync failed."""
+    """The entries were written to the previous file, but may be lost, because its fsync failed."""
     DAMAGED = "damaged"
-    """The entries could not be read from a file from which this one was made."""
+    """The file was made from another recording in which these entries could not be read."""
 
 
 class Gap(msgspec.Struct, frozen=True):
-    """Frames or events of a block that are missing in the recording, from ``first`` to ``last``.
+    """Frames or events of a block, from ``first`` to ``last``, that are missing in the recording.
 
-    ``after_ns`` is the log time of the entry before the gap, and ``before_ns`` that of the entry
-    after it; 0 if there is none.
+    ``after_ns`` is the log time of the entry before the gap, and ``before_ns`` is the log time of
+    the entry after it. 0: there is no such entry.
     """
 
     source: str
@@ -130,7 +130,7 @@ class Gap(msgspec.Struct, frozen=True):
 class StepMark(msgspec.Struct, frozen=True):
     """The end of a step of virtual time, recorded after all frames of the step.
 
-    ``time_ns`` is the instance time after the step, and ``dt_ns`` the length of the step.
+    ``time_ns`` is the instance's clock after the step, and ``dt_ns`` is the length of the step.
     """
 
     step: int
@@ -144,7 +144,7 @@ class ProcessEvent(StrEnum):
     IS = "is"
     """The process was running when the recording began."""
     STARTED = "started"
-    """The process was started or restarted; the end of the previous one was recorded before."""
+    """The process was started or restarted. In a restart, ENDED or DIED was recorded before."""
     ENDED = "ended"
     """The process ended, or was restarted, on request."""
     DIED = "died"
@@ -156,7 +156,7 @@ class ProcessEvent(StrEnum):
 
 
 class ProcessChange(msgspec.Struct, frozen=True):
-    """A process change, with its reason. ``pid`` is 0 if it is unknown."""
+    """The start or end of a process, with the reason. ``pid`` is 0 if it is unknown."""
 
     name: str
     kind: str
@@ -207,8 +207,9 @@ def decode_frame(data: bytes) -> Frame:
 def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
     """Convert a frame from FRAME to FRAME_V2.
 
-    Its numbers and times are replaced by differences, modulo 2^64, from those in the message's
-    header. The differences hardly change from frame to frame, so they compress well.
+    This replaces the numbers and times of the frame by their differences, modulo 2^64, from those
+    in the message's header. The differences hardly change from frame to frame, so they compress
+    well.
     """
     number, cycle, publish, clock, source = _COUNTED.unpack_from(data)
     head = _COUNTED.pack(
@@ -219,7 +220,10 @@ def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
 
 
 def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """Convert a frame from FRAME_V2 to FRAME. Bytes too short for a frame are unchanged."""
+    """Convert a frame from FRAME_V2 to FRAME.
+
+    Return bytes that are too short for a frame unchanged.
+    """
     if len(data) < _FRAME.size:
         return data
     number, cycle, publish, clock, source = _COUNTED.unpack_from(data)
@@ -269,7 +273,7 @@ def encode_json(item: Gap | StepMark | ProcessChange) -> bytes:
 
 def _decode_json(data: bytes, kind: type[T], name: str) -> T:
     if len(data) > MAX_JSON_BYTES:
-        raise ValueError(f"{name} of {len(data)} bytes")
+        raise ValueError(f"{name} has {len(data)} bytes, but at most {MAX_JSON_BYTES} are allowed")
     return msgspec.json.decode(data, type=kind)
 
 
@@ -287,7 +291,7 @@ def decode_step(data: bytes) -> StepMark:
     """Decode the end of a step; raise ValueError if it is malformed."""
     mark = _decode_json(data, StepMark, "a step")
     if min(mark.step, mark.time_ns, mark.dt_ns) < 0:
-        raise ValueError("a step is negative")
+        raise ValueError("a step has a negative number, time or length")
     return mark
 
 
@@ -305,7 +309,7 @@ def decode_position(text: str) -> BlockPosition:
     """Decode a position; raise ValueError if it is malformed."""
     frame, event, log_ns = (int(number) for number in text.split(" ") if len(number) <= 20)
     if min(frame, event, log_ns) < 0:
-        raise ValueError("a position is negative")
+        raise ValueError("a position has a negative number or time")
     return BlockPosition(frame, event, log_ns)
 
 
@@ -313,8 +317,8 @@ def decode_position(text: str) -> BlockPosition:
 class Channel:
     """A channel with a block's frames or events, or with gaps, steps or process changes.
 
-    ``layout`` is the hash of the block's layout in hex. ``encoding`` is FRAME for frames of both
-    versions, and empty for the messages of other programs.
+    ``layout`` is the hash of the block's layout in hexadecimal digits. ``encoding`` is FRAME for
+    both versions of frames. It is empty if another program wrote the channel's messages.
     """
 
     number: int
@@ -324,12 +328,12 @@ class Channel:
     block: int = 0
     section: int = 0
     after: int = 0
-    """Number of the frame or event before the first recorded one."""
+    """Number of the last frame or event before the first recorded one."""
     layout: str = ""
     period_ns: int = 0
     stale_ns: int = 0
     of: str = ""
-    """Hash of the whole layout, if only some of its registers were recorded; else empty."""
+    """Hash of the source's whole layout if only some registers were recorded; else empty."""
     differences: bool = False
     """True if frames are encoded as FRAME_V2."""
 

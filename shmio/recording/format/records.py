@@ -1,8 +1,9 @@
 """Reads the records of an MCAP file from front to back, without an index.
 
-So a file may end anywhere. Nothing in it is trusted: lengths are checked against the file, each
-other and limits, and chunks against their CRC. At most one chunk is in memory at a time. After a
-damaged place, reading continues with the next intact chunk or attachment.
+So a file may end anywhere. The reader does not trust the content: it compares lengths with the size
+of the file, with each other and with limits, and checks the CRC of each chunk. At most one chunk is
+in memory at a time. After a damaged place, reading continues with the next intact chunk or
+attachment.
 """
 
 from __future__ import annotations
@@ -28,20 +29,23 @@ from shmio.errors import RecordingError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES: Final = 1 << 20
-"""Largest size of a record, other than a chunk, that is read as a whole."""
+"""Largest size of a record that is read as a whole. Chunks have their own limit."""
 
 BROKEN: Final = 0
-"""Opcode of bytes that are not a valid record; MCAP does not use it."""
+"""Opcode that stands for bytes that are not a valid record. MCAP does not use this opcode."""
 ONLY_BEGUN: Final = "has no content: its recorder was killed before it wrote anything, or has just started"
 LOOK_BYTES: Final = 4096
-"""Number of bytes to read from the beginning of a record in order to check the lengths in it.
+"""Number of bytes at the beginning of a record that are read to check the lengths in it.
 
-The names of attachments and metadata fit in.
+They include the name of an attachment or of metadata.
 """
 BEAT_BYTES: Final = 1 << 20
 """Number of bytes that are read or decompressed between two calls of ``beat``."""
 MAX_CHUNK_BYTES: Final = 32 << 20
-"""Largest size of a chunk; a recorder's chunks have 1 MiB and one message of at most 2 MiB."""
+"""Largest size of a chunk.
+
+A recorder ends a chunk when it has 1 MiB; a message has at most 2 MiB.
+"""
 
 HEAD: Final = struct.Struct("<BQ")  # of any record: opcode, size of its content
 CHUNK: Final = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC; then the compression's name, size, data
@@ -55,12 +59,12 @@ _MARK: Final = re.compile(  # beginning of each chunk and attachment that shmio 
 _MARK_BYTES: Final = 64
 _SEARCH_BYTES: Final = 1 << 20
 _MAX_SEARCHED: Final = 100
-"""Number of places that look like a chunk or attachment but are not, after which a search ends."""
+"""A search ends after this number of places that only look like a chunk or an attachment."""
 _SIZES: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: FOOTER.size}
 
 
 class Record(NamedTuple):
-    """The place of a record in a file: opcode, offset of its content, and size of its content."""
+    """A record's opcode, and the offset and size of its content in the file."""
 
     opcode: int
     at: int
@@ -68,12 +72,15 @@ class Record(NamedTuple):
 
     @property
     def start(self) -> int:
-        """Offset at which the record itself begins."""
+        """Offset at which the record begins, with its header."""
         return self.at - HEAD.size
 
 
 class Records:
-    """Reads the records of a file; ``closed`` and ``damage`` are valid after :meth:`walk`."""
+    """Reads the records of a file.
+
+    :attr:`closed` and :attr:`damage` are valid after :meth:`walk`.
+    """
 
     def __init__(self, file: Path, *, own: bool, beat: Callable[[], object]) -> None:
         """Open a file.
@@ -93,7 +100,7 @@ class Records:
         self.closed = False
         """True if the recorder has closed the file, so that it has an index and a footer."""
         self.damage = ""
-        """Message that says where and why the walk ended before the footer; empty if it did not."""
+        """Message that says where and why the walk ended early; empty if it reached the footer."""
         flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # opening a FIFO would block
         self._fd = os.open(file, flags | os.O_NOFOLLOW if own else flags)
         try:
@@ -120,9 +127,9 @@ class Records:
     def walk(self, to: int | None = None) -> Iterator[Record]:
         """Yield all records up to the footer, or to the end of the file.
 
-        Damaged bytes, up to the next intact chunk, attachment or footer, are yielded as one record
-        with opcode BROKEN. If ``to`` is given, reading stops at this byte; :attr:`closed` and
-        :attr:`damage` are then not set.
+        Damaged bytes, up to the next intact chunk, attachment or footer, become one record with
+        opcode BROKEN. If ``to`` is given, reading stops at this byte, and does not set
+        :attr:`closed` and :attr:`damage`.
         """
         self.closed, self.damage, self._searched = False, "", 0
         at = len(MAGIC)
@@ -150,7 +157,10 @@ class Records:
             )
 
     def summary(self) -> Iterator[Record]:
-        """Yield the records in the summary of a closed file, which describes the channels again."""
+        """Yield the records in the summary of a closed file.
+
+        They include the description of each channel.
+        """
         footer = self._footer(len(MAGIC))
         if not footer:
             return
@@ -160,7 +170,7 @@ class Records:
             at = record.at + record.size
 
     def summary_damage(self) -> str:
-        """Check the CRC of a closed file's summary; return a message if it is wrong, else ""."""
+        """Check the CRC of a closed file's summary. Return a message if it is wrong, else ""."""
         footer = self._footer(len(MAGIC))
         start, _, crc = FOOTER.unpack(self.read(footer + HEAD.size, FOOTER.size))
         end = footer + HEAD.size + FOOTER.size - U32.size
@@ -179,7 +189,10 @@ class Records:
         return found
 
     def _peek(self, at: int, size: int) -> bytes:
-        """Return up to ``size`` bytes, but none that were appended after the file was opened."""
+        """Return up to ``size`` bytes.
+
+        Leave out bytes that were appended after the file was opened.
+        """
         return self._pread(max(0, min(size, self.size - at)), at)
 
     def _pread(self, size: int, at: int) -> bytes:
@@ -197,7 +210,7 @@ class Records:
             self._beat()
 
     def record(self, at: int) -> Record | None:
-        """Return the record that begins at a byte; None if no valid record begins there."""
+        """Return the record that begins at byte ``at``; None if no valid record begins there."""
         head = self._peek(at, HEAD.size + LOOK_BYTES)
         if len(head) < HEAD.size:
             return None
@@ -210,7 +223,7 @@ class Records:
         return Record(opcode, content, size)
 
     def _whole(self, at: int, end: int) -> int:
-        """Return the start of the next chunk or attachment with a correct CRC; 0 if none."""
+        """Return the start of the next chunk or attachment with a correct CRC; 0: there is none."""
         for begin in range(at, end, _SEARCH_BYTES):
             for found in _MARK.finditer(self._peek(begin, _SEARCH_BYTES + _MARK_BYTES - 1)):
                 record = self.record(begin + found.start())
@@ -229,7 +242,7 @@ class Records:
         return self.record(start) if start else None
 
     def _footer(self, at: int) -> int:
-        """Return the start of the footer at the end of the file; 0 if none is after ``at``."""
+        """Return the start of the footer at the end of the file; 0: there is none after ``at``."""
         start = self.size - len(MAGIC) - FOOTER.size - HEAD.size
         record = self.record(start) if start >= at else None
         if record is None or record.opcode != Opcode.FOOTER or record.at + record.size + len(MAGIC) != self.size:
@@ -243,10 +256,10 @@ class Records:
             RecordingError: The size exceeds the limit, or the file became shorter.
         """
         if size > limit:
-            raise RecordingError(f"{self.file}: a record of {size} bytes at byte {at} is larger than {limit}")
+            raise RecordingError(f"{self.file}: the record at byte {at} has {size} bytes, which is larger than {limit}")
         data = self._pread(size, at)
         if len(data) != size:
-            raise RecordingError(f"{self.file}: it became shorter while it was read")
+            raise RecordingError(f"{self.file}: the file became shorter while it was read")
         return data
 
     def chunk_times(self, record: Record) -> tuple[int, int]:
@@ -298,7 +311,7 @@ class Records:
             at += size
 
     def hold(self) -> None:
-        """Lock the file while it is open, so that no recorder deletes it.
+        """Lock the file until it is closed, so that no recorder deletes it.
 
         This has no effect on a file system without locks.
         """
@@ -315,8 +328,8 @@ class Records:
 class Damage(NamedTuple):
     """A damaged place in a file: bytes ``first`` to ``last`` cannot be read, or only in part.
 
-    ``after_ns`` and ``before_ns`` are the log times of the last readable entry before the place and
-    the first one after it; 0 if there is none.
+    ``after_ns`` is the log time of the last readable entry before this place. ``before_ns`` is the
+    log time of the first readable entry after it. 0: there is no such entry.
     """
 
     first: int
@@ -329,8 +342,8 @@ class Damage(NamedTuple):
 class DamageLog:
     """Collects damage while a file is read from front to back.
 
-    All damage between two intact chunks is reported as one place. Call :meth:`end` before each
-    readable chunk and at the end of the file, and :meth:`after` after each readable chunk.
+    The log reports all damage between two intact chunks as one place. Call :meth:`end` before each
+    readable chunk and at the end of the file. Call :meth:`after` after each readable chunk.
     """
 
     def __init__(self, tell: Callable[[Damage], object]) -> None:
@@ -347,11 +360,14 @@ class DamageLog:
             self._found = self._found._replace(last=last)
 
     def after(self, last_ns: int) -> None:
-        """Store the last log time of a chunk that was read."""
+        """Note that a chunk was read. ``last_ns`` is the log time of its last entry."""
         self._after_ns = last_ns
 
     def end(self, before_ns: int = 0) -> None:
-        """Report pending damage; ``before_ns`` is the log time of the next entry, 0 for none."""
+        """Report the damage since the last chunk.
+
+        ``before_ns``: log time of the next entry; 0: none.
+        """
         if self._found is not None:
             self._tell(self._found._replace(before_ns=before_ns))
             self._found = None
@@ -363,7 +379,10 @@ def stream(data: bytes | memoryview) -> ReadDataStream:
 
 
 class _OfThread(threading.local):
-    """A decompressor for each thread; to create one takes longer than to decompress a chunk."""
+    """A decompressor for each thread.
+
+    Creating a decompressor takes longer than decompressing a chunk.
+    """
 
     def __init__(self) -> None:
         self.decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
@@ -375,8 +394,8 @@ _of_thread = _OfThread()
 def _framed(opcode: int, size: int, look: bytes) -> bool:
     """Return whether the lengths inside a record are consistent with the length of the record.
 
-    Otherwise a damaged length would make the reader skip intact records. ``look`` is the beginning
-    of the content.
+    Without this check, a damaged length would make the reader skip intact records. ``look`` is the
+    beginning of the content.
     """
     try:
         if opcode == Opcode.CHUNK:
@@ -417,7 +436,7 @@ def _unpack(content: bytes) -> bytes:
     if packed_size != len(packed):
         raise ValueError("its sizes are inconsistent")
     if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"{size} bytes, more than {MAX_CHUNK_BYTES}")
+        raise ValueError(f"it has {size} bytes, but at most {MAX_CHUNK_BYTES} are allowed")
     if compression == "zstd":
         if zstandard.get_frame_parameters(packed).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
             raise ValueError("its sizes are inconsistent")

@@ -1,4 +1,4 @@
-"""Reads the frames of a block as arrays, chunk by chunk, without a Python object for each frame."""
+"""Reads the frames of a block as arrays, chunk by chunk. It creates no Python object per frame."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ HEAD: Final = np.dtype(
         ("delay_us", "<u4"),
     ]
 )
-"""The header of a frame (docs/reference/dump-format.md)."""
+"""The header of a frame as a numpy type (docs/reference/dump-format.md)."""
 
 _RECORD: Final = struct.Struct("<BQH")  # opcode, size; then, in a message, the channel
 _MESSAGE: Final = struct.Struct("<BQHIQQ")  # opcode, size, channel, sequence, log time, publish time
@@ -52,9 +52,9 @@ _TOLD: Final = np.dtype(
 _HEAD_SIZE: Final = 9
 _LOG_AT: Final = 15
 _WORTH: Final = 4
-"""Length of a run below which runs are not worth it.
+"""Smallest number of messages in a run for which reading by runs is faster.
 
-After ``_MAX_TRIES`` shorter runs, the rest of a chunk is read message by message.
+After ``_MAX_TRIES`` shorter runs, the rest of the chunk is read message by message.
 """
 _MAX_TRIES: Final = 8
 
@@ -68,7 +68,7 @@ class Batch:
     Attributes:
         time_ns: Log times in ns, int64, shape (n,).
         records: Headers (:data:`HEAD`) and images, uint8, shape (n, header + image size). The
-            images are those that readers saw, or those of the source if these were requested.
+            images are those that readers saw; with ``raw``, those that the source delivered.
         reasons: The reasons of the frames; None if all are empty.
     """
 
@@ -95,7 +95,7 @@ class Batch:
 
 
 def batch(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int, *, raw: bool = False) -> Batch | None:
-    """Return the frames of a channel in a chunk, or None if there are none in the range.
+    """Return the frames of a channel in a chunk; None if there are no frames in the range of time.
 
     Args:
         data: The uncompressed chunk.
@@ -158,15 +158,16 @@ def _frame(piece: bytes, size: int) -> Frame:
     except ValueError as error:
         raise RecordingError(str(error)) from None
     if len(frame.raw) != size:
-        raise RecordingError("a frame does not have the size of its layout")
+        raise RecordingError("the size of a frame does not match its layout")
     return frame
 
 
 def _runs(array: _Bytes, data: bytes, wanted: int) -> Iterator[_Bytes]:
-    """Yield a channel's messages in runs of one size and distance, each (n, bytes of a message).
+    """Yield a channel's messages in runs: arrays of shape (n, bytes of a message).
 
-    If several blocks publish in turn, the same pattern of records repeats. Such a run is found by
-    comparing arrays, not record by record.
+    All messages of a run have the same size, and begin at the same distance from each other. If
+    several blocks publish in turn, the same pattern of records repeats. This function finds the
+    repetitions by comparing arrays, which is faster than reading each record.
 
     Raises:
         RecordingError: The records do not fit the chunk.
@@ -197,7 +198,7 @@ def _runs(array: _Bytes, data: bytes, wanted: int) -> Iterator[_Bytes]:
 
 
 def _repeats(array: _Bytes, begin: int, period: int, pattern: list[int]) -> int:
-    """Return how many times a pattern of records repeats from ``begin`` on, one after another."""
+    """Return how many times a pattern of records occurs in direct succession from ``begin`` on."""
     count = (len(array) - begin) // period
     rows = array[begin : begin + count * period].reshape(count, period)
     same = np.ones(count, np.bool_)
@@ -208,7 +209,7 @@ def _repeats(array: _Bytes, begin: int, period: int, pattern: list[int]) -> int:
 
 
 def _cut(array: _Bytes, begin: int, period: int, count: int, size: int) -> _Bytes:
-    """Return messages of one size that begin ``period`` bytes apart, as uint8, (count, size)."""
+    """Return messages of one size, ``period`` bytes apart, as uint8 of shape (count, size)."""
     if size < _MESSAGE.size:
         raise RecordingError("a message is shorter than its header")
     if count == 1:
@@ -231,7 +232,7 @@ def _restored(run: _Bytes) -> _Bytes:
 
 
 def _regular(frames: _Bytes, size: int) -> bool:
-    """Return whether each frame consists of a header and one image."""
+    """Return whether each frame consists of only a header and one image, without a reason."""
     if frames.shape[1] != HEAD.itemsize + size:
         return False
     head = frames[:, : HEAD.itemsize].view(HEAD)[:, 0]
@@ -240,7 +241,7 @@ def _regular(frames: _Bytes, size: int) -> bool:
 
 
 def _decoded(frames: _Bytes, size: int, *, raw: bool) -> tuple[_Bytes, list[str]]:
-    """Decode frames one by one; return records as in :class:`Batch`, and the reasons."""
+    """Decode frames one by one. Return records as in :class:`Batch`, and the reasons."""
     records, reasons = [], []
     for piece in map(bytes, frames):
         frame = _frame(piece, size)

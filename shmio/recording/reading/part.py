@@ -24,9 +24,9 @@ from shmio.recording.reading.survey import Track, survey, survey_by_index
 from shmio.segment import Frame
 
 MAX_NS: Final = (1 << 63) - 1
-"""The largest log time, for ranges without an end."""
+"""The largest log time. It is the end of a range of time without an end."""
 BATCH_FRAMES: Final = 256
-"""Number of frames in a batch that is made from single frames."""
+"""Number of frames in a batch that :func:`batches_of` makes from single frames."""
 
 Damaged = Callable[[Path, Damage], object]
 T = TypeVar("T")
@@ -37,8 +37,8 @@ ItemT_co = TypeVar("ItemT_co", bound=Item, covariant=True)
 class DumpBlock:
     """A source with one layout in a recording. A reload that changes the layout begins a new block.
 
-    ``section`` is unique among the blocks of a run, also in several files. ``layout_hash`` is a
-    SHA-256 in hex.
+    No two blocks of a run have the same ``section``, even in different files. ``layout_hash`` is a
+    SHA-256 in hexadecimal digits.
     """
 
     source: str
@@ -48,12 +48,12 @@ class DumpBlock:
     period_ns: int
     stale_ns: int
     of: str = ""
-    """Hash of the whole layout, if only some of its registers were recorded; else empty."""
+    """Hash of the source's whole layout if only some registers were recorded; else empty."""
     frames: int = 0
     """Number of recorded frames; a frame that is in two files counts twice."""
     events: int = 0
     after: dict[str, int] = field(default_factory=dict)
-    """Number before the first recorded frame (key ``frames``) and event (key ``events``)."""
+    """Number of the last frame (key ``frames``) and event (key ``events``) before the recording."""
     begin_ns: int = 0
     end_ns: int = 0
     """``begin_ns`` and ``end_ns``: log times of the first and the last frame or event."""
@@ -124,7 +124,7 @@ class Contents:
 def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Contents:
     """Return the contents of a file, and add its new blocks to ``blocks``.
 
-    A block with a damaged layout is skipped, and noted in the survey's damage.
+    Leave out a block with a damaged layout, and add a message to the survey's damage.
     """
     found = Contents()
     for channel in sorted(part.reader.channels.values(), key=lambda channel: (channel.block, channel.number)):
@@ -160,7 +160,7 @@ class Part:
     """
 
     def __init__(self, file: Path, damaged: Damaged | None) -> None:
-        """Open a file. Damage is passed to ``damaged``, or raises RecordingError if it is None."""
+        """Open a file. Call ``damaged`` for damage; if it is None, damage raises RecordingError."""
         self.file = file
         self.reader = Reader(file)
         self._damaged = damaged
@@ -182,7 +182,7 @@ class Part:
         )
 
     def messages_before(self, channels: Collection[int], time_ns: int) -> Iterator[list[Message]]:
-        """Yield the messages of each chunk up to a time, beginning with the last chunk.
+        """Yield the messages of each chunk up to a time, from the last chunk to the first.
 
         The messages of a chunk are in file order.
         """
@@ -192,7 +192,7 @@ class Part:
             yield list(self.reader.messages(wanted, 0, time_ns, damaged, [record]))
 
     def batches(self, number: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Iterator[Batch]:
-        """Yield the frames of a channel as arrays, chunk by chunk; ``size`` is the image's size."""
+        """Yield the frames of a channel as arrays, chunk by chunk. ``size``: bytes of an image."""
         channel = self.reader.channels[number]
         for found in self._each(
             number, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)
@@ -235,9 +235,10 @@ class Part:
         return self.found.chunks.between(from_ns, to_ns, self._sure(channels))
 
     def _sure(self, channels: Collection[int]) -> Collection[int] | None:
-        """Return the channels if the CRC of the summary was correct, else None.
+        """Return the channels if the summary's CRC was correct, else None to select all chunks.
 
-        The index of a single chunk has no CRC. If it is damaged, it must not hide an intact chunk.
+        Without the summary, only each chunk's own index says which channels it has. This index has
+        no CRC. If it is damaged, it must not hide an intact chunk.
         """
         return channels if self._indexed else None
 
@@ -257,7 +258,10 @@ class Part:
 
 
 class Entry(NamedTuple, Generic[ItemT_co]):
-    """A recorded item with its log time; ``block`` is None if it is of the whole instance."""
+    """A recorded item with its log time.
+
+    ``block`` is None if the item concerns the whole instance.
+    """
 
     time_ns: int
     block: DumpBlock | None
@@ -267,7 +271,7 @@ class Entry(NamedTuple, Generic[ItemT_co]):
 def messages_of(
     part: Part, within: Contents, channels: Collection[int], from_ns: int, to_ns: int
 ) -> Iterator[tuple[Contents, Entry[Item]]]:
-    """Yield messages of some channels in a range of log times, each with the file's contents."""
+    """Yield the messages of some channels in a range of log times, with the file's contents."""
     for channel, log_ns, item in part.messages(channels, from_ns, to_ns):
         block = (
             within.numbered.get((item.source, item.block))
@@ -278,7 +282,7 @@ def messages_of(
 
 
 def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[DumpBlock, Batch]]:
-    """Yield frames as batches of arrays; ``raw`` selects the images without injections."""
+    """Yield frames as batches of arrays. ``raw`` selects the images without injections."""
     for block, of_block in groupby(frames, key=lambda entry: entry.block):
         while block is not None and (some := list(islice(of_block, BATCH_FRAMES))):
             items = [entry.item for entry in some]
@@ -289,7 +293,7 @@ def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[D
 
 
 def latest_of(part: Part, within: Contents, source: str, time_ns: int) -> Entry[Frame] | None:
-    """Return the last frame of a source in a file at or before a time; None if there is none."""
+    """Return the last frame of a source at or before a time in a file; None if there is none."""
     for messages in part.messages_before(within.frames(source), time_ns):
         for message in reversed(messages):
             if isinstance(message.item, Frame):

@@ -82,7 +82,7 @@ class Message(NamedTuple):
 
 
 class AttachmentEntry(NamedTuple):
-    """The place of an attachment's data in the file, and the record that contains it."""
+    """Offset and size of an attachment's data in the file, and the record that contains it."""
 
     at: int
     size: int
@@ -90,10 +90,10 @@ class AttachmentEntry(NamedTuple):
 
 
 class Reader:
-    """Reads one file of a recording. A context manager.
+    """Reads one file of a recording. Use it as a context manager.
 
     The file may be closed, left by a killed recorder, or being written. :meth:`messages` adds the
-    channels that it finds.
+    channels that it finds to ``channels``.
 
     Raises:
         OSError: The file cannot be opened.
@@ -106,19 +106,19 @@ class Reader:
         Args:
             file: The path.
             own: True to accept only a regular file of this user.
-            beat: Called regularly during reading, as a heartbeat.
+            beat: Called at intervals during reading, so that a process can write its heartbeat.
         """
         self.file = file
         self.records = Records(file, own=own, beat=beat)
         self.about: dict[str, str] = {}
-        """The recorder's metadata about the instance."""
+        """Metadata about the instance that the recorder has written."""
         self.places: dict[int, BlockPosition] = {}
-        """Positions by section at which the previous recording ended, as far as they are known."""
+        """Position in each block at which the previous recording ended, by section."""
         self.complete = False
         """True if all channels are known, because the whole file was read."""
         self.channels: dict[int, Channel] = {}
         self.summary_damage = ""
-        """Message about the first needed summary record that is damaged; empty if there is none."""
+        """Message about the first damaged record of the summary that was needed, else empty."""
         self.attachments: dict[str, AttachmentEntry] = {}
         self._layouts: dict[str, Layout] = {}
         self._layout_bytes = 0
@@ -136,14 +136,14 @@ class Reader:
         """Yield the messages of some channels in a range of log times, in file order.
 
         After the last message, :attr:`Records.closed` and :attr:`Records.damage` say how the file
-        ends. Once all channels are known, chunks outside the range are skipped.
+        ends. When all channels are known, the reader skips chunks outside the range.
 
         Args:
             wanted: Selects the channels.
             from_ns: Start of the range.
             to_ns: End of the range.
-            damaged: Called for each damage in the range; reading continues with the next intact
-                chunk. If None, damage raises RecordingError.
+            damaged: Called for each damaged place in the range. Reading continues with the next
+                intact chunk. If None, damage raises RecordingError.
             records: The records to read; None for the whole file.
         """
 
@@ -179,7 +179,8 @@ class Reader:
         """Yield the messages of a chunk.
 
         Raises:
-            RecordingError: The chunk is damaged; or, after the last message, one was malformed.
+            RecordingError: The chunk is damaged. If only a message is malformed, the error comes
+                after the last message.
         """
         problem: RecordingError | None = None
         for channel, log_ns, data in contents:
@@ -194,13 +195,15 @@ class Reader:
             raise problem
 
     def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
-        """Yield the channel, log time and data of each message in a chunk, and store its channels.
+        """Yield channel, log time and data of each message in a chunk.
 
-        Messages of other programs are skipped. Frames of both versions are converted to FRAME.
+        Add the channels that it describes.
+
+        This skips messages of other programs, and converts frames of both versions to FRAME.
 
         Raises:
-            RecordingError: The chunk is damaged; or, after the last message, a message was skipped
-                because its channel is unknown.
+            RecordingError: The chunk is damaged. If only the channel of a message is unknown, the
+                error comes after the last message.
         """
         return self._raw(self.records.chunk(record))
 
@@ -223,14 +226,14 @@ class Reader:
                 if channel.encoding:
                     yield channel, log_ns, data
         if unknown is not None:
-            raise RecordingError(f"{self.file}: messages of channel {unknown}, which has no description")
+            raise RecordingError(f"{self.file}: the file has messages of channel {unknown}, which has no description")
 
     def channel(self, number: int) -> Channel | None:
         """Return a channel by its number; None if it is unknown.
 
-        If the chunk that describes the channel is damaged, its description in the summary of a
-        closed file is used. Damage of the summary is noted in :attr:`summary_damage`, and does not
-        affect other channels.
+        If the chunk that describes the channel is damaged, the description in the summary of a
+        closed file is used. If that is damaged, too, :attr:`summary_damage` says so; other channels
+        are not affected.
         """
         if number not in self.channels and not self._summarized:
             self._summarized = True
@@ -252,7 +255,7 @@ class Reader:
             if channel.encoding == FRAME:
                 frame = decode_frame(bytes(data))
                 if len(frame.raw) != self.layout(channel).size:
-                    raise ValueError("a frame does not have the size of its layout")
+                    raise ValueError("the size of a frame does not match its layout")
                 return frame
             return _DECODERS[channel.encoding](bytes(data))
         except ValueError as error:
@@ -290,7 +293,7 @@ class Reader:
         return self.records.read(entry.at, entry.size, limit)
 
     def note(self, record: Record) -> None:
-        """Process a record outside chunks: metadata, a header or an attachment.
+        """Read a record outside the chunks: metadata, a header or an attachment.
 
         Raises:
             RecordingError: The record is damaged.
@@ -317,7 +320,7 @@ class Reader:
         return start in (b"", bytes([Opcode.HEADER])) and self.records.record(len(MAGIC)) is None
 
     def _profile(self, record: Record) -> str:
-        """Return the profile in the file's header, which is used only for messages."""
+        """Return the profile in the file's header; empty if the header is damaged."""
         with suppress(ValueError, struct.error, McapError):
             return str(Header.read(stream(self.records.read(record.at, min(record.size, LOOK_BYTES)))).profile)
         return ""
@@ -335,7 +338,7 @@ class Reader:
     def _channel(self, content: memoryview) -> None:
         if len(content) > MAX_CHANNEL_BYTES or len(self.channels) >= MAX_CHANNELS:
             raise RecordingError(
-                f"{self.file}: it has more, or longer, descriptions of channels than a recorder writes"
+                f"{self.file}: the file has more, or longer, descriptions of channels than a recorder writes"
             )
         try:
             channel = decode_channel(content)
@@ -345,7 +348,7 @@ class Reader:
             raise RecordingError(f"{self.file}: channel {channel.number} has two different descriptions")
 
     def require_ours(self) -> None:
-        """Raise RecordingError if no recorder of shmio has written what was read."""
+        """Raise RecordingError unless shmio wrote the part of the file that was read."""
         if not self.about and not any(channel.encoding for channel in self.channels.values()):
             if not self.records.closed and (self._ours or self._is_cut_short()):
                 raise RecordingError(f"{self.file} {ONLY_BEGUN}")

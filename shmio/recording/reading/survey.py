@@ -1,4 +1,4 @@
-"""Surveys a recording without reading all of it, by its index or the indexes of its chunks."""
+"""Surveys a recording without reading all of it: by its index, or by the indexes of its chunks."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from shmio.recording.reading.reader import Reader
 
 MAX_CHUNKS: Final = 1 << 22
 MAX_SETS: Final = 1 << 16
-"""Largest number of different sets of channels in the chunks."""
+"""Largest number of different sets of channels that the chunks of a file may have."""
 MAX_GAPS: Final = 1000
-"""Largest number of gaps that are listed; all are counted."""
+"""Largest number of gaps that a survey lists. It counts all of them."""
 MAX_DAMAGE: Final = 20
-"""Largest number of damaged places that are listed."""
+"""Largest number of damaged places that a survey lists."""
 MAX_BLOCKS: Final = 10_000
 MAX_SUMMARY_BYTES: Final = 64 << 20
-"""Largest size of the summary; it has about 90 bytes per chunk, so this is enough for a week."""
+"""Largest size of the summary. It has about 90 bytes per chunk, so this is enough for a week."""
 
 _MAX_U64: Final = (1 << 64) - 1
 _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
@@ -40,7 +40,10 @@ _Times = npt.NDArray[np.uint64]
 
 
 class Chunks:
-    """A table of a file's chunks and damaged places, in order; each takes about 40 bytes."""
+    """A table of a file's chunks and damaged places, in order.
+
+    A row takes about 40 bytes of memory.
+    """
 
     def __init__(self) -> None:
         self._at = array("Q")
@@ -62,7 +65,9 @@ class Chunks:
         """
         held = frozenset(channels)
         if len(self._at) >= MAX_CHUNKS or (held not in self._sets and len(self._sets) >= MAX_SETS):
-            raise RecordingError(f"more than {MAX_CHUNKS} chunks, or channels in more than {MAX_SETS} combinations")
+            raise RecordingError(
+                f"the file has more than {MAX_CHUNKS} chunks, or more than {MAX_SETS} combinations of channels"
+            )
         self._opcode.append(chunk.opcode)
         self._held.append(self._sets.setdefault(held, len(self._sets)))
         self._at.append(chunk.at)
@@ -93,7 +98,7 @@ class Chunks:
     def before(self, time_ns: int, channels: Collection[int] | None = None) -> Iterator[tuple[Record, int, int]]:
         """Yield the chunks that begin at or before a time, the last one first.
 
-        Items are those of :meth:`between`.
+        Each item is as for :meth:`between`.
         """
         _, end = self._bounds(0, time_ns)
         yield from self._rows(range(end - 1, -1, -1), 0, time_ns, channels)
@@ -110,7 +115,8 @@ class Chunks:
     def _bounds(self, from_ns: int, to_ns: int) -> tuple[int, int]:
         """Return a range of indices that includes all chunks in a range of log times.
 
-        It may include others, because the times of adjacent chunks may overlap a little.
+        The range may include other chunks, because the times of adjacent chunks may overlap a
+        little.
         """
         latest_ns, earliest_ns = self._sorted
         begin = int(np.searchsorted(latest_ns, np.uint64(min(max(from_ns, 0), _MAX_U64)), "left"))
@@ -119,7 +125,7 @@ class Chunks:
 
     @cached_property
     def _sorted(self) -> tuple[_Times, _Times]:
-        """For each chunk, the latest time up to it, and the earliest time from it on; both ascend.
+        """The latest time up to each chunk, and the earliest time from each chunk on; both ascend.
 
         They are computed once, when the table is complete.
         """
@@ -129,7 +135,7 @@ class Chunks:
 
 
 class Count(NamedTuple):
-    """The number of a channel's messages in a chunk, and the first and the last log time."""
+    """The number of a channel's messages in a chunk, and their first and last log time."""
 
     channel: int
     messages: int
@@ -139,7 +145,7 @@ class Count(NamedTuple):
 
 @dataclass(slots=True)
 class Track:
-    """The number of a channel's messages in a file; times and chunks of the first and the last."""
+    """The number of a channel's messages in a file; time and chunk of the first and last."""
 
     channel: Channel
     count: int
@@ -152,7 +158,7 @@ class Track:
         """Return the numbers of the first and the last frame or event.
 
         Raises:
-            RecordingError: The chunk of one of them cannot be read.
+            RecordingError: The chunk of the first or the last cannot be read.
         """
         return self._in(reader, self.first_in)[0], self.last(reader)
 
@@ -165,7 +171,10 @@ class Track:
         return self._in(reader, self.last_in)[-1]
 
     def _in(self, reader: Reader, chunk: Record) -> list[int]:
-        """Return the numbers of the channel's frames or events in a chunk, at least one."""
+        """Return the numbers of the channel's frames or events in a chunk.
+
+        There is at least one.
+        """
         found: list[int] = []
         try:
             for channel, _, data in reader.raw(chunk):
@@ -181,7 +190,7 @@ class Track:
 
 @dataclass(slots=True)
 class Survey:
-    """A survey of the contents of a file."""
+    """What a file contains: channels, chunks, gaps and damage."""
 
     tracks: dict[int, Track] = field(default_factory=dict)
     """The counts and times of messages, by the channel's number."""
@@ -215,7 +224,7 @@ class Survey:
         """
         key = (gap.source, gap.block, gap.what)
         if key not in self.missed and len(self.missed) >= MAX_BLOCKS:
-            raise RecordingError(f"gaps of more than {MAX_BLOCKS} blocks")
+            raise RecordingError(f"the file has gaps of more than {MAX_BLOCKS} blocks")
         self.gap_count += 1
         self.missed[key] = self.missed.get(key, 0) + gap.count
         self.missed_to[key] = max(self.missed_to.get(key, 0), gap.last)
@@ -224,7 +233,7 @@ class Survey:
 
 
 def survey(reader: Reader) -> Survey:
-    """Survey a recording by a walk through the file. Damage is noted and skipped.
+    """Survey a recording by reading through the file. Note damage, and continue after it.
 
     Raises:
         RecordingError: The file is not a recording of shmio.
@@ -316,7 +325,7 @@ def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
 def survey_by_index(reader: Reader) -> Survey | None:
     """Survey a recording by its index; None if it has no intact and consistent index.
 
-    The result is equal to that of :func:`survey`, but takes less time.
+    The result is the same as that of :func:`survey`, but this takes less time.
     """
     try:
         data = _summary(reader)
@@ -326,7 +335,7 @@ def survey_by_index(reader: Reader) -> Survey | None:
 
 
 def _summary(reader: Reader) -> bytes:
-    """Return the bytes of the summary; empty if there is none or its CRC is wrong."""
+    """Return the bytes of the summary. Empty: the file has none, or its CRC is wrong."""
     footer = reader.records.footer()
     if footer is None:
         return b""
@@ -345,7 +354,7 @@ class _IndexSurvey:
         self._found = Survey()
         self._first: dict[int, tuple[Record, int]] = {}
         self._last: dict[int, tuple[Record, int]] = {}
-        """``_first`` and ``_last``: a channel's first and last chunk, and their message indexes."""
+        """Last chunk of each channel, and offset of its message index; likewise ``_first``."""
         self._counts: dict[int, int] = {}
         self._chunk_count = -1
 
@@ -381,7 +390,9 @@ class _IndexSurvey:
         self._found.chunks.add(chunk, first_ns, last_ns, [number for number, _ in places])
 
     def _track(self, number: int, chunk: Record, index: int) -> None:
-        """Add a channel, whose first chunk and message index are given.
+        """Add the track of a channel.
+
+        ``chunk`` is its first chunk; ``index`` is the offset of its index.
 
         Raises:
             RecordingError, ValueError: The message index is invalid.
@@ -417,7 +428,10 @@ def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
 
 
 def _places(content: memoryview, at: int) -> Iterator[tuple[int, int]]:
-    """Yield the items of a map from channels to numbers; its length in bytes is before ``at``."""
+    """Yield the items of a map from channels to numbers at ``at``.
+
+    Its length in bytes precedes it.
+    """
     (size,) = struct.unpack_from("<I", content, at - 4)
     if size > len(content) - at or size % _PLACE.size:
         raise ValueError

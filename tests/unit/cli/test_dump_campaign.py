@@ -113,10 +113,10 @@ def test_values_of_a_client_become_set_operations(derive: Derive) -> None:
 
 def test_injections_that_cannot_be_declared_are_reported(derive: Derive, capsys: pytest.CaptureFixture[str]) -> None:
     blind = declared(7, DRIFT | {"name": "blind"})._replace(writer=NO_WRITER)
-    again = "no client has added it, but the configuration or a replayed recording"
+    again = "no client created this injection, but the configuration or a replayed recording"
     limit = laid(5, "in", (0, 2, 255), name="limit")
-    why = "a client has set its values over /in, which depended on other writes"
-    earlier = "it was added before the recording began"
+    why = "a client gave its values over /in, and they depended on other writes"
+    earlier = "it was created before the recording began"
     derive(
         (1, blind), (5, given(4, 1)), (5, given(4, 2)), (10, limit), (20, declared(6, DRIFT)),
         said="".join(f"not exactly reproduced: {x}\n" for x in (f"blind: {again}", f"4: {earlier}", f"limit: {why}")),

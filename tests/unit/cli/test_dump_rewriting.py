@@ -74,7 +74,7 @@ def test_cut_by_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["cut", str(file), "-o", "part.mem"]) == 1
     assert capsys.readouterr().err == "part.mem exists already: choose another name, no file is overwritten\n"
     assert main(["cut", str(file), "-o", "none.mem", "--from", "100"]) == 1
-    assert re.fullmatch(r"nothing of \S+ is in that time; it was recorded from .* to .*\n", capsys.readouterr().err)
+    assert re.fullmatch(r"\S+ has nothing in that time: it was recorded from .* to .*\n", capsys.readouterr().err)
     assert not Path("none.mem").exists()
 
 

@@ -157,7 +157,7 @@ def test_columns_have_the_same_values_as_frames(tmp_path: Path) -> None:
     [
         (["count"], "not one of the 2 sources"),
         (["cell/nothing"], "no such register"),
-        (["cell/count", "press/count"], "registers of cell and press"),
+        (["cell/count", "press/count"], "these registers belong to cell and press"),
         (["cell/count/in"], "leave out /in"),
         (["cell/x*"], "no register of this recording"),
     ],
