@@ -48,7 +48,7 @@ def test_an_empty_value_is_refused() -> None:
         ({"operation": "drop", "target": 5}, "injection: "),
         ({"operation": "flip", "bits": [-1]}, "injection: "),
         ({"operation": "noise", "distribution": "even"}, "injection.distribution: 'even' is unknown"),
-        ({"operation": "random", "values": [None]}, "injection.values: a NoneType"),
+        ({"operation": "random", "values": [None]}, "injection.values: a Python NoneType"),
     ],
 )
 def test_invalid_declarations_are_refused(table: dict[str, Any], message: str) -> None:
