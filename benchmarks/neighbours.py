@@ -31,10 +31,10 @@ def resident_mb(pid: int) -> float:
     return int(next(line for line in lines if line.startswith("RssAnon:")).split()[1]) / 1024
 
 
-def latencies_ms(running: Instance, crowd: Sequence[object], duration_s: float) -> tuple[list[float], int]:
-    """Return a subscriber's latencies in ms beside these other subscribers, and how often one of those came."""
+def latencies_ms(running: Instance, arguments: Sequence[object], duration_s: float) -> tuple[list[float], int]:
+    """Return a subscriber's latencies in ms beside those of bad_subscribers.py, and how often one of these came."""
     with ExitStack() as stack:
-        others = stack.enter_context(Child("crowd.py", running.grpc, *crowd)) if crowd else None
+        others = stack.enter_context(Child("bad_subscribers.py", running.grpc, *arguments)) if arguments else None
         client = stack.enter_context(Child("subscriber.py", running.grpc, PATH, "--stamps"))
         time.sleep(SETTLE_S)
         begun_s = time.monotonic()
@@ -61,8 +61,8 @@ def main() -> None:
         started([Polled("cell", Address.parse(plc.hello), 1, HERE / "stamped.db")]) as running,
     ):
         for _ in range(rounds):
-            for name, crowd in SITUATIONS.items():
-                taken, came = latencies_ms(running, crowd, duration_s)
+            for name, arguments in SITUATIONS.items():
+                taken, came = latencies_ms(running, arguments, duration_s)
                 found[name] += taken
                 visits[name] += came
                 memory_mb[name].append(resident_mb(running.pids["grpc"]))

@@ -162,7 +162,7 @@ class TestRos2(WriteConformance):
         run.until(lambda frame: rig.counted(frame) and rig.generation(frame.raw) > last)
 
     def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Ros2Rig) -> None:  # type: ignore[override]
-        """A frozen node publishes late. The fixture ``run`` checks that counts never go back."""
+        """A frozen node publishes late. Values must not go back, which the fixture ``run`` checks at its end."""
         run.until(rig.counted)
         for _ in range(2):
             rig.proxy.freeze()

@@ -1,7 +1,8 @@
-"""Tests a chain of injections over one word: two clients inject beneath a declared injection, and end one by one.
+"""Tests a chain of injections over one word: two clients inject, and further out a declared injection.
 
-The inner client gives multiples of 4. The outer client has a higher priority, and gives the value that it receives
-plus 1. Both clients use shmio.v1, because only one program may be attached with write access.
+The clients end one by one. The inner client gives multiples of 4. The outer client has a higher priority, and gives
+the value that it receives plus 1. Both clients use shmio.v1, because all places for attached programs that write are
+taken.
 """
 
 from __future__ import annotations

@@ -63,7 +63,10 @@ class Counts:
     missed: int = 0
     values: int = 0
     since_ns: int = 0
-    """CLOCK_MONOTONIC when the PLC got the newest good value. Without a truth: when the source read that value."""
+    """CLOCK_MONOTONIC when the PLC got the newest good value.
+
+    Without a truth: when the value was published, or when its reader received it.
+    """
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Stress tests of the C core under sanitizers, and models that run through all its interleavings."""
+"""Stress tests of the C core under sanitizers, and models of it that are explored exhaustively."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The figures of a running cell, read by a real Prometheus: formats, alert rules, and the queries of the dashboard."""
+"""The figures of a running cell, read by a real Prometheus: formats, alert rules, and the dashboard's queries."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def get(url: str) -> bytes:
 
 @contextmanager
 def prometheus(folder: Path, target: Address, address: Address) -> Iterator[str]:
-    """Run Prometheus with the packaged rules, every 200 ms."""
+    """Run Prometheus with the packaged rules. It reads the figures every 200 ms."""
     shutil.copytree(PACKAGING, folder, dirs_exist_ok=True)
     file = folder / "prometheus.yml"
     text = (

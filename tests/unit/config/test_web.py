@@ -1,4 +1,4 @@
-"""The section ``[metrics]``: what is refused, and what is not."""
+"""The section ``[metrics]``: what it accepts, and what it refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A segment with one source, which only the test publishes."""
+"""A segment with one source. Only the test publishes its frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The HTTP endpoint over a real socket: a segment on one side, clients on the other."""
+"""The HTTP endpoint over a real socket: the test publishes into a segment, and clients request figures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def processes() -> list[ProcessSpec]:
 
 
 class Served:
-    """A served segment; the server runs in a thread."""
+    """An endpoint that serves a segment. The server runs in a thread."""
 
     def __init__(self, segment: Segment, measurements: Measurements, server: HttpServer) -> None:
         self.segment, self.measurements, self.server = segment, measurements, server
@@ -59,7 +59,7 @@ class Served:
             connection.close()
 
     def figures(self) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
-        """Return all figures by name and labels, as Prometheus' own library reads them."""
+        """Return all figures by name and labels, parsed by Prometheus' own library."""
         status, _, text = self.get()
         assert status == 200
         return {

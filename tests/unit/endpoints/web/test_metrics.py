@@ -1,4 +1,4 @@
-"""The figures for Prometheus: of processes, sources, registers, and of each source's timing."""
+"""The figures for Prometheus: of processes, sources and registers, and of each source's timing."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def counts(histogram: Histogram) -> int:
 
 
 def test_timing_is_that_of_cycles(segment: Segment) -> None:
-    """A gap between cycles is no period, and an image that is published again is no cycle."""
+    """A gap between cycles is not a period. An image that is published again is not a cycle."""
     writer, block = segment.writer("cell"), segment.blocks["cell"]
     timing = SourceTiming(block, segment.header.started_ns)
     for cycle in (1, 2, 2, 3, 7, 8):
@@ -136,7 +136,7 @@ def test_timing_is_that_of_cycles(segment: Segment) -> None:
 
 
 def test_time_of_commands(segment: Segment) -> None:
-    """From acceptance to the first outcome; an outcome of a command that was accepted before is left out."""
+    """The time is from acceptance to the first outcome. A command accepted earlier does not count."""
     writer, block = segment.writer("cell"), segment.blocks["cell"]
     timing = SourceTiming(block, segment.header.started_ns)
     for kind, command in (

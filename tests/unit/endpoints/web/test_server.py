@@ -1,4 +1,4 @@
-"""The HTTP server with foreign names, and with clients that misbehave."""
+"""The HTTP server with requests for foreign names, and with clients that misbehave."""
 
 from __future__ import annotations
 
