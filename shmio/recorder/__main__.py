@@ -1,4 +1,4 @@
-"""Runs the process of the recorder."""
+"""The main module of the recorder's process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 
 NOTE = "to "
-"""Start of the recorder's status note if there is no problem; the name of its file follows."""
+"""Start of the recorder's status note if it has no problem. The name of its file follows."""
 WAITS = f"{NOTE}a file as soon as its trigger fires"
 
 
@@ -53,11 +53,14 @@ def run(worker: Worker) -> None:
         worker.log.error("%s", unclosed)
     _report(worker, series, "")
     counters = series.counters
-    worker.log.info("%d frames, %d events, %d missed", counters.frames, counters.events, counters.missed)
+    worker.log.info("recorded %d frames and %d events; missed %d", counters.frames, counters.events, counters.missed)
 
 
 def _elsewhere(before: Report, directory: Path) -> str:
-    """Return a log text if the previous recorder's file is not in this folder, else ""."""
+    """Return a text for the log if the previous recorder's file is not in this folder.
+
+    The text is empty if that file is in the folder, or if the previous recorder wrote none.
+    """
     name = before.note.removeprefix(NOTE)
     if before.note in (name, WAITS) or (directory / name).exists():
         return ""
@@ -67,7 +70,7 @@ def _elsewhere(before: Report, directory: Path) -> str:
 def _record(worker: Worker, series: RotatingRecorder | TriggeredRecorder) -> None:
     """Record in turns until the worker is stopped.
 
-    In virtual time, each step waits for a turn, so that the recorder misses nothing.
+    In virtual time, each step waits until the recorder has read its frames, so that none is missed.
     """
     clock, slot = worker.segment.clock, worker.slot.index
     bell = clock.slot_bell(slot)

@@ -1,4 +1,4 @@
-"""Writes a recording's file in a separate thread, so that a slow disk does not delay reading."""
+"""Writes a recording's file in a separate thread. So a slow disk does not delay the recorder."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from shmio.errors import RecordingError
 RETRY_S: Final = 0.5
 """Time between attempts after a failed write."""
 WAIT_S: Final = 0.02
-"""Period at which to check whether the previous file is complete."""
+"""Interval at which to check whether the previous file is complete."""
 SLOW_S: Final = 2.0
-"""A write that takes longer is reported as a problem."""
+"""A write that takes longer than this is reported as a problem."""
 SUFFIX: Final = ".mem"
 _NAMES: Final = 1000
 
 
 def create(directory: Path, instance: str, now: datetime | None = None) -> tuple[Path, int]:
-    """Create a file named after the instance and the time (UTC), and its directory if needed.
+    """Create a file whose name has the instance and the time (UTC), and its directory if needed.
 
-    An existing file is never changed. Only the user may read the new file.
+    The function never changes an existing file. Only this user may read the new file.
 
     Returns:
         The path and the file descriptor.
@@ -50,9 +50,10 @@ def create(directory: Path, instance: str, now: datetime | None = None) -> tuple
 class Output:
     """Queues bytes from one thread, and writes them to a file in another.
 
-    The bytes between two calls of :meth:`flush` are a piece. The file contains only whole pieces,
-    even if the disk is full: a piece that does not fit is removed and retried. The file is locked
-    (flock) while it is being written, so that no process takes it for the file of a dead recorder.
+    The bytes between two calls of :meth:`flush` are a piece. The file contains only whole pieces.
+    If the disk is full, the thread removes an incomplete piece from the file, and writes the piece
+    again later. The file is locked (flock) while it is being written, so that no process takes it
+    for the file of a dead recorder.
     """
 
     def __init__(
@@ -63,25 +64,26 @@ class Output:
         Args:
             path: Path of the file.
             fd: Descriptor of the file.
-            limit_bytes: Number of waiting bytes above which the output is :attr:`full`.
+            limit_bytes: If more bytes than this wait for the disk, the output is :attr:`full`.
             fsync_s: Time between two fsyncs; 0 for an fsync only at the end.
-            after: The previous file, which must be complete before this file is written.
+            after: The output of the previous file. This file is written only when that one is
+                complete.
         """
         with suppress(OSError):  # a file system without locks
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self.path = path
         self.error = ""
-        """Reason why the waiting bytes cannot be written; empty if they can."""
+        """Reason why the last write failed; empty if it succeeded."""
         self.doubt = ""
         """Reason why bytes of the file may be lost; empty if no fsync has failed.
 
-        It is never cleared. After a failed fsync the kernel counts the pages as written, so a later
-        fsync of this file does not report the failure again.
+        The reason is never cleared. After a failed fsync the kernel counts the pages as written, so
+        a later fsync of this file does not report the failure again.
         """
         self.written = 0
         """Number of bytes in the file."""
         self.synced = 0
-        """Number of bytes that an fsync has confirmed; it does not grow after a failed fsync."""
+        """Number of bytes that an fsync has confirmed. It does not grow after a failed fsync."""
         self._fd = fd
         self._limit = limit_bytes
         self._fsync_s = fsync_s
@@ -103,7 +105,7 @@ class Output:
     # ---- called by the recorder's thread -----------------------------------------------------------------------------
 
     def write(self, data: bytes | memoryview) -> int:
-        """Append to the present piece, without waiting for the disk."""
+        """Append to the present piece. This does not wait for the disk."""
         self._piece += data
         return len(data)
 
@@ -127,7 +129,10 @@ class Output:
 
     @property
     def full(self) -> bool:
-        """True if too many bytes wait. It stays True until fewer than half the limit wait."""
+        """True if too many bytes wait for the disk.
+
+        It stays True until at most half the limit wait.
+        """
         self._full = self.waiting > (self._limit // 2 if self._full else self._limit)
         return self._full
 
@@ -149,7 +154,10 @@ class Output:
             raise RecordingError(f"{self.path} was removed while it was being written")
 
     def end(self) -> None:
-        """Accept no more bytes. The thread writes those that wait, however long the disk takes."""
+        """Accept no more bytes.
+
+        The thread writes the waiting bytes, however long the disk takes.
+        """
         self.flush()
         with self._news:
             self._ending = True
@@ -161,7 +169,10 @@ class Output:
         return not self._thread.is_alive()
 
     def close(self, patience_s: float) -> bool:
-        """Write the waiting bytes within ``patience_s``; return whether all were written safely."""
+        """Write the waiting bytes, at most for ``patience_s``.
+
+        Return whether all are safely on the disk.
+        """
         self.flush()
         with self._news:
             self._ending = self._closing = True
@@ -198,7 +209,7 @@ class Output:
         self._sync()
 
     def _is_next(self) -> bool:
-        """Wait until the previous file has ended; return False if it is not complete."""
+        """Wait until the previous file has ended. Return False if that file is not complete."""
         after, self._after = self._after, None
         while after is not None and not (after.whole or after.ended or self._closing):
             after._thread.join(WAIT_S)
@@ -208,7 +219,7 @@ class Output:
         return False
 
     def _put(self, piece: bytes) -> bool:
-        """Write a whole piece; if it does not fit, remove what was written of it."""
+        """Write a whole piece. If that fails, remove its written part, and return False."""
         self._busy_since_s = time.monotonic()
         view, at = memoryview(piece), 0
         try:
@@ -225,7 +236,7 @@ class Output:
         return True
 
     def _wait(self) -> bool:
-        """Wait before the next attempt; return False if the file is being closed."""
+        """Wait before the next attempt. Return False if the file is being closed."""
         with self._news:
             if not self._closing:
                 self._news.wait_for(lambda: self._closing, RETRY_S)

@@ -52,10 +52,10 @@ from shmio.recording.format.records import (
 from shmio.recording.reading.reader import Reader
 
 LOOK_S: Final = 60.0
-"""Period at which the folder is checked."""
+"""Interval in s at which the folder is checked."""
 DAY_S: Final = 86_400
 CHECKED: Final = 128
-"""Number of chunks at the end of a file that are verified, because a power cut may leave zeros."""
+"""Number of chunks at the end of a file to verify. After a power cut, they may have zeros."""
 ZEROS_BYTES: Final = 1 << 20
 
 _MESSAGE: Final = struct.Struct("<HIQ")  # channel, sequence, log time
@@ -65,7 +65,7 @@ log = logging.getLogger("shmio.recorder")
 
 
 class _File(NamedTuple):
-    """Identity and size of a file at a check; it is read again only if they have changed."""
+    """Identity and size of a file at a check. The file is read again only if they have changed."""
 
     path: Path
     inode: int
@@ -76,18 +76,18 @@ class _File(NamedTuple):
 class Housekeeper:
     """Thread that closes and deletes recordings.
 
-    It changes only this user's recordings of this instance by the same kind of recorder (``by``),
-    and never a file that another process is writing.
+    It changes only recordings of this user and this instance that the same kind of recorder
+    (``by``) has written. It never changes a file that another process is writing.
     """
 
     def __init__(self, instance: str, settings: Settings, by: str, present: Callable[[], set[Path]]) -> None:
-        """Create the thread; ``present`` returns the files that this recorder is writing."""
+        """Create the thread. ``present`` returns the files that this recorder is writing."""
         self._instance = instance
         self._settings = settings
         self._by = by
         self._present = present
         self._own: dict[_File, bool] = {}
-        """The recordings by this kind of recorder; the value is True if the recording is closed."""
+        """The recordings by this kind of recorder. The value is True if the recording is closed."""
         self._strange: set[_File] = set()
         self._undeletable: set[_File] = set()
         self._stop = threading.Event()
@@ -98,7 +98,10 @@ class Housekeeper:
         self._thread.start()
 
     def stop(self, patience_s: float = 0.5) -> None:
-        """Stop the thread; it ends before the next file."""
+        """Stop the thread before it handles the next file.
+
+        Wait for its end, at most ``patience_s``.
+        """
         self._stop.set()
         self._thread.join(patience_s)
 
@@ -111,7 +114,7 @@ class Housekeeper:
             self._stop.wait(LOOK_S)
 
     def look(self) -> None:
-        """Check the folder once, and close and delete files."""
+        """Check the folder once: close recordings that were left unclosed, and delete old ones."""
         present = self._present()
         files = [_file(path) for path in own_files(Path(self._settings.directory), self._instance)]
         found = [file for file in files if file is not None]
@@ -134,7 +137,7 @@ class Housekeeper:
             with Reader(file.path, own=True) as reader:
                 closed = reader.records.footer() is not None
             if not closed and finalise(file.path):
-                log.info("%s is closed now: its recorder died before it could close it", file.path)
+                log.info("closed %s, because its recorder died before it could close the file", file.path)
                 file, closed = _file(file.path) or file, True
             self._own[file] = closed
         except (OSError, RecordingError) as error:
@@ -142,7 +145,10 @@ class Housekeeper:
             log.warning("%s is left unchanged: %s", file.path, error)
 
     def _delete(self, present: list[_File]) -> None:
-        """Delete closed files that are too old; then the oldest until the rest is small enough."""
+        """Delete closed files that are too old.
+
+        Then delete the oldest closed files until all files together are small enough.
+        """
         settings = self._settings
         left = sum(file.size for file in (*present, *self._own))
         oldest = sorted((file for file, closed in self._own.items() if closed), key=lambda file: file.changed_ns)
@@ -168,12 +174,15 @@ class Housekeeper:
                 log.warning("%s cannot be deleted: %s; %s", file.path, error.strerror, why)
             return False
         del self._own[file]
-        log.info("%s is deleted: %s", file.path, why)
+        log.info("deleted %s: %s", file.path, why)
         return True
 
 
 def _is_held(path: Path) -> bool:
-    """Return whether a replay uses the file. It must stay, because a restart needs it again."""
+    """Return whether a replay uses the file.
+
+    The file must stay: a restarted replay reads it again.
+    """
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -187,7 +196,7 @@ def _is_held(path: Path) -> bool:
 
 
 def _file(path: Path) -> _File | None:
-    """Return the file's present state; None if it does not exist or is not this user's own file."""
+    """Return the file's present state; None if it does not exist or belongs to another user."""
     try:
         found = path.lstat()
     except OSError:
@@ -200,7 +209,7 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
 
     Args:
         file: The file.
-        beat: Called regularly, as a heartbeat.
+        beat: Called at intervals, so that the process can write its heartbeat.
 
     Returns:
         False if another process is still writing the file.
@@ -257,7 +266,7 @@ class _RecordingEnd:
         """Read the file.
 
         Raises:
-            RecordingError: It is not a recording, or is damaged before its end.
+            RecordingError: The file is not a recording, or is damaged before its end.
         """
         self._reader = reader
         self._records = reader.records
@@ -269,7 +278,7 @@ class _RecordingEnd:
         self.cut = len(MAGIC)
         """Offset in the file at which the last complete record ends."""
         self._anew = b""
-        """New message indexes of the last chunk."""
+        """New message indexes for the last chunk, which replace those in the file."""
         self._walk()
         self._check()
 
@@ -308,7 +317,7 @@ class _RecordingEnd:
         opcode, length = HEAD.unpack(self._records.read(self.cut, HEAD.size))
         cut_short = opcode != BROKEN and size - HEAD.size < length <= MAX_CHUNK_BYTES
         if not cut_short and not self._zeros():
-            raise self._damaged(self.cut, "it is damaged from there on")
+            raise self._damaged(self.cut, "the file is damaged to its end")
 
     def _zeros(self) -> bool:
         end = self._records.size
@@ -342,7 +351,10 @@ class _RecordingEnd:
         self._chunks.append(_Chunk(record, index))
 
     def _index(self, record: Record) -> None:
-        """Add a message index to the last chunk; if its channel is new, read its description."""
+        """Add a message index to the last chunk.
+
+        If its channel is new, read the channel's description.
+        """
         chunk = self._chunks[-1]
         number, size = INDEX.unpack(self._records.read(record.at, INDEX.size))
         if number not in self._channels:
@@ -359,7 +371,7 @@ class _RecordingEnd:
                 known[number] = HEAD.pack(opcode, len(content)) + bytes(content)
 
     def _index_anew(self) -> None:
-        """Create the message indexes of the last chunk again; they may be missing or incomplete."""
+        """Create the message indexes of the last chunk again, because some may be missing."""
         chunk = self._chunks[-1]
         self.cut = chunk.record.at + chunk.record.size
         found: dict[int, MessageIndex] = {}
@@ -395,7 +407,7 @@ class _RecordingEnd:
         self._metadata.append(MetadataIndex(record.start, record.size + HEAD.size, name))
 
     def _check(self) -> None:
-        """Remove damaged chunks near the end from the index."""
+        """Leave damaged chunks near the end of the file out of the index."""
         whole = self._chunks[:-CHECKED]
         for chunk in self._chunks[-CHECKED:]:
             with suppress(RecordingError):

@@ -14,14 +14,14 @@ from shmio.segment.events import EVENT_SIZE
 from shmio.segment.processes import Phase, ProcessSlot
 
 TURN_S: Final = 0.1
-"""Longest pause between two turns of the recorder."""
+"""Longest pause between two turns of the recorder, in s. It reads all new entries in a turn."""
 LIVELY: Final = 256
-"""Entries of one block in a turn above which the next turn comes sooner.
+"""If one block has more entries than this in a turn, the next turn comes sooner.
 
 Many commands fill an event ring fast.
 """
 BATCH_BYTES: Final = 2 << 20
-"""Approximate number of bytes to read from one block in a turn; the next turn reads the rest."""
+"""Approximate number of bytes to read from one block in a turn. The next turn continues there."""
 
 _DOWN: Final[Mapping[Phase, ProcessEvent]] = {Phase.BACKOFF: ProcessEvent.DIED, Phase.FATAL: ProcessEvent.GAVE_UP}
 
@@ -29,7 +29,7 @@ Item = TypeVar("Item", bound=Frame | Event)
 
 
 class BlockEntry(NamedTuple):
-    """A frame, an event or a gap of a block, with its time in the recording."""
+    """A frame, an event or a gap of a block, with its log time."""
 
     log_ns: int
     follower: BlockFollower
@@ -37,7 +37,7 @@ class BlockEntry(NamedTuple):
 
 
 class InstanceEntry(NamedTuple):
-    """A step or a process change of the instance, with its time in the recording."""
+    """The end of a step or a process change of the instance, with its log time."""
 
     log_ns: int
     item: StepMark | ProcessChange
@@ -63,7 +63,7 @@ class _Stream(Generic[Item]):
 class BlockFollower:
     """Reads the frames and events of one block in order.
 
-    ``done`` is True if a reload has retired the block and everything was read from it.
+    ``done`` is True if a reload has retired the block, and all its entries have been read.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class BlockFollower:
             number: Number of the block in the recording.
             place: The position after which to start.
             reason: Reason for a gap at the start.
-            log_time: Converts CLOCK_MONOTONIC to the time in the recording.
+            log_time: Converts CLOCK_MONOTONIC to log time.
             over: True if a reload has already retired the block.
             part: The registers to record; None for all.
         """
@@ -111,13 +111,13 @@ class BlockFollower:
             yield from self._entries(side)
 
     def rest(self) -> Iterator[BlockEntry]:
-        """Yield gaps for the missing frames and events after the last entry."""
+        """Yield gaps for the frames and events that are missing after the last entry."""
         for side in (self._frames, self._events):
             if side.cursor.last > side.last and side.held is None:
                 yield BlockEntry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
 
     def _next(self) -> _Stream[Frame] | _Stream[Event] | None:
-        """Return the stream with the next entry; None if there is none."""
+        """Return the stream that has the next entry; None if there is no new entry."""
         frame = self._frames.peek()
         event = self._events.peek()
         if event is None:
@@ -162,7 +162,7 @@ class _ProcessState(NamedTuple):
 
 
 class ProcessWatch:
-    """Finds changes in the process table, also if a process has restarted between two checks."""
+    """Finds changes in the process table, even if a process was restarted between two checks."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -180,7 +180,7 @@ class ProcessWatch:
         return changes
 
     def standing(self) -> list[ProcessChange]:
-        """Return the running and the failed processes at the last check, as changes."""
+        """Return a process change for each process that ran or had failed at the last check."""
         found = []
         for name, state in self._known.items():
             what = ProcessEvent.IS if state.phase is Phase.RUNNING else _DOWN.get(state.phase)
@@ -218,7 +218,8 @@ def _between(name: str, old: _ProcessState | None, now: _ProcessState) -> Iterat
 class StartPositions(NamedTuple):
     """The positions after which to start reading, by the section of each block.
 
-    Blocks without a position start at their oldest frame if ``first`` is True, else now.
+    For a block without a position, reading starts at the oldest frame if ``first`` is True, else
+    with the next new frame.
     """
 
     places: Mapping[int, BlockPosition] = {}
@@ -233,20 +234,23 @@ FROM_THE_FIRST: Final = StartPositions()
 class InstanceFollower:
     """Reads each entry of an instance once, in order. Use it from one thread only.
 
-    It also follows blocks that a reload adds or replaces. Several files may be written from it one
-    after another; no entry is lost between them.
+    It also follows blocks that a reload adds or replaces. Several files may be written from one
+    follower, one after another. No entry is lost between them.
     """
 
     def __init__(
         self, segment: Segment, start: StartPositions = FROM_THE_FIRST, selection: Selection | None = None
     ) -> None:
-        """Create the follower. ``selection`` names the sources and registers; None is all."""
+        """Create the follower.
+
+        ``selection`` names the sources and registers to record; None: all.
+        """
         self.segment = segment
         self.start = start
         self.followers: list[BlockFollower] = []
-        """Followers of present blocks, and of retired blocks that were not read to their end."""
+        """Followers of the present blocks, and of retired blocks that have unread entries."""
         self.done = 0
-        """Number of the last step of virtual time that was read completely."""
+        """Number of the last step of virtual time of which all frames have been read."""
         self._selection = selection or Selection()
         self._watched: set[str] = set()
         self._watching: list[BlockFollower] = []
@@ -265,10 +269,9 @@ class InstanceFollower:
         return tap
 
     def watch(self, sources: Collection[str]) -> None:
-        """From now on, also read these sources, even if they are not recorded.
+        """From now on, also read these sources, even if they are not selected for recording.
 
-        The followers of sources that are not recorded have number 0. They are not in
-        :attr:`followers`.
+        A follower of a source that is not selected has number 0, and is not in :attr:`followers`.
         """
         self._watched |= set(sources)
         followed = {follower.block.section for follower in (*self.followers, *self._watching)}
@@ -329,19 +332,19 @@ class InstanceFollower:
         return [InstanceEntry(now_ns, change) for change in changes]
 
     def rest(self) -> list[BlockEntry]:
-        """Return gaps for what is missing after the last entries."""
+        """Return gaps for the frames and events that are missing after the last entries."""
         return [entry for follower in self.followers for entry in follower.rest()]
 
     @property
     def pause_s(self) -> float:
-        """Time to wait before the next turn, in s; rings keep entries much longer."""
+        """Time to wait before the next turn, in s. The rings keep entries much longer."""
         rings = [follower.block.ring for follower in (*self.followers, *self._watching)]
         return min(
             [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]
         )
 
     def _step(self, state: Clock) -> list[InstanceEntry]:
-        """Return the mark of a step that was read completely."""
+        """Return the mark for the end of a step of which all frames have been read."""
         self.done = state.done
         if state.done != state.step or not state.dt_ns:  # the length of that step is unknown
             return []
@@ -349,7 +352,7 @@ class InstanceFollower:
         return [InstanceEntry(log_ns, StepMark(state.step, state.time_ns, state.dt_ns))]
 
     def _follow(self, start: StartPositions) -> None:
-        """Follow new blocks, and retired blocks that were not read completely."""
+        """Follow new blocks, including those that a reload has added and already retired."""
         self._known = self.segment.blocks
         ended = self.segment.ended
         for block in (*ended, *self._known.values()):

@@ -1,4 +1,4 @@
-"""Finds recordings of earlier recorders, and the position at which the last one ended."""
+"""Finds recordings of earlier recorders, and the position at which the last recording ended."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from shmio.recording.reading.survey import survey
 from shmio.segment import Block, Segment
 
 ABOUT_BYTES: Final = 1 << 20
-"""Number of bytes to read for the metadata about the instance, the second record of a file."""
+"""Number of bytes to read at the start of a file, for the metadata about the instance."""
 MAX_FILES: Final = 256
-"""Largest number of recordings to check, from the newest by name on."""
+"""Largest number of recordings to check: those with the newest names."""
 
 log = logging.getLogger("shmio.recorder")
 
 
 def own_files(directory: Path, instance: str) -> list[Path]:
-    """Return this user's regular files whose names are those of recordings of this instance.
+    """Return the files that have the name of a recording of this instance.
 
-    Other files with such names are ignored, with a warning in the log.
+    Ignore files that are not regular files of this user, and log a warning.
     """
     name = re.compile(rf"{re.escape(instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # does not match a50-test
     found: list[Path] = []
@@ -47,7 +47,7 @@ def own_files(directory: Path, instance: str) -> list[Path]:
 
 
 def is_own(status: os.stat_result) -> bool:
-    """Return whether a file's status is that of a regular file of this user."""
+    """Return whether a file is a regular file of this user, according to its status."""
     return stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
 
 
@@ -58,11 +58,11 @@ def about_of(file: Path, instance: str, by: str, beat: Callable[[], object] = la
         file: The file.
         instance: Name of the instance.
         by: Kind of recorder.
-        beat: Called regularly, as a heartbeat.
+        beat: Called at intervals, so that the process can write its heartbeat.
 
     Returns:
-        The metadata. It is empty if the file is of another instance or another kind of recorder, or
-        was made from other recordings.
+        The metadata. It is empty if another instance or another kind of recorder wrote the file, or
+        if it was made from other recordings.
 
     Raises:
         OSError: The file is not a regular file of this user, or cannot be read.
@@ -88,10 +88,10 @@ def last_positions(
         directory: Directory of the recordings.
         segment: The instance's segment.
         by: Kind of recorder.
-        beat: Called regularly, as a heartbeat.
+        beat: Called at intervals, so that the process can write its heartbeat.
 
     Returns:
-        The positions by the sections of blocks. Blocks that were not recorded are not included.
+        The positions, by the section of each block. A block that was not recorded has none.
     """
     found: dict[int, BlockPosition] = {}
     blocks = {block.section: block for block in (*segment.ended, *segment.blocks.values())}
@@ -118,7 +118,8 @@ def trigger_interrupted(directory: Path, segment: Segment, by: str, beat: Callab
 def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], object]) -> list[Path]:
     """Return the recordings of this run of the instance, from the newest to the oldest.
 
-    They are not sorted by name, because the host's clock may have been set back.
+    They are sorted by the monotonic time at which they began. Their names may be in another order,
+    because the host's clock may have been set back.
     """
     epoch = f"{segment.header.epoch:016x}"
     found: list[tuple[int, Path]] = []
@@ -136,7 +137,7 @@ def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], 
 def _positions(reader: Reader, blocks: dict[int, Block]) -> dict[int, BlockPosition]:
     """Return the position of each block at the end of a file.
 
-    For a block without intact entries, it is the position at the start of the file.
+    For a block without intact entries, this is the position at the start of the file.
     """
     found = survey(reader)
     positions = {section: place for section, place in reader.places.items() if section in blocks}
@@ -151,7 +152,9 @@ def _positions(reader: Reader, blocks: dict[int, Block]) -> dict[int, BlockPosit
             try:
                 number = track.last(reader)
             except RecordingError as error:
-                log.warning("the end of the previous recording is damaged; recording its entries again: %s", error)
+                log.warning(
+                    "the end of the previous recording is damaged, so its last entries are recorded again: %s", error
+                )
                 track = None
         number = max(number, found.missed_to.get((channel.source, channel.block, what), 0))
         frame, event, log_ns = positions.get(channel.section, BlockPosition())

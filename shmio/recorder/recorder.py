@@ -1,4 +1,4 @@
-"""Records an instance to one file, or to a sequence of files rotated by size and age."""
+"""Records an instance to one file, or to a sequence of files that are rotated by size and age."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from shmio.version import __version__
 MAX_FILE_BYTES: Final = 16 << 20
 """Largest size of a file that is attached to a recording."""
 CHUNK_S: Final = 0.8
-"""Longest duration of a chunk, so that a killed recorder loses less than a second."""
+"""Longest duration of a chunk, in s. So a killed recorder loses less than a second."""
 CLOSE_S: Final = 3.0
 CHECK_S: Final = 1.0
-"""Period at which to check whether the file was removed."""
+"""Interval in s at which to check whether the file was removed."""
 CONFIG_S: Final = 5.0
-"""Period at which to check whether the configuration has changed."""
+"""Interval in s at which to check whether the configuration has changed."""
 RENEWAL: Final = Backoff(1.0, 600.0)
-"""Back-off between new files while fsync fails repeatedly."""
+"""Back-off between attempts to start a new file, while fsync fails again and again."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -54,9 +54,9 @@ class AttachedFile(NamedTuple):
 
 
 AttachedFiles = Callable[[str | None, int], list[AttachedFile]]
-"""Returns the files to attach for a source's name and its block's number.
+"""Returns the files to attach for a source: its arguments are the source's name and block number.
 
-With None, it returns the files of the instance.
+If the name is None, it returns the files of the instance.
 """
 
 
@@ -66,14 +66,20 @@ def no_attachments(_source: str | None, _block: int) -> list[AttachedFile]:
 
 
 class ConfigFiles:
-    """Reads the files that a configuration names; skips and logs those that cannot be read."""
+    """Reads the files that a configuration names.
+
+    It skips files that cannot be read, and logs why.
+    """
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._told: set[str] = set()
 
     def __call__(self, source: str | None, block: int) -> list[AttachedFile]:
-        """Return the files of a source's layout; if ``source`` is None, the configuration file."""
+        """Return the files of a source's layout.
+
+        If ``source`` is None, return the configuration file.
+        """
         if source is None:
             return self._read("config", [self._file], TOML)
         try:
@@ -110,7 +116,7 @@ class ConfigFiles:
 
 @dataclass(slots=True)
 class _LostRange:
-    """A range of frames or events that were lost because the buffer was full."""
+    """A range of frames or events that were lost because the output was full."""
 
     first: int
     last: int
@@ -123,9 +129,9 @@ class _LostRange:
 
 @dataclass(slots=True)
 class RecordedBlock:
-    """A block in one file, with its first position and the last frame and event recorded.
+    """A block in one file, with its start position and its last recorded frame and event.
 
-    Frames and events in a gap count as recorded.
+    Frames and events in a recorded gap count as recorded.
     """
 
     follower: BlockFollower
@@ -148,7 +154,7 @@ class RecordedBlock:
         return sum(lost.count for lost in self.lost.values())
 
     def come_to(self, what: str, number: int, log_ns: int) -> None:
-        """Store that all frames or events up to this number were recorded."""
+        """Note that all frames or events up to this number were recorded."""
         self.log_ns = log_ns
         if what == "frames":
             self.frame = number
@@ -166,7 +172,7 @@ class RecordedBlock:
         return last - first + 1
 
     def found(self, before_ns: int) -> list[Gap]:
-        """Return gaps for the lost entries, and reset these."""
+        """Return gaps for the lost entries, and clear :attr:`lost`."""
         block = self.follower.block
         lost, self.lost = self.lost, {}
         return [
@@ -180,7 +186,7 @@ class RecordedBlock:
 
 @dataclass(slots=True)
 class Counters:
-    """Numbers of recorded frames and events, and of missed frames and events."""
+    """Numbers of recorded frames, of recorded events, and of missed frames and events."""
 
     frames: int = 0
     events: int = 0
@@ -207,8 +213,8 @@ class Recorder:
             tap: Follows the instance.
             output: The file.
             by: Kind of recorder.
-            places: Positions by section at which the previous file ended; None for those at which
-                ``tap`` started.
+            places: Positions at which the previous file ended, by section of the block. None: the
+                positions at which ``tap`` started.
             about: More metadata about the recording.
             counters: Counters to continue; None for new ones.
             attachments: Returns the files to attach.
@@ -217,12 +223,15 @@ class Recorder:
         self.output = output
         self.counters = counters or Counters()
         self.places = dict(tap.start.places if places is None else places)
-        """Positions by section up to which entries were recorded, as of the last :meth:`settle`."""
+        """Position after the last recorded entry of each block, by section.
+
+        :meth:`settle` updates these positions.
+        """
         self.confirmed: Mapping[int, BlockPosition] = dict(self.places)
-        """Positions by section up to which an fsync has confirmed the recording."""
+        """Position of each block, by section, up to which an fsync has confirmed the recording."""
         self._ended = False
         self.empty = True
-        """True if nothing was recorded yet except process changes."""
+        """True if only process changes, or nothing, were recorded so far."""
         self._attachments = attachments
         self._writer = Writer(output, {**self._about(by), **(about or {})})
         self._followed: dict[int, RecordedBlock] = {}
@@ -230,7 +239,7 @@ class Recorder:
         self._config = attachments(None, 0)
         self._attach(self._config)
         self._unaware = True
-        """True if the present state of the processes must be recorded next."""
+        """True if the next entries to record must include the present state of the processes."""
         self._to_confirm: tuple[int, dict[int, BlockPosition]] | None = None
         self._writer.places(self.places)
         for follower in tap.followers:
@@ -299,9 +308,9 @@ class Recorder:
             self._look()
 
     def _confirm(self) -> None:
-        """Move the stored positions to :attr:`confirmed` once everything before them was synced.
+        """Copy the stored positions to :attr:`confirmed` if an fsync has covered their data.
 
-        Then store the present positions, to confirm them next.
+        Then store the present positions, which will be confirmed next.
         """
         if self._to_confirm and self.output.synced >= self._to_confirm[0]:
             self.confirmed, self._to_confirm = self._to_confirm[1], None
@@ -310,7 +319,7 @@ class Recorder:
             self._to_confirm = self.output.tell(), dict(self.places)
 
     def settle(self) -> None:
-        """Update :attr:`places` to the last recorded entries."""
+        """Set :attr:`places` to the positions of the last recorded entries."""
         self.places |= {section: followed.place for section, followed in self._followed.items()}
 
     @property
@@ -326,7 +335,10 @@ class Recorder:
         return f"{problem}; {lost} frames and events lost so far" if problem and lost else problem
 
     def end(self) -> None:
-        """Write the index and the footer, without waiting for the disk. Later calls do nothing."""
+        """End the file with its index and footer, without waiting for the disk.
+
+        Later calls do nothing.
+        """
         if self._ended:
             return
         self._ended = True
@@ -337,7 +349,10 @@ class Recorder:
         self.output.end()
 
     def close(self, patience_s: float = CLOSE_S) -> bool:
-        """Record remaining entries and close the file; return False if the disk was too slow."""
+        """Record the remaining entries, and close the file.
+
+        Return False if it is not safely on the disk.
+        """
         while self.turn():
             pass
         self.put(self.tap.rest())
@@ -350,7 +365,10 @@ class Recorder:
         return self._followed.get(follower.block.section) or self._follow(follower)
 
     def _follow(self, follower: BlockFollower) -> RecordedBlock:
-        """Begin to record a block, and attach the files that are needed to read it."""
+        """Begin to record a block.
+
+        Attach its layout and the files from which the layout was made.
+        """
         block = follower.block
         place = self.places.get(block.section, follower.begin)
         followed = self._followed[block.section] = RecordedBlock(follower, place, *place)
@@ -415,7 +433,10 @@ class Recorder:
             self.counters.missed += self._known(entry.follower).lose(entry.item)
 
     def _tell_lost(self, followed: RecordedBlock, before_ns: int) -> None:
-        """Record gaps for lost entries, before the entry that follows them."""
+        """Record gaps for lost entries.
+
+        ``before_ns``: log time of the entry that follows them; 0: none.
+        """
         for gap in followed.found(before_ns):
             log_ns = before_ns or self.tap.now()
             self._writer.gap(gap, log_ns)
@@ -428,11 +449,13 @@ def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:
 
 
 class RotatingRecorder:
-    """Records to a sequence of files; a new one begins when the present one is large or old enough.
+    """Records to a sequence of files.
+
+    It starts a new file when the present one is too large or old.
 
     No entry is lost between two files. It also starts a new file after a failed fsync, because part
     of the old file may be lost. The new file begins at the last position that an fsync has
-    confirmed: it has the entries after this position that are still in the rings, and a gap for the
+    confirmed. It has the entries after this position that are still in the rings, and gaps for the
     others.
     """
 
@@ -454,8 +477,8 @@ class RotatingRecorder:
             settings: Settings of the recorder.
             by: Kind of recorder.
             attachments: Returns the files to attach.
-            places: Positions by section at which the recording begins. If given, the caller reads
-                from ``tap`` and calls :meth:`put`.
+            places: Positions at which the recording begins, by section of the block. If they are
+                given, the caller reads from ``tap`` and calls :meth:`put`.
             about: More metadata about the recording.
             counters: Counters to continue; None for new ones.
 
@@ -468,7 +491,7 @@ class RotatingRecorder:
         self._renewals = 0
         self._again_s = 0.0
         self._ending: list[Recorder] = []
-        """Recorders of earlier files that are not completely written yet."""
+        """Recorders of earlier files that are not completely on the disk yet."""
         self.counters = counters or Counters()
         self._takes = places is None
         self._why = dict(about or {})
@@ -507,18 +530,18 @@ class RotatingRecorder:
         self.recorder.put(entries)
 
     def end(self) -> Mapping[int, BlockPosition]:
-        """End the recording without waiting for the disk; return the last positions by section."""
+        """End the recording without waiting for the disk. Return the last positions, by section."""
         self.recorder.end()
         return self.recorder.places
 
     @property
     def ended(self) -> bool:
-        """True if all files are completely written after :meth:`end`."""
+        """True if :meth:`end` was called, and all files are completely written."""
         return all(recorder.output.ended for recorder in (*self._ending, self.recorder))
 
     @property
     def tap(self) -> InstanceFollower:
-        """The follower of the instance; a new one replaces it after a failed fsync."""
+        """The follower of the instance. After a failed fsync, a new follower replaces it."""
         return self.recorder.tap
 
     @property
@@ -542,7 +565,7 @@ class RotatingRecorder:
         return next(filter(None, (recorder.problem for recorder in (*self._ending, self.recorder))), "")
 
     def tend(self) -> bool:
-        """Start a new file if one is due. Return True if it replaces a file with a failed fsync."""
+        """Start a new file if one is due. Return True if it replaces a file whose fsync failed."""
         for old in [old for old in self._ending if old.output.ended and not old.output.doubt]:
             old.output.close(0)
             self._ending.remove(old)
@@ -561,7 +584,10 @@ class RotatingRecorder:
 
     @property
     def _due(self) -> bool:
-        """True if rotation is due and the disk has no problem, which a new file would not solve."""
+        """True if rotation is due, and the disk has no problem.
+
+        A new file would not solve a problem.
+        """
         settings, recorder = self._settings, self.recorder
         old = bool(settings.rotate_min) and time.monotonic() - self._begun_s >= settings.rotate_min * 60
         large = bool(settings.rotate_mb) and recorder.output.tell() >= settings.rotate_mb * 1e6
@@ -615,7 +641,7 @@ class RotatingRecorder:
     def close(self, patience_s: float = CLOSE_S) -> list[str]:
         """Record all remaining entries, and close all files.
 
-        Return the problem of each file that is incomplete.
+        Return a message for each file that is incomplete.
         """
         until_s = time.monotonic() + patience_s
         files = [*self._ending, self.recorder]

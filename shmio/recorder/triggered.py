@@ -1,4 +1,4 @@
-"""Records to a file when a trigger fires, including the seconds before it."""
+"""Records to a file when a trigger fires. The file includes the seconds before the trigger."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from shmio.segment import Block, Frame, Quality
 from shmio.segment.block import Layouts
 
 ENTRY_BYTES: Final = 800
-"""Approximate memory of an entry without its images, in bytes."""
+"""Approximate memory that an entry takes besides its images, in bytes."""
 
 log = logging.getLogger("shmio.recorder")
 
 
 class Trigger:
-    """Evaluates the trigger's condition at each frame of a source that it reads.
+    """Evaluates the trigger's condition at each frame of the sources that the condition reads.
 
-    It uses the values that readers see. The values of a bad frame are unknown.
+    It uses the values that readers see. The values of a bad frame count as unknown.
     """
 
     def __init__(self, when: str, blocks: Mapping[str, Block]) -> None:
@@ -44,12 +44,15 @@ class Trigger:
         self._bind(blocks)
 
     def follow(self, blocks: Mapping[str, Block]) -> None:
-        """Find the registers again after a reload. If one is missing, the trigger does not fire."""
+        """Find the registers again after a reload.
+
+        If a register is missing, the trigger does not fire.
+        """
         if blocks is not self._blocks:
             try:
                 self._bind(blocks)
             except ConfigError as error:
-                log.warning("the trigger cannot fire until its registers are there again: %s", error)
+                log.warning("the trigger cannot fire until its registers exist again: %s", error)
                 self._blocks, self._condition = blocks, NEVER
 
     def _bind(self, blocks: Mapping[str, Block]) -> None:
@@ -62,7 +65,7 @@ class Trigger:
         self._memory = Memory()
 
     def sees(self, entry: BlockEntry | InstanceEntry) -> bool:
-        """Return whether the condition is true at this entry."""
+        """Return whether the entry is a frame at which the condition is true."""
         if isinstance(entry, InstanceEntry) or not isinstance(entry.item, Frame):
             return False
         source = self._sections.get(entry.follower.block.section, "")
@@ -83,17 +86,17 @@ class PreTriggerBuffer:
     """Stores the entries of the last seconds before a trigger, within a limit of memory."""
 
     def __init__(self, before_s: float, limit_bytes: int, places: Mapping[int, BlockPosition]) -> None:
-        """Create the buffer; ``places`` are the positions by section after which it starts."""
+        """Create the buffer. ``places`` are the positions after which it starts, by section."""
         self._before_ns = round(before_s * 1e9)
         self._limit = limit_bytes
         self._entries: deque[BlockEntry | InstanceEntry] = deque()
         self._size = 0
         self._told = False
         self.places = dict(places)
-        """Positions by section after which the buffer starts at present."""
+        """Positions after which the buffer starts now, by section of the block."""
 
     def add(self, entry: BlockEntry | InstanceEntry) -> None:
-        """Add an entry. A gap from before this recorder was started is not stored."""
+        """Add an entry. Do not store a gap that arose before this recorder was started."""
         item = entry.item
         if isinstance(item, Gap) and item.reason is not Reason.OVERTAKEN:
             self._pass(entry)
@@ -104,12 +107,15 @@ class PreTriggerBuffer:
         if self._size > self._limit and not self._told:
             self._told = True
             kept_s = (entry.log_ns - self._entries[0].log_ns) / 1e9
-            log.warning("only %.1f s before a trigger are kept: raise recorder.trigger.before_mb to keep more", kept_s)
+            log.warning(
+                "only the last %.1f s before a trigger fit in memory: raise recorder.trigger.before_mb to keep more",
+                kept_s,
+            )
         while self._size > self._limit:
             self._drop()
 
     def before(self, log_ns: int) -> list[BlockEntry | InstanceEntry]:
-        """Return the stored entries of the seconds before a time, the oldest first."""
+        """Return the stored entries of the last seconds before a time, the oldest first."""
         self._trim(log_ns)
         return list(self._entries)
 
@@ -142,7 +148,7 @@ def _size(entry: BlockEntry | InstanceEntry) -> int:
 
 
 class TriggeredRecorder:
-    """Records a file for each trigger, from some seconds before it until some seconds after it.
+    """Records a file each time the trigger fires, with some seconds before and after.
 
     If the trigger fires again while a file is being written, that file becomes longer.
     """
@@ -153,8 +159,8 @@ class TriggeredRecorder:
     ) -> None:  # fmt: skip
         """Create the recorder, which waits for the trigger.
 
-        If ``going`` is True, it records at once, because the previous recorder died during a
-        triggered recording.
+        If ``going`` is True, it starts a file at once, because the previous recorder died while it
+        wrote a triggered recording.
 
         Raises:
             ConfigError: The condition is invalid.
@@ -178,7 +184,9 @@ class TriggeredRecorder:
             self._begin(tap.now())
 
     def turn(self) -> bool:
-        """Read new entries; record them if the trigger has fired. Return whether there are more.
+        """Read new entries, and record them if the trigger has fired.
+
+        Return whether there are more.
 
         Raises:
             RecordingError: The file was removed.
@@ -208,13 +216,16 @@ class TriggeredRecorder:
         return more
 
     def _begin(self, log_ns: int) -> None:
-        """Start a file with the stored entries, or extend the time of the present file."""
+        """Start a file with the buffered entries. If a file is being written, extend it."""
         self._until_ns = log_ns + round(self._times.after_s * 1e9)
         if self._series is not None:
             return
         if sum(series.waiting for series in self._ending) > self._settings.buffer_bytes:
             if not self._held:
-                log.error("%s: no new file is started while earlier ones wait for the disk", self._trigger.when)
+                log.error(
+                    "the trigger %s has fired, but no new file is started: earlier files still wait for the disk",
+                    self._trigger.when,
+                )
             self._held = True
             return
         self._held = False
@@ -233,7 +244,7 @@ class TriggeredRecorder:
         self._problem = ""
         self._series = series
         series.put(before)
-        log.info("%s: recording to %s", self._trigger.when, series.file)
+        log.info("the trigger %s has fired: recording to %s", self._trigger.when, series.file)
 
     def _end(self, last: Sequence[BlockEntry | InstanceEntry]) -> None:
         if series := self._series:
@@ -251,7 +262,7 @@ class TriggeredRecorder:
         return [*self._ending, *([present] if present else [])]
 
     def tend(self) -> bool:
-        """Close finished files. Return True if a new file replaces one with a failed fsync."""
+        """Close finished files. Return True if a new file replaces a file whose fsync failed."""
         for series in [series for series in self._ending if series.ended]:
             for unclosed in series.close(0):
                 log.error("%s", unclosed)
@@ -280,7 +291,7 @@ class TriggeredRecorder:
     def close(self, patience_s: float = CLOSE_S) -> list[str]:
         """Record all remaining entries, and close all files.
 
-        Return the problem of each file that is incomplete.
+        Return a message for each file that is incomplete.
         """
         while self.turn():
             pass

@@ -1,8 +1,8 @@
-"""Simulation models: small classes that compute a source's registers step by step. No I/O.
+"""Simulation models: classes that compute a source's registers step by step. They do no I/O.
 
 A model declares its inputs and outputs, and computes the outputs in ``step``: see
 docs/how-to/write-a-model.md. ``ModelRunner`` runs a model on the image of a block. ``ServedModel``
-runs it in a client, for an instance on another host.
+runs a model in a client, for an instance on another host.
 """
 
 from shmio.simulation.images import Ends

@@ -34,7 +34,7 @@ Outputs  controller to plant
 10 - 12  Robot_800, Robot_825, Robot_850: drives on, task runs, work space released
 13       command: hold; all motion stops while bit 0 is set
 14, 15   command: valves of ``ACTUATORS`` to open in every step; the drive reaches its end at once
-16, 17   command: valves of ``ACTUATORS`` to close in every step; it overrides the command to open
+16, 17   command: valves of ``ACTUATORS`` to close in every step; this overrides the command to open
 =======  ==========================================================================================================
 """
 
@@ -62,18 +62,18 @@ def smooth(u: float) -> float:
 
 
 class Track:
-    """A cyclic motion of several axes through key poses; all axes start and stop together.
+    """A cyclic motion of several axes through key poses. All axes start and stop together.
 
-    A slow sine of small amplitude is added, like the play of a servo loop. So the value of an axis
-    changes even while it rests.
+    To each position, a slow sine of small amplitude is added, like the play of a servo loop. So the
+    value of an axis changes even while the axis rests.
     """
 
     def __init__(self, keys: Sequence[tuple[float, Pose]], cycle_s: float, breath: float) -> None:
         """Create the track.
 
         Args:
-            keys: The key poses with their times in the cycle in s, in order. From the last one, the
-                axes move to the first one of the next cycle.
+            keys: The key poses with their times in the cycle in s, in order. From the last pose,
+                the axes move to the first pose of the next cycle.
             cycle_s: The length of the cycle in s.
             breath: The amplitude of the sine, in the unit of the axes.
 
@@ -99,7 +99,7 @@ class Track:
         )
 
     def _place(self, time_s: float) -> tuple[int, float]:
-        """Return the index of the last key pose, and the progress to the next one from 0 to 1."""
+        """Return the index of the last key pose, and the progress to the next pose, from 0 to 1."""
         phase_s = (time_s - self._times[0]) % self._cycle_s + self._times[0]
         index = min(bisect_right(self._times, phase_s), len(self._times) - 1) - 1
         begun_s, ends_s = self._times[index], self._times[index + 1]
@@ -138,14 +138,17 @@ class Actuator(NamedTuple):
     name: str
     travel_s: float
     spans: tuple[tuple[float, float], ...]
-    """Times in a cycle, in s, at which the valve opens to extend the drive, and closes again."""
+    """Pairs of times in a cycle, in s: the valve opens to extend the drive, and closes again."""
 
     def valve(self, phase_s: float) -> bool:
         """Return whether the valve is open."""
         return any(extend_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
 
     def switches(self, phase_s: float) -> int:
-        """Return the limit switches: bit 0 extended, bit 1 retracted; 0 while the drive moves."""
+        """Return the limit switches: bit 0 extended, bit 1 retracted.
+
+        Both are 0 while the drive moves.
+        """
         travel_s = self.travel_s
         extended = any(extend_s + travel_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
         away = any(extend_s <= phase_s < retract_s + travel_s for extend_s, retract_s in self.spans)
@@ -191,7 +194,7 @@ _AT_UNIT: Pose = (-64.0, -69.0, 117.0, -9.0, 43.0, 74.0)
 def _carry(begin_s: float, to: tuple[Pose, Pose], away: tuple[Pose, Pose], slow: float) -> list[tuple[float, Pose]]:
     """Return the key poses of a transfer: pick up the part, put it down, return home.
 
-    The times are multiplied by ``slow``.
+    ``slow`` multiplies the duration of each motion.
     """
     at = ((0, HOME), (1.5, to[0]), (2.3, to[1]), (2.8, to[1]), (3.5, to[0]), (5.2, away[0]), (5.9, away[1]),
           (6.3, away[1]), (7.0, away[0]), (8.0, HOME))  # fmt: skip
@@ -249,7 +252,7 @@ _AXES: Final = {f"Axs{axis}_Pos": "REAL" for axis in range(1, 7)}
 class _CellState(NamedTuple):
     time_s: float
     phase_s: float
-    """Time in the cell's cycle, in s; it stops while the cell is paused."""
+    """Time in the cell's cycle, in s. It stands still while the cell is paused."""
     cycles: int
     step: int
     hold: bool
@@ -261,7 +264,7 @@ class _CellState(NamedTuple):
 class A50Cell(Model):
     """A model of the cell and of its controller's program, with the signals of DB201.
 
-    It runs on the layout that it declares, or on that of ``db201.db``.
+    It runs on the layout that it declares, or on the layout of ``db201.db``.
     """
 
     inputs = InOut("ARRAY[0..999] OF BYTE", path="Inputs", comment="plant to controller")
@@ -278,7 +281,10 @@ class A50Cell(Model):
         self._cell_s: float | None = None  # time of the cell in s, which stops while the cell is paused
 
     def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  everything depends only on the time
-        """Compute axes, inputs and outputs. The bytes after them keep their written values."""
+        """Compute axes, inputs and outputs.
+
+        The bytes after those that it computes keep their values.
+        """
         inputs, outputs = self.inputs.commanded, self.outputs.commanded
         hold, opened, closed = _ORDERS.unpack_from(outputs, _OUTPUTS.size)
         hold &= 1
@@ -351,7 +357,7 @@ def _beat(time_s: float) -> bool:
 
 
 def _drive(actuator: Actuator, phase_s: float, opened: int, closed: int) -> tuple[bool, int]:
-    """Return the valve and the limit switches; a command moves the drive to its end at once."""
+    """Return the state of the valve and the limit switches. A command moves the drive at once."""
     if closed:
         return False, 0b10
     if opened:
@@ -364,7 +370,7 @@ def _bits(*flags: bool) -> int:
 
 
 def _load(test_s: float, scale: float) -> tuple[int, int]:
-    """Return torque in 0.1 Nm and speed in 1/min of a test unit during the test."""
+    """Return torque in 0.1 Nm and speed in 1/min of a test unit at a time in the test."""
     duration_s = STEPS[80]
     share = smooth(test_s / 2) * smooth((duration_s - test_s) / 2)
     torque_nm = share * (85 + 30 * math.sin(2 * math.pi * test_s / 3))

@@ -23,7 +23,7 @@ _BYTES: Final = (bytes, bytearray)
 
 
 class Images:
-    """The two images of one block, which begin with the initial values of the layout.
+    """The two images of a block. They begin with the initial values of the layout.
 
     ``commanded`` has the values that clients and connections have written: to inputs, to the
     ``/in`` of in-outs, and to registers that the model does not declare. ``shown`` has the values
@@ -49,8 +49,8 @@ class Images:
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Write bytes and bits into the commanded image.
 
-        Return for each write "", or why it is refused: it changes an output, or is outside the
-        block.
+        Return for each write "", or the reason if it is refused: it would change an output, or lies
+        outside the block.
         """
         return [self._write(write) for write in writes]
 
@@ -62,11 +62,11 @@ class Images:
 
         """
         if len(image) != len(self.shown):
-            raise LayoutError(f"its block has {len(self.shown)} bytes, the image {len(image)}")
+            raise LayoutError(f"the image has {len(image)} bytes, but the block has {len(self.shown)}")
         self.shown[:] = self.commanded[:] = image
 
     def with_given(self, image: bytes | bytearray) -> bytes:
-        """Return an image with the commanded values in all bits that the model does not compute."""
+        """Return the image, but with the commanded values where the model computes nothing."""
         if self._all_computed:
             return bytes(image)
         return (_array(self.commanded) & self._given | _array(image) & ~self._given).tobytes()
@@ -88,7 +88,7 @@ def _array(data: bytes | bytearray) -> npt.NDArray[np.uint8]:
 
 
 class Ends:
-    """Access to the commanded and the shown value of an in-out register."""
+    """The commanded and the shown value of an in-out register, for the model."""
 
     __slots__ = ("_commanded", "_shown")
 
@@ -103,7 +103,7 @@ class Ends:
 
     @property
     def shown(self) -> Any:
-        """The value of ``/out`` that readers see; the model sets it."""
+        """The value of ``/out``, which the model sets and readers see."""
         return self._shown.read()
 
     @shown.setter
@@ -112,7 +112,7 @@ class Ends:
 
 
 class Port(Protocol):
-    """Access to the value of one declaration in one image."""
+    """Reads and writes the value of one declaration in one image."""
 
     def read(self) -> Any:
         """Return the value from the image."""
@@ -148,7 +148,7 @@ class RegisterPort:
     def read(self) -> Any:
         """Return the value.
 
-        An array is returned as tuples, because a change of a list would not change the image.
+        An array is returned as tuples: a list would suggest that its change also changes the image.
         """
         if self._is_row:
             return bytes(self._image[self._start : self._stop])
@@ -178,7 +178,10 @@ class _StructurePort:
     def __init__(
         self, path: str, ports: Mapping[str, RegisterPort], bulk: _StructureCodec | None, image: bytearray
     ) -> None:
-        """Create the port; ``bulk`` is a faster codec for all members, or None."""
+        """Create the port.
+
+        ``bulk`` is a faster codec for all members together; None: there is none.
+        """
         self._path = path
         self._ports = ports
         self._bulk = bulk
@@ -191,7 +194,7 @@ class _StructurePort:
         return {path: port.read() for path, port in self._ports.items()}
 
     def write(self, value: object) -> None:
-        """Write the members that the dict ``value`` names; the others stay unchanged."""
+        """Write the members that the dict ``value`` names. The others stay unchanged."""
         if isinstance(value, Mapping) and self._bulk is not None and self._bulk.write(value, self._image):
             return
         if not isinstance(value, Mapping) or value.keys() - self._ports.keys():
@@ -202,7 +205,10 @@ class _StructurePort:
 
 
 class _Run(NamedTuple):
-    """Adjacent numbers in a block; ``values`` are their indices among all numbers."""
+    """Adjacent numbers in a block.
+
+    ``values`` are their indices among all numbers of the structure.
+    """
 
     where: slice
     packing: struct.Struct
@@ -210,7 +216,7 @@ class _Run(NamedTuple):
 
 
 class _StructureCodec:
-    """Reads and writes all registers of a structure at once; each must be a single number."""
+    """Reads and writes all registers of a structure at once. Each must be a single number."""
 
     def __init__(self, names: Sequence[str], runs: Sequence[_Run]) -> None:
         """Create the codec for two or more registers with these names."""
@@ -235,7 +241,7 @@ class _StructureCodec:
         return dict(zip(self._names, found, strict=True))
 
     def write(self, values: Mapping[str, object], image: bytearray) -> bool:
-        """Write all values and return True; if any does not fit, write none and return False."""
+        """Write all values, and return True. If a value is missing or does not fit, write none."""
         try:
             found: Sequence[object] = self._values(values)
             if len(values) != len(self._names) or not _NUMBERS.issuperset(map(type, found)):
@@ -249,7 +255,7 @@ class _StructureCodec:
 
 
 def _code(register: Register, byte_order: ByteOrder) -> str:
-    """Return the format character for ``struct``; empty if the register is not a single number."""
+    """Return the register's format character for ``struct``; empty if it is not a single number."""
     if register.dims or register.type == "BOOL":
         return ""
     return scalar_codec(register.element, byte_order).plain

@@ -1,4 +1,4 @@
-"""The loop-back model: readers see a value one step after it was written.
+"""The loop-back model: readers see a value one step after a client has written it.
 
 Clients of SimlogAPI use these registers in their tests.
 """
@@ -22,6 +22,6 @@ class Loopback(Model):
     zone_1 = InOut("SafetyZone", {"zone": "Z1"}, path="safetyzones/Z1")
 
     def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  nothing depends on the time
-        """Show the values that were written before this step."""
+        """Copy the values that clients wrote before this step to what readers see."""
         for ends in (self.r3200_link1, self.kuka_j1, self.kuka_j2, self.r3_l2, self.zone_1):
             ends.shown = ends.commanded

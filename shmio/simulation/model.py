@@ -1,4 +1,4 @@
-"""The base class of models, their declarations, and loading a model by its name."""
+"""The base class of models, their declarations, and a function that loads a model by name."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class _DeclaringModel(Protocol):
 class Declaration:
     """A declaration of a model, such as a register or a parameter.
 
-    The attribute of the class is this object; the attribute of a model object is the value. The
-    value of a single register is a bool, int, float or str (see ``shmio.layout.values.codec``). The
-    value of an array is a tuple, nested for several dimensions, or bytes for a one-dimensional
-    array of BYTE. The value of a structure is a dict; if you set it, members that the dict does not
-    name stay unchanged.
+    On the class, the attribute is this object. On a model object, it is the value. The value of a
+    single register is a bool, int, float or str (see ``shmio.layout.values.codec``). The value of
+    an array is a tuple, nested for several dimensions, or bytes for a one-dimensional array of
+    BYTE. The value of a structure is a dict; if you set it, members that the dict does not name
+    stay unchanged.
     """
 
     kind: ClassVar[str]
@@ -58,7 +58,9 @@ class Declaration:
         unit: str = "",
         comment: str = "",
     ) -> None:
-        """Declare a value. The creation of the model's class raises ModelError if it is invalid.
+        """Declare a value.
+
+        If the declaration is invalid, creating the model's class raises ModelError.
 
         Args:
             type: The type as in a tag table, such as ``LREAL``, ``STRING[20]``, ``SafetyZone`` or
@@ -85,16 +87,19 @@ class Declaration:
         return self if model is None else model._ports[self.name].read()
 
     def __set__(self, model: _DeclaringModel, value: object) -> None:
-        raise AttributeError(f"{self.name} is {self.kind}: a model reads it and cannot set it")
+        raise AttributeError(f"{self.name} is {self.kind}, which a model can only read")
 
     @cached_property
     def members(self) -> Mapping[str, str] | None:
-        """The types of a structure's members by their paths in it; None if it is no structure."""
+        """The types of a structure's members, by path within the structure.
+
+        None: it is no structure.
+        """
         return members(self.type) if isinstance(self.type, str) else self.type
 
     @cached_property
     def paths(self) -> Mapping[str, str]:
-        """The path of each register by its member; the key of a single register is ``""``."""
+        """The path of each register, by its member. A single register has the key ``""``."""
         inside = {"": ""} if self.members is None else {member: f"/{member}" for member in self.members}
         return {member: canonical_path(self.path + end) for member, end in inside.items()}
 
@@ -119,7 +124,10 @@ class Declaration:
 
 
 class Input(Declaration):
-    """A register that the model reads. Clients write it, or it is connected to another source."""
+    """A register that the model reads.
+
+    Clients write it, or a register of another source sets it.
+    """
 
     kind = "an input"
 
@@ -134,7 +142,10 @@ class Parameter(Declaration):
 
 
 class Output(Declaration):
-    """A register that only the model writes. It keeps its value until the model sets another."""
+    """A register that only the model writes.
+
+    It keeps its value until the model sets another value.
+    """
 
     kind = "an output"
 
@@ -158,7 +169,7 @@ class InOut(Declaration):
 
 
 def place_declarations(model: str, declarations: Iterable[Declaration]) -> Layout:
-    """Return the layout of the declarations, placed like the entries of a tag table.
+    """Return a layout of the declarations. They are placed as the entries of a tag table.
 
     Raises:
         ModelError: A declaration is invalid. The message names the model and all errors.
@@ -254,7 +265,7 @@ def declared(model: type[Model], *kinds: type[Declaration]) -> list[Declaration]
 
 @lru_cache(maxsize=256)
 def layout_of(model: type[Model]) -> Layout:
-    """Return the layout of a model's registers, placed like the entries of a tag table.
+    """Return a layout of a model's registers. They are placed as the entries of a tag table.
 
     Args:
         model: The model's class.
@@ -265,9 +276,7 @@ def layout_of(model: type[Model]) -> Layout:
     """
     registers = declared(model, Input, Output, InOut)
     if not registers:
-        raise ModelError(
-            f"model {model.__qualname__}: it declares no register; give it an Input, an Output or an InOut"
-        )
+        raise ModelError(f"model {model.__qualname__} declares no register: give it an Input, an Output or an InOut")
     return place_declarations(model.__qualname__, registers)
 
 
@@ -279,8 +288,8 @@ def load(text: str, folder: str | Path | None = None) -> type[Model]:
 
     Args:
         text: ``package.module:Class``.
-        folder: A folder to search for modules that are not installed, such as that of the
-            configuration.
+        folder: A folder to search for modules that are not installed, such as the configuration's
+            folder.
 
     Raises:
         ConfigError: The text is malformed, the module or class does not exist, its import fails, or
@@ -323,7 +332,10 @@ def _module(name: str, folder: str | Path | None) -> ModuleType:
 
 
 def explain(error: BaseException, module: str) -> str:
-    """Return a text with the error and its line, in ``module`` if the traceback has such a line."""
+    """Return a text with the error and the place where it occurred.
+
+    The place is the last line in ``module``, if the traceback has one.
+    """
     if isinstance(error, SyntaxError) and error.filename:
         return _line(f"{error.msg} ({Path(error.filename).name}, line {error.lineno})")
     frames = list(traceback.walk_tb(error.__traceback__))

@@ -1,4 +1,4 @@
-"""Runs a model, in the process of a source or in a client of an instance on another host."""
+"""Runs a model in the process of a source, or in a client of an instance on another host."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ NOTHING: Final[Mapping[str, object]] = MappingProxyType({})
 
 
 class ModelRunner:
-    """Runs one model on the images of its block. Not thread-safe.
+    """Runs one model on the images of its block. Use it from one thread.
 
     There are two images. The commanded image has the values that clients and connections have
     written: to inputs, to the ``/in`` of in-out registers, and to registers that the model does not
-    declare. The shown image has the values that readers see. A value commanded to an input or to an
-    undeclared register is shown from the next step on.
+    declare. The shown image has the values that readers see. It shows a value that was written to
+    an input or to an undeclared register from the next step on.
     """
 
     def __init__(
@@ -104,20 +104,21 @@ class ModelRunner:
             writes: The writes, in order.
 
         Returns:
-            For each write "", or why it is refused: it changes an output, or is outside the block.
+            For each write "", or the reason if it is refused: it would change an output, or lies
+            outside the block.
 
         """
         return self._images.write(writes)
 
     def connect(self, values: Mapping[str, object]) -> None:
-        """Set the values of inputs for the next step. An input that is not named keeps its value.
+        """Set the values of inputs for the next step. All other inputs keep their values.
 
         Args:
             values: Values by the paths of the inputs.
 
         Raises:
-            PathError: There is no such input. The inputs before it are set.
-            ValueRangeError: A value does not fit. The inputs before it are set.
+            PathError: There is no such input. All values before it have been set.
+            ValueRangeError: A value does not fit. All values before it have been set.
 
         """
         for path, value in values.items():
@@ -176,7 +177,7 @@ class ModelRunner:
             raise LayoutError(f"model {self.name}: {error}") from None
 
     def _run(self, call: Callable[..., None], *arguments: float, instead: bytes | None = None) -> None:
-        """Call the model's code. If it fails, the shown image is restored."""
+        """Call the model's code. If it fails, restore the shown image."""
         before = self.image if instead is None else instead
         try:
             call(*arguments)
@@ -185,10 +186,11 @@ class ModelRunner:
             raise ModelError(f"model {self.name}: {explain(error, self._model.__module__)}") from error
 
     def _find(self, model: type[Model], declaration: Declaration) -> dict[str, Register]:
-        """Return the registers of a declaration, by their paths in it.
+        """Return the registers of a declaration, by their paths within it.
 
         Raises:
-            ConfigError: The layout lacks a register, or it has another type there.
+            ConfigError: The layout lacks a register, or the register has another type in the
+                layout.
 
         """
         found: dict[str, Register] = {}
@@ -238,7 +240,7 @@ def _kind(register: Register) -> str:
 
 
 class Inputs(Protocol):
-    """The values of a model's inputs by path; a value is None if it is not known."""
+    """The values of a model's inputs, by path. None: the value is not known."""
 
     @property
     def changed(self) -> Collection[str]:
@@ -266,14 +268,15 @@ class Source(Protocol):
 
     @property
     def computed(self) -> bool:
-        """True if a model has computed the outputs before."""
+        """True if a model has computed these outputs before: this one or an earlier one."""
 
 
 class ServedModel:
     """Runs a model in a client, for a source with ``connector = "remote"``.
 
     Pass its ``step`` and ``start`` to :meth:`shmio.client.Client.simulate`. The model runs as with
-    ``connector = "simulation"``. When the client connects, it continues from the source's values.
+    ``connector = "simulation"``. When the client connects, the model continues from the source's
+    values.
     """
 
     def __init__(self, model: type[Model], parameters: Mapping[str, object] = NOTHING, seed: int = 0) -> None:

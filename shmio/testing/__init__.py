@@ -1,1 +1,4 @@
-"""Code that tests and benchmarks share: faults on the wire, ports. Never imported at run time."""
+"""Code that tests and benchmarks share, such as a TCP proxy with faults.
+
+It is never imported at run time.
+"""

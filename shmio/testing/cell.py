@@ -1,4 +1,4 @@
-"""A whole cell that a test starts and stops by the commands, and helpers for such tests."""
+"""A whole cell that a test starts and stops by shmio's commands, and helpers for such tests."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ listen = ["{grpc}"]
 
 
 class Cell:
-    """An instance in a folder, operated by the commands."""
+    """An instance in a folder, which tests operate by shmio's commands."""
 
     def __init__(self, folder: Path, instance: str, grpc: Address) -> None:
         self.folder = folder
@@ -70,7 +70,7 @@ class Cell:
         )
 
     def output(self, command: str, *arguments: str) -> str:
-        """Run one of shmio's commands; return what it prints.
+        """Run one of shmio's commands, and return what it prints.
 
         Raises:
             AssertionError: The command failed. The message has its error output and the instance's logs.
@@ -83,20 +83,20 @@ class Cell:
         return done.stdout
 
     def up(self) -> None:
-        """Start the instance detached; return when it runs."""
+        """Start the instance in the background. Return when it runs."""
         self.output("shmio-supervisor", "up", "--detach")
 
     def down(self) -> None:
-        """Stop the instance; return when it has ended."""
+        """Stop the instance. Return when it has ended."""
         self.output("shmio-supervisor", "down")
 
     def status(self) -> dict[str, Any]:
-        """Return what ``status --json`` prints, without starting a process."""
+        """Return what ``shmio-supervisor status --json`` prints. This starts no process."""
         status: dict[str, Any] = msgspec.to_builtins(read_status(self.instance, ""))
         return status
 
     def processes(self) -> dict[str, dict[str, Any]]:
-        """Return the processes of ``status``, by name."""
+        """Return the processes of :meth:`status`, by name."""
         return {process["name"]: process for process in self.status()["processes"]}
 
     def logs(self) -> str:
@@ -107,16 +107,19 @@ class Cell:
 
 
 def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE_S) -> None:
-    """Wait until a condition is true; raise AssertionError if it is not in time."""
+    """Wait until a condition is true. Raise AssertionError if it does not become true in time."""
     deadline = time.monotonic() + patience_s
     while not condition():
         if time.monotonic() > deadline:
-            raise AssertionError(f"not seen in {patience_s} s: {what}")
+            raise AssertionError(f"this did not become true within {patience_s} s: {what}")
         time.sleep(0.01)
 
 
 def kill(pid: int, sign: signal.Signals = signal.SIGKILL) -> None:
-    """Signal a process that need not be a child, by a pidfd, so that no other one gets the signal."""
+    """Send a signal to a process that need not be a child.
+
+    It uses a pidfd, so that no other process can get the signal.
+    """
     handle = os.pidfd_open(pid)
     try:
         signal.pidfd_send_signal(handle, sign)

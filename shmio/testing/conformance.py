@@ -1,8 +1,9 @@
-"""Test suite for connectors, also those of other packages. It needs pytest.
+"""Test suite for connectors of shmio and of other packages. It needs pytest.
 
 A subclass provides a :class:`Rig`: a real device behind a fault proxy. The suite breaks the
-connection in all ways that occur in cells, and checks that quality is bad with a reason, that the
-source recovers without a restart, and that it never shows a value that the device did not have.
+connection in all ways that occur in cells. It checks that the quality becomes bad with a reason,
+that the source recovers without a restart, and that it never shows a value that the device did not
+have.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ PERIOD_NS = 5_000_000
 
 
 class Rig(Protocol):
-    """A device behind a fault proxy; its block changes continuously."""
+    """A device behind a fault proxy. The values in the device's block change all the time."""
 
     proxy: FaultProxy
     layout: Layout
@@ -66,7 +67,7 @@ class Run:
                 self.frames.append(frame)
                 if condition(frame):
                     return frame
-        raise AssertionError(f"not seen in time; last frame: {self.frames[-1:]}")
+        raise AssertionError(f"no frame met the condition in time; last frame: {self.frames[-1:]}")
 
     def good(self) -> Frame:
         """Wait for the next good frame."""
@@ -77,7 +78,7 @@ class Run:
         return self.until(lambda frame: frame.quality is Quality.BAD)
 
     def stop(self) -> None:
-        """Stop the loop, and check the rules that apply to all frames."""
+        """Stop the loop. Check the rules that all its frames must obey."""
         self._clock.stop()
         self.loop.commands.stop()
         for thread in self._threads:
@@ -100,9 +101,9 @@ class Run:
 
 
 class ConnectorConformance:
-    """Tests of reading: inherit from this class, and define a fixture ``rig``, a :class:`Rig`.
+    """Tests of reading. Inherit from this class, and define a fixture ``rig``, a :class:`Rig`.
 
-    Connectors that can write use :class:`shmio.testing.write_conformance.WriteConformance`.
+    For connectors that can write, use :class:`shmio.testing.write_conformance.WriteConformance`.
     """
 
     writable: ClassVar[tuple[str, ...]] = ()
@@ -110,7 +111,7 @@ class ConnectorConformance:
 
     @pytest.fixture
     def run(self, rig: Rig, instance: str) -> Iterator[Run]:
-        """Provide a running loop, which is stopped and checked at the end."""
+        """Provide a running loop. Stop and check it after the test."""
         block = BlockSpec("device", rig.layout, PERIOD_NS, 10**9, 1 << 24)
         with Segment.create(instance, [block], [ProcessSpec("device", "source")]) as segment:
             run = Run(segment, rig, self.writable)
@@ -128,18 +129,18 @@ class ConnectorConformance:
         rig.proxy.refuse()
 
     def test_values_come_and_change(self, run: Run, rig: Rig) -> None:
-        """A device that works is read every cycle."""
+        """The source reads a working device in every cycle."""
         first = rig.generation(run.good().raw)
         run.until(lambda frame: rig.generation(frame.raw) > first)
 
     def test_absent_at_start(self, absent: None, run: Run, rig: Rig) -> None:
-        """The source is bad with a reason until the device appears, and then good."""
+        """The source is bad, with a reason, until the device appears. Then it is good."""
         assert "refused" in run.bad().reason
         rig.proxy.admit()
         run.good()
 
     def test_lost_and_back(self, run: Run, rig: Rig) -> None:
-        """Twice, the peer closes the connection, refuses others for a while, and is back."""
+        """The peer closes the connection and refuses new ones for a while. This happens twice."""
         for _ in range(2):
             run.good()
             rig.proxy.refuse()
@@ -148,7 +149,7 @@ class ConnectorConformance:
             run.good()
 
     def test_reset(self, run: Run, rig: Rig) -> None:
-        """The peer crashes and is available again at once."""
+        """The peer resets the connection, as in a crash, and accepts a new one at once."""
         run.good()
         rig.proxy.cut(reset=True)
         run.bad()
@@ -163,7 +164,10 @@ class ConnectorConformance:
         run.good()
 
     def test_half_open(self, run: Run, rig: Rig) -> None:
-        """The connection is open but the peer is silent: bad after the time-out, then good."""
+        """The connection stays open, but the peer is silent.
+
+        The source is bad after the time-out, and good again when the peer answers.
+        """
         run.good()
         rig.proxy.freeze()
         assert "answer" in run.bad().reason
@@ -180,7 +184,7 @@ class ConnectorConformance:
         run.good()
 
     def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Rig) -> None:
-        """A late answer that arrives on the next connection is never taken for another answer."""
+        """The source never takes a late answer for the answer to another request."""
         run.good()
         rig.proxy.hold(frames=1)
         run.bad()
@@ -188,12 +192,15 @@ class ConnectorConformance:
         run.good()
 
     def test_a_loop_ends_while_the_device_hangs(self, run: Run, rig: Rig) -> None:
-        """Stopping never takes longer than the device's time-out; the fixture checks that."""
+        """Stopping never takes longer than the device's time-out.
+
+        The fixture ``run`` checks this.
+        """
         run.good()
         rig.proxy.freeze()
 
     def test_close_may_come_at_any_time(self, rig: Rig) -> None:
-        """The connector may be closed before the first connect, and twice."""
+        """A program may close the connector before the first connect, and may close it twice."""
         connector: Any = rig.connector()
         connector.close()
         connector.connect()

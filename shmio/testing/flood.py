@@ -1,4 +1,7 @@
-"""A flood of gRPC calls to unknown methods, as raw HTTP/2: client libraries refuse to send some."""
+"""A flood of gRPC calls to unknown methods.
+
+It sends raw HTTP/2, because client libraries refuse to send some of these calls.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from typing import Final
 NOT_UTF8: Final = b"/x\xff\xfe/y"
 UNKNOWN: Final = b"/shmio.v1.Shmio/NoSuchCall"
 WINDOW: Final = 64
-"""Number of concurrent calls on a connection that every server accepts."""
+"""Number of concurrent calls on a connection. Every server accepts this number."""
 
 _PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 _FIELDS: Final = {
@@ -28,7 +31,10 @@ PATIENCE_S: Final = 60.0
 
 
 class Flood:
-    """Threads that send such calls as fast as they are answered, each over its own connections."""
+    """Threads that send calls to unknown methods as fast as a server answers them.
+
+    Each thread has its own connections.
+    """
 
     def __init__(self, names: Sequence[bytes] = (NOT_UTF8, UNKNOWN), window: int = WINDOW) -> None:
         """Set the names to call, and the maximum number of unanswered calls on a connection."""
@@ -46,7 +52,7 @@ class Flood:
     def upon(
         self, target: tuple[str, int] | str, tls: ssl.SSLContext | None = None, threads: int = 2
     ) -> Iterator[None]:
-        """Flood an address, or the UNIX socket with this path, for the length of a ``with`` block."""
+        """Send calls to an address, or to a UNIX socket, during a ``with`` block."""
         workers = [threading.Thread(target=self._run, args=(target, tls)) for _ in range(threads)]
         for worker in workers:
             worker.start()
@@ -91,7 +97,7 @@ class Flood:
 
 
 def request(name: bytes, stream: int) -> bytes:
-    """Return the headers of a call without messages, uncompressed (RFC 7541, 6.2.2)."""
+    """Return the HTTP/2 headers of a call without messages, uncompressed (RFC 7541, 6.2.2)."""
     block = b"".join(
         b"\0" + bytes((len(field),)) + field + bytes((len(value),)) + value
         for field, value in (_FIELDS | {b":path": name}).items()
@@ -120,7 +126,7 @@ def _end(connection: socket.socket) -> None:
 
 
 def _frames(connection: socket.socket) -> Iterator[tuple[int, int]]:
-    """Yield the kind and the flags of each frame; raise OSError when the server closes."""
+    """Yield the kind and the flags of each HTTP/2 frame. Raise OSError if the server closes."""
     received = bytearray()
     while True:
         while len(received) < 9 or len(received) < 9 + int.from_bytes(received[:3], "big"):

@@ -1,4 +1,4 @@
-"""A mosquitto broker for a test, which may kill and restart it."""
+"""A mosquitto broker that a test may kill and restart."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from shmio.endpoints.mqtt.broker.program import find_mosquitto
 
 PATIENCE_S = 20.0
 TETHER = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
-"""Command of util-linux that kills the broker when the thread that started it ends."""
+"""Prefix of the broker's command: it kills the broker when the thread that started it ends."""
 
 
 def missing() -> str:
-    """Return why mosquitto cannot run here, or an empty string."""
+    """Return the reason why mosquitto cannot run here; empty if it can."""
     return "" if find_mosquitto() else "mosquitto is not installed: apt-get install mosquitto"
 
 
 class Mosquitto:
-    """A broker that keeps its port over restarts; its log is ``mosquitto.log`` in its folder."""
+    """A broker that keeps its port over restarts. Its log is ``mosquitto.log`` in its folder."""
 
     def __init__(self, folder: Path, address: Address, *lines: str) -> None:
-        """Write the configuration: the port, then ``lines``; by default anybody may connect."""
+        """Write the configuration: the port, then ``lines``.
+
+        Without ``lines``, anybody may connect.
+        """
         self.folder = folder
         self.address = address
         self._file = folder / "mosquitto.conf"
@@ -40,11 +43,11 @@ class Mosquitto:
 
     @property
     def pid(self) -> int:
-        """Pid of the broker, or 0 if it does not run."""
+        """Pid of the broker; 0 if it does not run."""
         return self._process.pid if self._process else 0
 
     def start(self) -> None:
-        """Start the broker; return when it listens."""
+        """Start the broker. Return when it listens."""
         program = find_mosquitto() or "mosquitto"
         with (self.folder / "mosquitto.log").open("ab") as log:
             self._process = subprocess.Popen([*TETHER, program, "-c", self._file], stdout=log, stderr=log)

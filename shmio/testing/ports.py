@@ -1,4 +1,4 @@
-"""TCP ports for tests, chosen by the kernel, so that tests contain no port numbers."""
+"""TCP ports for tests. The kernel chooses them, so that tests contain no port numbers."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from shmio.config.address import Address
 def reserved_port(host: str = "127.0.0.1") -> Iterator[Address]:
     """Reserve a free port for the length of a ``with`` block.
 
-    The port is bound, but nothing listens: connections are refused, and the kernel does not choose it for others. A
-    server that binds it with SO_REUSEADDR, as all servers here do, gets it.
+    The port is bound, but nothing listens. So the kernel refuses connections to it, and does not
+    choose it for other programs. A server that binds it with SO_REUSEADDR, as all servers here do,
+    gets it.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as keeper:

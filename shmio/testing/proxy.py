@@ -1,8 +1,8 @@
 """TCP proxy with faults on demand between a program and its peer, for tests and benchmarks.
 
-It has one thread and uses ``select``, because its time-outs have microseconds, unlike those of
-``epoll``. A method that changes the behaviour returns when the change is in effect, so that tests
-need not wait.
+It has one thread and uses ``select``, whose time-outs have a resolution of microseconds, unlike
+those of ``epoll``. A method that changes the behaviour returns when the change is in effect, so
+that tests need not wait.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with RST
 
 
 class Link:
-    """A client's connection, and the matching connection to the server."""
+    """A client's connection to the proxy, and the proxy's connection to the server for it."""
 
     def __init__(self, client: socket.socket, server: socket.socket) -> None:
         self._sockets = (client, server)
@@ -44,13 +44,13 @@ class Link:
 
     @property
     def open(self) -> bool:
-        """True if bytes may still pass."""
+        """True if bytes may still pass in either direction."""
         if self._sockets[0].fileno() >= 0 and all(pipe.finished for pipe in self.pipes):
             self.close()
         return self._sockets[0].fileno() >= 0
 
     def close(self, *, reset: bool = False) -> None:
-        """Close both connections; with ``reset`` by a TCP reset, as when a peer crashes."""
+        """Close both connections. With ``reset``, do so by a TCP reset, as when a peer crashes."""
         for end in self._sockets:
             if end.fileno() >= 0 and reset:
                 end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
@@ -73,12 +73,12 @@ class Pipe:
 
     @property
     def hungry(self) -> bool:
-        """True if more bytes may be read from the sender."""
+        """True if the proxy may read more bytes from the sender now."""
         return not self.ended and self._queued < _MAX_QUEUED
 
     @property
     def next_s(self) -> float:
-        """Time at which the next bytes are due, in s (monotonic); infinity if there are none."""
+        """Time in s (monotonic) at which the next bytes are due; infinity if there are none."""
         return self._later[0][0] if self._later else float("inf")
 
     def enqueue(self, data: bytes, delay_s: float) -> None:
@@ -95,7 +95,7 @@ class Pipe:
             self.due += self._later.popleft()[1]
 
     def end_when_drained(self) -> None:
-        """Pass on the end of the stream once its last byte is sent."""
+        """Pass on the end of the stream when its last byte has been sent."""
         if self.ended and not self.due and not self._later and not self.finished:
             self.finished = True
             with contextlib.suppress(OSError):
@@ -111,7 +111,7 @@ class Pipe:
 
 
 def tpkt(data: bytes | bytearray) -> int:
-    """Return the length of the ISO-on-TCP frame (RFC 1006) at the start of ``data``; 0 if unknown yet."""
+    """Return the length of the ISO-on-TCP frame (RFC 1006) in ``data``; 0: not known yet."""
     return data[2] << 8 | data[3] if len(data) >= 4 else 0
 
 
@@ -126,13 +126,13 @@ def reference_edit(change: Callable[[int], int]) -> Edit:
 
 
 class Tampering:
-    """The present edit, and the frames on hold. Only the proxy's thread may use it.
+    """The present edit, and the frames that are on hold.
 
-    Any thread may use ``frame_held``.
+    Only the proxy's thread may use it, except ``frame_held``, which any thread may use.
     """
 
     def __init__(self, framing: Framing | None) -> None:
-        """Set the function that measures a frame; with None each ``recv`` is a frame."""
+        """Set the function that measures a frame. None: the result of each ``recv`` is a frame."""
         self._framing = framing
         self._edit: Edit | None = None
         self._held: list[bytes] = []
@@ -140,7 +140,10 @@ class Tampering:
         """Set while a frame is on hold."""
 
     def begin(self, edit: Edit, frames: int | None) -> None:
-        """Pass frames through a function: ``frames`` of them, or all until :meth:`end` if None."""
+        """Pass the next ``frames`` frames through a function.
+
+        None: all frames until :meth:`end`.
+        """
         left = frames
 
         def counted(frame: bytes) -> bytes | None:
@@ -166,7 +169,10 @@ class Tampering:
         return held
 
     def passing(self, waiting: bytearray, data: bytes) -> Iterator[bytes]:
-        """Yield the bytes to pass on after new data; an incomplete frame stays in ``waiting``."""
+        """Add new data, and yield the bytes to pass on.
+
+        An incomplete frame stays in ``waiting``.
+        """
         waiting += data
         while waiting:
             size = len(waiting)
@@ -182,10 +188,10 @@ class Tampering:
 
 
 class FaultProxy:
-    """TCP proxy between clients and one server; a context manager, or call ``stop`` at the end.
+    """TCP proxy between clients and one server. Use it as a context manager, or call ``stop``.
 
-    Faults last until they are changed; ``pass_all`` ends all except the delay. Faults of frames
-    apply to the direction from server to client.
+    A fault lasts until another method ends it. ``pass_all`` ends all faults except the delay.
+    Faults of frames apply to the direction from the server to the client.
     """
 
     def __init__(
@@ -195,9 +201,10 @@ class FaultProxy:
 
         Args:
             target: Address of the server.
-            up_s: Delay of each byte to the server, in s; throughput is not limited.
+            up_s: Delay of each byte to the server, in s. It does not limit the throughput.
             down_s: Delay of each byte from the server, in s.
-            framing: Function that returns the length of a frame; with None each ``recv`` is a frame.
+            framing: Function that returns the length of a frame. None: the result of each ``recv``
+                is a frame.
         """
         self._target = target
         self._up_s, self._down_s = up_s, down_s
@@ -254,7 +261,10 @@ class FaultProxy:
         self._do(change)
 
     def cut(self, *, reset: bool = False) -> None:
-        """Close all connections now; with ``reset`` by a TCP reset, as when a peer crashes."""
+        """Close all connections now.
+
+        With ``reset``, do so by a TCP reset, as when a peer crashes.
+        """
 
         def change() -> None:
             for link in self._links:
@@ -271,7 +281,7 @@ class FaultProxy:
         self._do(change)
 
     def freeze(self) -> None:
-        """Pass nothing, but keep connections and accept new ones, like a peer that hangs."""
+        """Pass no bytes, but keep connections and accept new ones, like a peer that hangs."""
 
         def change() -> None:
             self._frozen = True
@@ -279,7 +289,7 @@ class FaultProxy:
         self._do(change)
 
     def thaw(self) -> None:
-        """Continue where ``freeze`` stopped."""
+        """Pass bytes again after ``freeze``, beginning with those that have waited."""
         self._do(self._melt)
 
     def refuse(self) -> None:
@@ -299,7 +309,10 @@ class FaultProxy:
         self._do(self._listen)
 
     def edit(self, change_frame: Edit, *, frames: int | None = None) -> None:
-        """Pass frames through a function, which returns None to drop one; end after ``frames``."""
+        """Pass frames through a function, which returns None to drop a frame.
+
+        The edit ends after ``frames`` frames. None: it ends when it is changed.
+        """
         self._do(lambda: self._tampering.begin(change_frame, frames))
 
     def garble(self, data: bytes) -> None:
@@ -315,11 +328,11 @@ class FaultProxy:
         self.edit(self._tampering.keep, frames=frames)
 
     def wait_held(self, timeout_s: float = _TIMEOUT_S) -> bool:
-        """Wait until a frame is on hold; return False if none came in time."""
+        """Wait until a frame is on hold. Return False if no frame came in time."""
         return self._tampering.frame_held.wait(timeout_s)
 
     def release(self) -> None:
-        """Send the frames on hold to the newest connection, whichever they were meant for."""
+        """Send the frames on hold to the newest connection, even if they came on an older one."""
 
         def change() -> None:
             for frame in self._tampering.end():

@@ -1,7 +1,7 @@
-"""Test suite for connectors that can write, in addition to that of reading. It needs pytest.
+"""Test suite for connectors that can write, in addition to the tests of reading. It needs pytest.
 
-It checks that reported outcomes are true, that a bit is written without its neighbours, and that
-after any fault no confirmation is matched to another write.
+It checks that the reported outcomes are true, and that writing a bit does not change its
+neighbours. After any fault, a connector must not take a confirmation for that of another write.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class WriteRig(Rig, Protocol):
     """A device that accepts writes."""
 
     spare: int
-    """Offset of ``SPARE`` bytes, initially zero, which the device never changes."""
+    """Offset of ``SPARE`` bytes that are zero at first. The device itself never changes them."""
     flags: int
-    """Offset of a byte of which the device leaves the lowest bit alone, and counts in the others.
+    """Offset of a byte. The device counts in all its bits but the lowest, which it never changes.
 
-    ``generation`` asserts that no count is lost.
+    ``generation`` checks that no count is lost.
     """
     refused: Write
     """A write that the device refuses."""
@@ -46,7 +46,10 @@ class Writer:
         self._events = run.block.events.cursor()
 
     def write(self, *writes: Write) -> Event:
-        """Send a command, and wait for the outcomes of all items; return that of the first."""
+        """Send a command, and wait for the outcomes of all items.
+
+        Return the outcome of the first item.
+        """
         number = self._sender.submit(writes, time.monotonic_ns() + round(FAR_S * 1e9))
         ends: list[Event] = []
         deadline_s = time.monotonic() + PATIENCE_S
@@ -61,7 +64,10 @@ class Writer:
         return min(ends, key=lambda event: event.item)
 
     def written(self, *writes: Write) -> Frame:
-        """Send a command that must succeed; return the first frame requested after it."""
+        """Send a command that must succeed.
+
+        Return the first frame that was requested after its end.
+        """
         end = self.write(*writes)
         assert end.kind == EventKind.WRITTEN, end
         return self.after(end)
@@ -82,13 +88,16 @@ class Writer:
 
 
 class WriteConformance(ConnectorConformance):
-    """Tests of writing: inherit from this class, and define a fixture ``rig``, a :class:`WriteRig`."""
+    """Tests of writing.
+
+    Inherit from this class, and define a fixture ``rig``: a :class:`WriteRig`.
+    """
 
     writable: ClassVar[tuple[str, ...]] = ("**",)
 
     @pytest.fixture
     def writer(self, run: Run) -> Writer:
-        """Provide a writer of commands, once the running source is connected."""
+        """Wait until the running source is connected, and provide a writer of commands."""
         run.good()
         return Writer(run)
 
@@ -107,13 +116,16 @@ class WriteConformance(ConnectorConformance):
         assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
 
     def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
-        """The device counts in the other bits meanwhile, and no count is lost."""
+        """While the device counts in the other bits of the byte, writing one bit loses no count."""
         for turn in range(50):
             frame = writer.written(Write(rig.flags, 1, bytes([turn & 1])))
             assert frame.raw[rig.flags] & 1 == turn & 1
 
     def test_a_refused_item_among_good_ones(self, rig: WriteRig) -> None:
-        """One item is refused with a reason; the others are done, and the connection stays open."""
+        """The device refuses one item, with a reason.
+
+        It executes the others, and stays connected.
+        """
         connector = rig.connector()
         try:
             connector.connect()
@@ -144,7 +156,7 @@ class WriteConformance(ConnectorConformance):
 
     @pytest.mark.parametrize("count", [1, 30])
     def test_lost_in_mid_write(self, run: Run, writer: Writer, rig: WriteRig, count: int) -> None:
-        """The connection breaks around a write: the reported outcome is true."""
+        """If the connection breaks during a write, the reported outcome is true."""
         for turn in range(1, 5):
             rig.proxy.cut_after(count * turn)
             value = bytes([turn]) * SPARE
@@ -160,9 +172,9 @@ class WriteConformance(ConnectorConformance):
 
     @pytest.mark.parametrize("fault", ["cut before", "cut in the answer", "no answer"])
     def test_of_each_lost_write_what_is_said_is_true(self, rig: WriteRig, fault: str) -> None:
-        """The connection breaks during several writes: each reported outcome is true.
+        """If the connection breaks during several writes, each reported outcome is true.
 
-        A connector that raises a ConnectorError other than WriteLostError reports none.
+        A connector that raises a ConnectorError other than WriteLostError reports no outcome.
         """
         writes = [Write(rig.spare + place, 0, bytes([place + 1])) for place in range(SPARE)]
         connector = rig.connector()
@@ -188,7 +200,7 @@ class WriteConformance(ConnectorConformance):
                     assert (found[offset : offset + 1] == data) == (outcome == ""), (offset, outcome)
 
     def test_without_a_connection_nothing_is_sent(self, rig: WriteRig) -> None:
-        """Writing before the first connect, or after a close, fails and changes nothing."""
+        """A write before the first connect, or after a close, fails and changes nothing."""
         connector = rig.connector()
         try:
             for _ in range(2):

@@ -1,1 +1,1 @@
-"""Code generated from ``proto/`` by ``scripts/generate-wire``; nothing here is written by hand."""
+"""Code that ``scripts/generate-wire`` generates from ``proto/``. Do not change it by hand."""

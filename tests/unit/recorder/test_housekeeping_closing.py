@@ -194,7 +194,7 @@ def test_the_successor_closes_the_file_of_a_killed_recorder(segment: Segment, tm
         until(lambda: second.counts("frames") == 5, "its own file")
         assert second.stop() == 0
     assert [topic for topic, _, _ in messages(old)].count("cell/frames") == 20
-    assert f"{old} is closed now: its recorder died" in second.log.read_text()
+    assert f"closed {old}, because its recorder died" in second.log.read_text()
     assert numbers(old) + numbers(second.file) == list(range(1, 26))
     assert gaps(second.file) == []
 

@@ -54,7 +54,7 @@ def test_it_records_reports_counters_and_closes_its_file(
         assert reader.about["recorder"] == "supervised"
     assert main(["info", str(file)]) == 0
     assert "; recorded by the instance's own recorder, shmio " in capsys.readouterr().out
-    assert "5 frames, 1 events, 0 missed" in process.log.read_text()
+    assert "recorded 5 frames and 1 events; missed 0" in process.log.read_text()
 
 
 def test_a_killed_recorders_file_is_readable_and_its_successor_continues(segment: Segment, tmp_path: Path) -> None:

@@ -263,7 +263,7 @@ def test_retention_by_age(segment: Segment, tmp_path: Path, caplog: pytest.LogCa
     caplog.set_level("INFO")
     old, young, present = (recorded(segment, tmp_path, days) for days in (8, 6, 9))
     assert keep(segment, tmp_path, present, keep_days=7) == {young, present}
-    assert f"{old} is deleted: it is 8.0 days old, recorder.keep_days is 7" in caplog.text
+    assert f"deleted {old}: it is 8.0 days old, recorder.keep_days is 7" in caplog.text
 
 
 def test_retention_by_size_deletes_the_oldest_first(segment: Segment, tmp_path: Path) -> None:
@@ -347,5 +347,5 @@ def test_the_process_deletes_old_files_as_configured(segment: Segment, tmp_path:
         until(lambda: not old.exists(), "the old file deleted")
         publish(segment.writer("cell"), 3)
         process.stop()
-    assert "is deleted: it is 9.0 days old" in process.log.read_text()
+    assert ": it is 9.0 days old" in process.log.read_text()
     assert [message.channel.source for message in read(process.file)]

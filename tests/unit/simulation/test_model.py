@@ -113,5 +113,5 @@ def test_a_model_must_not_define_init() -> None:
 
 
 def test_a_model_without_registers_has_no_layout() -> None:
-    with pytest.raises(ModelError, match="model Still: it declares no register"):
+    with pytest.raises(ModelError, match="model Still declares no register"):
         layout_of(Still)

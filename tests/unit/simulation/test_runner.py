@@ -193,8 +193,8 @@ class Fragile(Model):
     [
         (1, "ZeroDivisionError: division by zero"),
         (2, "value: INT: 40000 is out of range -32768..32767"),
-        (3, "AttributeError: how is an input: a model reads it and cannot set it"),
-        (4, "AttributeError: limit is a parameter: a model reads it and cannot set it"),
+        (3, "AttributeError: how is an input, which a model can only read"),
+        (4, "AttributeError: limit is a parameter, which a model can only read"),
         (5, "AttributeError: 'tuple' object has no attribute '__setitem__'"),
         (6, "SystemExit: 3"),
         (7, "row: expected a list of 2 elements, found 1"),
@@ -255,7 +255,7 @@ def test_a_new_runner_resumes_from_the_image() -> None:
     assert second.begin() == image
     step(second, 4)
     assert [value(second, path) for path in ("count", "given", "both")] == [4, 4, 5]
-    with pytest.raises(LayoutError, match="its block has 12 bytes, the image 11"):
+    with pytest.raises(LayoutError, match="the image has 11 bytes, but the block has 12"):
         second.resume(image[1:])
 
 
