@@ -1,7 +1,7 @@
 """The loop that plays a recording, in wall time by the clock and in virtual time by steps.
 
 ``ReplayLoop`` decides which frames and events are due, and ``Player`` publishes them. ``moved`` and
-``Search`` carry out the requests of clients.
+``Search`` carry out clients' requests to pause, seek and search.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ NOTHING: Final = f"{OWN_WORDS}nothing of this source was recorded up to here"
 GOES_ON: Final = f"{OWN_WORDS}the recording continues"
 
 PIECE: Final = 64
-"""Largest number of frames and events to play before requests and commands are handled."""
+"""Largest number of frames and events to play before the loop handles requests and commands again."""
 LATE_NS: Final = 10_000_000_000
-"""Frames that are delayed by more than this, in instance time, are skipped; others are played."""
+"""In wall time, frames that are more than this late (instance time, ns) are skipped."""
 ASK_TURN_NS: Final = 1_000_000
-"""Period at which to check whether the step that a request waits for has ended.
+"""Period in ns at which to check whether a step has ended, if a request must wait for its end.
 
 The end of a step does not wake the loop.
 """
 BEHIND_NS: Final = 3_000_000_000
-"""A request that is not older than this waits until everything due before it has been played."""
+"""A request of this age in ns or less waits until everything due before it has been played."""
 AHEAD_NS: Final = 60_000_000_000
-"""The longest time by which a request may be in the future.
+"""The longest time in ns by which a request may lie in the future.
 
-Requests may be in the past without limit, because the process may have been delayed.
+Requests may lie in the past without limit, because the process may have been delayed.
 """
 ANY = "any"
-"""Event name in a search that matches every replayed event."""
+"""Name of an event in a search that stands for every event that a replay publishes."""
 SEARCH_PIECE = 256
 """Number of entries that a search reads before the loop continues to play."""
 
@@ -77,7 +77,10 @@ _OF_INJECTIONS: Final = frozenset(
 Asked = tuple[int, PlayheadRequest | None] | None
 """The number of a request, and the request; None if no request waits."""
 StampOf = Callable[[int, int], Stamp]
-"""Returns the time stamp for an entry from its position and its recorded instance time, in ns."""
+"""Returns the time stamp of an entry.
+
+Arguments: its position and its recorded instance time, in ns.
+"""
 
 log = logging.getLogger("shmio.source")
 
@@ -88,7 +91,7 @@ log = logging.getLogger("shmio.source")
 def is_replayed(event: Event, *, keep: bool) -> bool:
     """Return whether a replay publishes a recorded event.
 
-    Events about injections are published only if ``keep`` is set, which shows recorded injections.
+    It publishes events about injections only with ``keep``, which shows recorded injections.
     """
     return event.kind not in _OF_PROCESSES and (keep or not (event.kind in _OF_INJECTIONS or event.injection))
 
@@ -105,7 +108,7 @@ class Player:
         self._entries: Iterator[Entry] = iter(())
         self._next: Entry | None = None
         self.note = ""
-        """Reason why the quality is not good; empty if it is good."""
+        """Why quality is not good; empty if it is good."""
         self._bad = False  # the last published frame was bad
         self._missing = False  # the last frame was a bad one of the replay itself, not a recorded one
         self.stopped = False
@@ -114,11 +117,11 @@ class Player:
 
     @property
     def next_ns(self) -> int | None:
-        """The position of the next entry; None at the end."""
+        """The position of the next entry in ns; None at the end."""
         return None if self._next is None else self._next.position_ns
 
     def go(self, position_ns: int | None) -> None:
-        """Continue with the first entry at or after a position; None: with the first entry."""
+        """Continue with the first entry at or after a position; None: at the first entry of all."""
         self._entries = self._recorded.entries(position_ns)
         self._next = next(self._entries, None)
 
@@ -133,13 +136,16 @@ class Player:
         self.go(None if entry is None else position_ns)
 
     def again(self, position_ns: int, stale_ns: int, stamp: StampOf) -> None:
-        """Continue at the begin of a loop. Publish a bad frame if none is due in ``stale_ns``."""
+        """Continue at the beginning of a loop.
+
+        If no frame is due within ``stale_ns`` from there, publish a bad frame.
+        """
         if self._recorded.newest(position_ns + stale_ns) is None:
             self.end(NOTHING, stamp(position_ns, position_ns))
         self.go(position_ns)
 
     def resume(self, position_ns: int) -> None:
-        """Continue after ``position_ns``, up to which the previous process has published."""
+        """Continue after ``position_ns``, up to which the source's previous process has published."""
         self.go(position_ns + 1)
         entry = self._recorded.newest(position_ns)
         if entry is not None and isinstance(entry.item, Frame):
@@ -162,7 +168,7 @@ class Player:
         self.go(position_ns + 1)
 
     def play(self, until_ns: int, stamp: StampOf, most: int) -> bool:
-        """Publish the entries up to a position, at most ``most``. Return whether more are left."""
+        """Publish at most ``most`` entries up to a position. Return whether more are left."""
         for _ in range(most):
             if self._next is None or self._next.position_ns > until_ns:
                 return False
@@ -218,7 +224,7 @@ class Player:
         self.published += 1
 
     def _happen(self, event: Event, at: Stamp) -> None:
-        """Publish a recorded event without an owner, so that no client takes it for an answer."""
+        """Publish a recorded event without its owner, so that no client takes it for an answer."""
         if not is_replayed(event, keep=self._keep):
             return
         record = Record(
@@ -246,8 +252,8 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
         clock_ns: The present instance time, in ns.
 
     Returns:
-        The new state, which applies from the request's time on; and the position to show, or None
-        if the request does not seek.
+        The new state, which applies from the request's time on; and the position to show in ns, or
+        None if the request does not seek.
 
     Raises:
         ValueRangeError: The request cannot be carried out.
@@ -263,11 +269,11 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
         position_ns = play.begin_ns  # `play` at the end starts from the beginning
     if position_ns is not None and not play.begin_ns <= position_ns <= play.end_ns:
         length_s = (play.end_ns - play.begin_ns) / 1e9
-        raise ValueRangeError(f"that time is outside the played part, which is {length_s:.3f} s long")
+        raise ValueRangeError(f"the requested time is outside the played part, which is {length_s:.3f} s long")
     at_ns = play.position_ns if position_ns is None else position_ns
     if ask.until_ns is not None and ask.until_ns < at_ns:
         at_s = (at_ns - play.begin_ns) / 1e9
-        raise ValueRangeError(f"that time has passed: the replay is at {at_s:.3f} s; seek to an earlier time")
+        raise ValueRangeError(f"the requested time has passed: the replay is at {at_s:.3f} s; seek to an earlier time")
     until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
     if ask.until_ns is None and position_ns is None and (ask.paused is None or play.until_ns > at_ns):
         until_ns = play.until_ns  # `pause` and `play` keep a stop position that lies ahead
@@ -283,7 +289,10 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
 
 
 class Search:
-    """A search for an event or a change. It reads the recording in pieces while the replay runs."""
+    """A search for an event or for the change of a register.
+
+    It reads the recording in pieces while the replay runs.
+    """
 
     def __init__(self, recorded: RecordedSource, find: FindRequest, end_ns: int, *, keep: bool) -> None:
         """Create a search.
@@ -291,11 +300,11 @@ class Search:
         Args:
             recorded: The recording of the source.
             find: The event or register to find.
-            end_ns: The position before which the search ends.
+            end_ns: The position in ns before which the search ends.
             keep: True if recorded injections are shown.
 
         Raises:
-            PathError: There is no such register or event kind.
+            PathError: There is no such register or kind of event.
 
         """
         self._end_ns = end_ns
@@ -306,7 +315,7 @@ class Search:
         self._what = f"event {find.event}" if find.event else f"change of {find.path}"
 
     def go_on(self) -> PlayheadAnswer | None:
-        """Read the next piece. Return the result, or None if the search must continue."""
+        """Read the next piece. Return the result, or None if the search is not finished."""
         for _ in range(SEARCH_PIECE):
             entry = next(self._entries, None)
             if entry is None or entry.position_ns >= self._end_ns:
@@ -353,7 +362,7 @@ def _change_matcher(recorded: RecordedSource, wanted: FindRequest, *, keep: bool
 class ReplayLoop:
     """Plays one source of a recording, and answers requests to pause, seek and search.
 
-    In virtual time, each step plays the entries whose time falls into it; there may be none.
+    In virtual time, each step plays the entries whose time falls into the step; there may be none.
     """
 
     def __init__(
@@ -372,12 +381,13 @@ class ReplayLoop:
 
         Args:
             source: The recording to play.
-            writer: The writing side of the source's block.
-            beginning: The state to start from, as
-                :func:`~shmio.connectors.replay.source.begin` returned it for the same block.
+            writer: Writes the source's block.
+            beginning: The state to start from, as :func:`~shmio.connectors.replay.source.begin`
+                returned it for the same block.
             clock: The loop's clock.
-            writable: See :class:`CommandProcessor`, also for the arguments below.
-            allow_nonfinite: Patterns of registers that may be written NaN and infinities.
+            writable: Patterns of registers for which the configuration allows commands. Commands
+                are refused nevertheless, because nothing can be written to a recording.
+            allow_nonfinite: Patterns of the registers to which NaN and infinities may be written.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
 
@@ -405,11 +415,11 @@ class ReplayLoop:
 
     @property
     def note(self) -> str:
-        """Reason why the quality is not good; empty if it is good."""
+        """Why quality is not good; empty if it is good."""
         return self._player.note
 
     def run(self) -> None:
-        """Play until the clock stops the loop, then publish a last bad frame."""
+        """Play until the clock tells the loop to stop, then publish a last, bad frame."""
         try:
             self._begin()
             while not self._turn():
@@ -421,7 +431,10 @@ class ReplayLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def _begin(self) -> None:
-        """Continue where the previous process stopped; if there was none, begin to play."""
+        """Continue where the source's previous process stopped.
+
+        If there was none, begin to play.
+        """
         play, clock_ns = self._play, self._page.read().time_ns
         if self._done_ns is not None:
             reach_ns = play.reach_ns(clock_ns) if play.wraps else play.at_ns(clock_ns)
@@ -438,7 +451,7 @@ class ReplayLoop:
     # ---- the loop ------------------------------------------------------------------------------------------------
 
     def _turn(self) -> bool:
-        """Play what is due, answer requests, then wait. Return True if the loop must stop."""
+        """Play what is due, answer requests, then wait. Return whether the loop must stop."""
         asked = self._head.asks(self._play.asked)  # before the time is read, so that no request is in the future
         state = self._page.read()
         # In virtual time, all frames and events have the time of the end of the step.
@@ -462,7 +475,10 @@ class ReplayLoop:
         return self._clock.wait_ns(0 if more else ASK_TURN_NS if waits else self._patience_ns(virtual=state.virtual))
 
     def _patience_ns(self, *, virtual: bool) -> int | None:
-        """Return the time in ns until the next entry is due; None to wait for a wake-up."""
+        """Return the time in ns until the next entry is due.
+
+        None if the loop can wait for a wake-up.
+        """
         play, next_ns = self._play, self._player.next_ns
         if virtual or play.paused:
             return None
@@ -503,8 +519,8 @@ class ReplayLoop:
     def _leave_out(self, clock_ns: int) -> None:
         """In wall time, skip to the present if the next entry is more than ``LATE_NS`` late.
 
-        In a loop, also skip if it is a whole round late: clients could not tell it from the entry
-        of the present round.
+        If the recording is played in a loop, also skip an entry that is a whole round late: clients
+        could not distinguish it from the same entry in the present round.
         """
         play, next_ns = self._play, self._player.next_ns
         if next_ns is None or play.paused or self._writer.at_ns is not None:
@@ -546,9 +562,9 @@ class ReplayLoop:
         return (next_ns is not None and next_ns <= due_ns) or play.settled(clock_ns) is not play
 
     def _before_ns(self, asked: Asked, clock_ns: int) -> int | None:
-        """Return the time up to which to play before the waiting request is answered.
+        """Return the position in ns to which to play before a waiting request is answered.
 
-        None to answer it now.
+        None if the request can be answered now.
         """
         number, ask = asked or (0, None)
         if not isinstance(ask, MoveRequest) or number != self._play.asked + 1 or ask.position_ns is not None:
@@ -557,7 +573,7 @@ class ReplayLoop:
         return moment_ns if self._is_behind(moment_ns) and clock_ns - moment_ns < BEHIND_NS else None
 
     def _listen(self, asked: Asked, clock_ns: int) -> bool:
-        """Answer a request, or continue the search that it asked for.
+        """Answer a request, or continue the search that it started.
 
         Return whether there was a request.
         """
@@ -613,7 +629,7 @@ class ReplayLoop:
         return PlayheadAnswer()
 
     def _catch_up(self, clock_ns: int) -> None:
-        """Adopt the state of the recording's other sources, because this one missed requests."""
+        """Adopt the playing state of the recording's other sources, after missing requests."""
         other = as_others(self._source, [head for block in self._blocks().values() if (head := block.playhead)])
         if other is None or other.anchor_ns <= self._play.anchor_ns:
             return

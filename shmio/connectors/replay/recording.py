@@ -18,20 +18,20 @@ from shmio.segment import Event, Frame
 from shmio.segment.header import MAX_PROCESSES
 
 Moment = float | str
-"""A time in a recording: seconds from its begin, or a date and time."""
+"""A time in a recording: seconds from its beginning, or a date and time."""
 
 MAX_NS: Final = 1 << 61
-"""The largest valid time, about 70 years in ns."""
+"""The largest valid time in ns, about 70 years."""
 
 MIN_PERIOD_NS: Final = 100_000
 MAX_PERIOD_NS: Final = 3_600_000_000_000
-"""The longest valid period of a source; the configuration has the same limit."""
+"""The longest valid period of a source in ns; the configuration has the same limit."""
 
 log = logging.getLogger("shmio.source")
 
 
 class MissingFrames(NamedTuple):
-    """Frames that are missing in the recording, and the reason why."""
+    """Frames that the recording lacks, and the reason."""
 
     reason: str
 
@@ -58,9 +58,9 @@ class RecordedSource:
 
         Args:
             dump: The recording.
-            damage: The list to which ``dump`` appends each damaged place that it finds.
-            block: A block of the source. Only blocks of the source with the same layout are played.
-            utc_ns: UTC of position 0, in ns.
+            damage: The list to which ``dump`` appends each damaged part that it finds.
+            block: A block of the source. Only the source's blocks with the same layout are played.
+            utc_ns: The UTC time of position 0, in ns since 1970.
 
         """
         self._dump = dump
@@ -70,9 +70,9 @@ class RecordedSource:
         self._holes = [gap for gap in dump.gaps if gap.source == block.source and gap.what == "frames"]
 
     def entries(self, from_ns: int | None) -> Iterator[Entry]:
-        """Yield the entries from a position on (None: from the first one) in recorded order.
+        """Yield the entries from a position on (None: from the first one), in recorded order.
 
-        The item of an entry at a gap or at damage is MissingFrames.
+        At a gap or damaged part, the item of the entry is a MissingFrames.
         """
         at_ns = from_ns
         begin_ns = 0 if from_ns is None else max(0, from_ns + self._utc_ns)
@@ -110,7 +110,8 @@ class RecordedSource:
     def _hole(self, gap: Gap, at_ns: int) -> Entry:
         """Return the entry of a gap.
 
-        Its position is one period after the frame before the gap, or that of the frame after it.
+        Its position is one period after the frame before the gap, but not later than the frame
+        after it.
         """
         position_ns = gap.after_ns - self._utc_ns + self.block.period_ns if gap.after_ns else at_ns
         if gap.before_ns:
@@ -127,7 +128,7 @@ class Span(NamedTuple):
 
 
 class Recording:
-    """A recording in one or several files, open for reading. A context manager.
+    """A recording in one or several files, open for reading. Use it as a context manager.
 
     Raises:
         RecordingError: A file cannot be read or is not a recording, there are no frames, or the
@@ -155,12 +156,12 @@ class Recording:
         if not (started.isdecimal() and len(started) < 20):
             raise RecordingError(f"{self._file} does not say when its instance was started: it cannot be played")
         self.utc_ns = int(started)
-        """UTC of position 0, the start of the recorded instance, in ns."""
+        """The UTC time of position 0, the start of the recorded instance, in ns since 1970."""
         names = self._dump.sources
         if len(names) > MAX_PROCESSES:
             raise RecordingError(
-                f"{self._file} has {len(names)} sources, an instance at most {MAX_PROCESSES}: shmio-dump cut --source "
-                "copies some of them to another file"
+                f"{self._file} has {len(names)} sources, but an instance has at most {MAX_PROCESSES}: copy some of "
+                "them to another file with shmio-dump cut --source"
             )
         spans = {name: span for name in names if (span := self._measured(name))}
         if not spans:
@@ -180,7 +181,7 @@ class Recording:
             raise RecordingError(f"{self._file} has invalid times: it cannot be played")
 
     def _measured(self, name: str) -> Span | None:
-        """Return the span of a source's frames in UTC, up to one period after the last one.
+        """Return the span of a source's frames in UTC, up to one period after the last frame.
 
         None if the source has no frames.
         """
@@ -198,11 +199,13 @@ class Recording:
         self._damage.append(damage)
 
     def span(self, start: Moment | None, end: Moment | None) -> Span:
-        """Return the part of the recording between two times, either of which may be None.
+        """Return the part of the recording between two times.
+
+        None stands for its beginning or its end.
 
         Raises:
-            RecordingError: A time is invalid, or no part of the recording lies between them. The
-                message begins with the key.
+            RecordingError: A time is invalid, or no part of the recording lies between the times.
+                The message begins with the configuration key.
 
         """
         begin_ns = self.whole.begin_ns if start is None else self.moment("start", start)
@@ -212,14 +215,16 @@ class Recording:
             length_s = (self.whole.end_ns - self.whole.begin_ns) / 1e9
             begin = datetime.fromtimestamp((self.utc_ns + self.whole.begin_ns) / 1e9).astimezone().isoformat()
             raise RecordingError(
-                f"start, end: there is nothing to play between them; {self._file} has {length_s:.3f} s from {begin} on"
+                f"start, end: there is nothing to play between these times; {self._file} has {length_s:.3f} s from "
+                f"{begin} on"
             )
         return span
 
     def moment(self, key: str, text: Moment) -> int:
-        """Return the position of a time, given as seconds from the begin or as a date and time.
+        """Return the position in ns of a time, given as seconds from the beginning or as a date and time.
 
-        A date and time without a zone is local. ``key`` is for the message.
+        A date and time without a zone is local. ``key`` is the configuration key, for error
+        messages.
 
         Raises:
             RecordingError: The text is not a valid time.
@@ -238,12 +243,12 @@ class Recording:
         """Return a reader of one source of the recording.
 
         Raises:
-            RecordingError: There are no frames of the source, or its layout changes in ``span``.
+            RecordingError: The source has no frames, or its layout changes within ``span``.
 
         """
         if source not in self.sources:
             raise RecordingError(
-                f"{self._file} has no frames of a source {source!r}; it has: {', '.join(self.sources)}"
+                f"{self._file} has no frames of a source {source!r}; its sources are: {', '.join(self.sources)}"
             )
         blocks = [block for block in self._dump.blocks if block.source == source and block.frames]
         begin_ns, end_ns = (position_ns + self.utc_ns for position_ns in span)

@@ -24,8 +24,8 @@ class Replay(Replayed):
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         """Keys of the source.
 
-        With ``own_clock``, frames have the instance time at which they were recorded, not at which
-        they are played.
+        With ``own_clock``, each frame has the instance time of its recording. Otherwise it has the
+        time at which it is played.
         """
 
         file: File | Annotated[list[File], msgspec.Meta(min_length=1)]
@@ -42,7 +42,8 @@ class Replay(Replayed):
         """Open the recording.
 
         Raises:
-            ConfigError: The recording cannot be played. The message begins with the key.
+            ConfigError: The recording cannot be played. The message begins with the configuration
+                key that is wrong.
 
         """
         self.options = options
@@ -77,10 +78,11 @@ def files(options: Replay.Options) -> Sequence[str]:
 
 
 def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Span, RecordedSource]:
-    """Return the part of the recording to play, and the reader of its source.
+    """Return the part of the recording to play, and a reader of the source to play.
 
     Raises:
-        ConfigError: There is nothing to play. The message begins with the key.
+        ConfigError: There is nothing to play. The message begins with the configuration key that is
+            wrong.
 
     """
     try:
@@ -96,8 +98,8 @@ def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Sp
 class ReplayStart(NamedTuple):
     """The state in which the process of a replay source starts.
 
-    ``done_ns`` is the position up to which the previous process has published the same recording;
-    None if there was no such process.
+    ``done_ns`` is the position up to which the source's previous process has published the same
+    recording; None if there was no such process.
     """
 
     play: PlayState
@@ -105,7 +107,7 @@ class ReplayStart(NamedTuple):
 
     @property
     def at(self) -> Stamp:
-        """The time stamp of the start event: that of the position at which playing continues."""
+        """The time stamp for the start event: that of the position at which playing continues."""
         play, done_ns = self
         position_ns = play.begin_ns if done_ns is None else done_ns
         return stamp(play, position_ns, position_ns)
@@ -114,8 +116,8 @@ class ReplayStart(NamedTuple):
 def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> ReplayStart:
     """Return the state to start from, and write it to the block's playhead.
 
-    If the playhead is set for this recording already, continue from it. Otherwise join the other
-    sources of the recording, or start as configured.
+    If the playhead already belongs to this recording, continue from it. Otherwise follow the other
+    sources that replay the recording, if there are any, or start as configured.
 
     Args:
         source: The recording to play.
@@ -142,7 +144,7 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
 
 
 def _done_ns(block: Block, play: PlayState) -> int | None:
-    """Return the position of the last replayed frame, or of a replayed event after it.
+    """Return the position of the newest frame or event that was replayed in the block.
 
     None if the block has no frame. Replayed events are those without an owner.
     """
@@ -159,7 +161,10 @@ def _is_of(source: Replay, play: PlayState) -> bool:
 
 
 def as_others(source: Replay, heads: Iterable[Playhead]) -> PlayState | None:
-    """Return the newest state of all sources that replay the same recording; None if none does."""
+    """Return the newest playing state among sources that replay the same recording.
+
+    None if none does.
+    """
     plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
     return max(plays, key=lambda play: play.anchor_ns, default=None)
 
@@ -184,7 +189,7 @@ def _as_configured(source: Replay, block: Block, started_ns: int) -> PlayState:
 
 
 def stamp(play: PlayState, position_ns: int, clock_ns: int) -> Stamp:
-    """Return the time stamp for a position; ``clock_ns`` is the recorded instance time."""
+    """Return the time stamp for a position; ``clock_ns`` is the recorded instance time in ns."""
     if not play.own_clock:
         clock_ns = play.due_ns(max(position_ns, play.position_ns))
     return Stamp(play.base_ns + position_ns, clock_ns)

@@ -1,8 +1,8 @@
-"""Reads and writes a whole block with several requests in flight, and finds its length. No I/O.
+"""Reads and writes data of a controller with several requests in flight; finds a block's length.
 
-Each operation builds its requests (``take``) and checks the answers (``accept``). ``transport``
-sends and receives them. Round trips take nearly all the time of a cycle, so ``transport`` keeps as
-many requests in flight as the controller granted.
+Nothing here does I/O. Each operation builds its requests (``take``) and checks the answers
+(``accept``). ``transport`` sends and receives them. Round trips take nearly all the time of a
+cycle, so ``transport`` keeps as many requests in flight as the controller granted.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class BlockRead:
 
     @property
     def complete(self) -> bool:
-        """True if every part of the block was received, or the controller refused the block."""
+        """True if all parts of the block were received, or the controller refused to read it."""
         return self._answered == self.count or self.refusal is not None
 
     @property
@@ -69,7 +69,7 @@ class BlockRead:
         return bytes(self._block)
 
     def take(self, count: int, first: int) -> memoryview:
-        """Return the next requests, with references from ``first`` on (16 bits, wrapping)."""
+        """Return the next ``count`` requests; references begin at ``first`` (16 bits, wrapping)."""
         size = pdu.READ_REQUEST_SIZE
         begin, self.sent = self.sent, self.sent + count
         for place in range(count):
@@ -94,7 +94,9 @@ class BlockRead:
         start = index * self._chunk
         due = min(self._chunk, self._size - start)
         if len(answer.data) != due:
-            raise ConnectorError(f"answer has {len(answer.data)} bytes of data, {due} were asked for")
+            raise ConnectorError(
+                f"the controller's answer has {len(answer.data)} bytes of data, but {due} were requested"
+            )
         self._block_view[start : start + due] = answer.data
         self._answered += 1
 
@@ -118,7 +120,7 @@ def bit_item(db_number: int, start: int, bit: int, value: bool, area: int = pdu.
 
 
 def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes:
-    """Return a job that writes items from ``byte_item`` and ``bit_item``."""
+    """Return a job that writes items, which ``byte_item`` and ``bit_item`` have encoded."""
     parameters = bytes((pdu.WRITE, len(items))) + b"".join(address for address, _ in items)
     values = b"".join(value + b"\0" * (len(value) & 1) for _, value in items[:-1]) + items[-1][1]
     return pdu.request(reference, parameters, values)
@@ -135,14 +137,14 @@ def parse_write_answer(frame: memoryview, count: int) -> bytes:
     data_length = pdu.check_answer(frame)
     codes = frame[pdu.HEADER_END + 2 :]
     if len(frame) < pdu.HEADER_END + 2 or len(codes) != data_length or frame[pdu.HEADER_END] != pdu.WRITE:
-        raise ConnectorError("not an answer to a write")
+        raise ConnectorError("the controller's reply is not an answer to a write")
     if frame[pdu.HEADER_END + 1] != count or data_length != count:
-        raise ConnectorError(f"answer with {data_length} return codes, {count} items were written")
+        raise ConnectorError(f"the controller's answer has {data_length} return codes, but {count} items were written")
     return bytes(codes)
 
 
 class WriteItem(NamedTuple):
-    """A part of a write that one item of a job carries out."""
+    """An item of a job, which carries out a write or a part of it."""
 
     write: int
     """Index of the write to which the item belongs."""
@@ -154,8 +156,8 @@ class WriteItem(NamedTuple):
 class BlockWrite:
     """One wave of writes: jobs that may all be in flight at once.
 
-    Jobs contain the items in the order of the writes, and are sent in this order. Reasons of
-    refusals are stored in ``outcomes``.
+    The jobs contain the items in the order of the writes, and are sent in this order. If the
+    controller refuses a write, the reason is stored in ``outcomes``.
     """
 
     def __init__(self, db_number: int, pdu_size: int, items: Sequence[WriteItem], outcomes: list[str]) -> None:
@@ -172,7 +174,7 @@ class BlockWrite:
         return len(self._answered) == self.count
 
     def take(self, count: int, first: int) -> bytes:
-        """Return the next requests, with references from ``first`` on (16 bits, wrapping)."""
+        """Return the next ``count`` requests; references begin at ``first`` (16 bits, wrapping)."""
         begin, self.sent = self.sent, self.sent + count
         return b"".join(
             write_request((first + place) & 0xFFFF, [item.encoded for item in job])
@@ -199,14 +201,17 @@ class BlockWrite:
         self._answered.add(index)
 
     def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
-        """Yield for each item the index of its write, and how it was lost; None if answered."""
+        """Yield, for each item, the index of its write and what is known of the item.
+
+        This is None if the controller has answered the item.
+        """
         for index, job in enumerate(self._jobs):
             known = None if index in self._answered else Lost.UNKNOWN if index < self.sent else Lost.UNSENT
             for item in job:
                 yield item.write, known
 
     def _reason(self, item: WriteItem, code: int) -> str:
-        """Return why an item was refused, by its return code."""
+        """Return why an item with this return code was refused."""
         return explain_write(code, self._db_number, item.last)
 
     def _refuse(self, item: WriteItem, reason: str) -> None:
@@ -214,10 +219,10 @@ class BlockWrite:
 
 
 def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
-    """Divide a batch into waves, in order; send a wave when the one before it is complete.
+    """Divide a batch into waves, in order. Each wave must be complete before the next one is sent.
 
-    The controller may execute jobs in flight in any order. So writes to the same bits must be in
-    different waves. Each wave stores the reasons of refusals in ``outcomes``, by the write's index.
+    The controller may execute jobs in flight in any order, so writes to the same bits must be in
+    different waves. If the controller refuses a write, its wave stores the reason in ``outcomes``.
     """
     wave: list[WriteItem] = []
     spans: list[tuple[int, int]] = []  # sorted ranges of bits that the wave writes
@@ -235,7 +240,7 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
 def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
     """Return the outcome of each write after the session was lost.
 
-    ``begun`` are the waves that were sent completely or in part.
+    ``begun`` are the waves that were sent, completely or in part.
     """
     parts: list[set[Lost | None]] = [set() for _ in outcomes]
     for wave in begun:
@@ -300,7 +305,8 @@ def _fill(items: Sequence[WriteItem], pdu_size: int) -> Iterator[list[WriteItem]
 class SizeProbe:
     """Finds the real length of a block that is shorter than its layout.
 
-    Each job reads single bytes at several places, and so narrows the range by a factor of twenty.
+    Each job reads single bytes at several places. This narrows the range of possible lengths by a
+    factor of about twenty.
     """
 
     count = 1
@@ -354,16 +360,16 @@ def parse_readable(frame: memoryview, count: int) -> list[bool]:
     """
     pdu.check_answer(frame)
     if bytes(frame[pdu.HEADER_END : pdu.HEADER_END + 2]) != bytes((pdu.READ, count)):
-        raise ConnectorError(f"not an answer to a read of {count} items")
+        raise ConnectorError(f"the controller's reply is not an answer to a read of {count} items")
     readable = []
     at = pdu.HEADER_END + 2
     for place in range(count):
         if at + 4 > len(frame):
-            raise ConnectorError(f"answer that ends before item {place + 1} of {count}")
+            raise ConnectorError(f"the controller's answer ends before item {place + 1} of {count}")
         code, _, _ = _ITEM_HEAD.unpack_from(frame, at)
         good = code == ITEM_OK
         readable.append(good)
         at += 6 if good else 4  # one byte of data, and one of padding
     if at - len(frame) not in {0, 1}:  # the last item may have no padding
-        raise ConnectorError(f"answer of {len(frame)} bytes, {at} belong to its items")
+        raise ConnectorError(f"the controller's answer has {len(frame)} bytes, but only {at} belong to its items")
     return readable

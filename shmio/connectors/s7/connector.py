@@ -1,4 +1,4 @@
-"""The S7 connector: the client that reads and writes one data block, and the choice for a layout."""
+"""The S7 connector for layouts: the client that reads and writes one data block."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["S7Client", "S7Connector", "S7Options"]
 
 
 class S7Client(S7Session):
-    """Reads and writes one block of one controller."""
+    """Reads and writes one data block of one controller."""
 
     def __init__(self, options: S7Options, db_number: int, size: int) -> None:
         """Create a client for ``size`` bytes of DB ``db_number``. It does not connect yet.
@@ -45,14 +45,17 @@ class S7Client(S7Session):
         return [first, *(BlockRead(self.db_number, self.size, chunk) for _ in range(depth - 1))]
 
     def _chunk(self, pdu_size: int) -> int:
-        """Return the most bytes of a request."""
+        """Return the largest number of data bytes in a request."""
         return min(pdu_size - pdu.READ_OVERHEAD, self.options.packetSize or self.size, self.size)
 
     def _waves(self, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
         return waves(self.db_number, self.pdu_size, writes, outcomes)
 
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:
-        """If the controller's block is too short, return a refusal that names its real length."""
+        """Return the refusal of a read.
+
+        If the block is too short, the text names its real length.
+        """
         if refusal.code != OUT_OF_RANGE:
             return refusal
         probe = SizeProbe(self.db_number, self.size, self.pdu_size)
@@ -79,7 +82,7 @@ class S7Connector(S7Client, Connector):
 
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:
-        """Return the connector of tag tables if registers have addresses."""
+        """Return this class, or the connector for tag tables if registers have addresses."""
         if not any(register.address for register in layout.registers):
             return cls
         return S7TableConnector
@@ -88,7 +91,8 @@ class S7Connector(S7Client, Connector):
         number = options.dbNumber if options.dbNumber is not None else layout.number
         if options.every:
             raise ConfigError(
-                "every: a data block is read as a whole; name addresses in a tag table to read some less often"
+                "every: a data block is read as a whole; to read some registers less often, use a tag table with "
+                "addresses"
             )
         if number is None:
             raise ConfigError(
@@ -104,7 +108,10 @@ class S7Connector(S7Client, Connector):
 
     @property
     def doubt(self) -> str:
-        """Reason why values may not change, or may be others than the layout says; empty if there is none."""
+        """Why values may be frozen, or may differ from what the layout says.
+
+        Empty if there is no reason.
+        """
         return "; ".join(filter(None, (*self._watch.doubts.values(), super().doubt)))
 
     def _explain_size(self, found: int) -> str:
@@ -112,10 +119,10 @@ class S7Connector(S7Client, Connector):
         return explain_size(self.db_number, self.size, found, self._described.name, gone)
 
     def describe(self) -> str:
-        """Return the peer and the parameters of the session as a text for logs."""
+        """Return the peer and the parameters of the session, for the log."""
         return f"to {self.options.peer} DB{self.db_number} pdu={self.pdu_size} jobs={self.jobs} depth={self.depth}"
 
     def load(self) -> Load:
-        """Return the requests that read the block, by the PDU size that the controller may grant."""
+        """Return how many requests read the block, for each PDU size that the controller may grant."""
         requests = by_pdu_size(lambda pdu_size: -(-self.size // self._chunk(pdu_size)))
         return Load(f"bytes 0 to {self.size - 1} of DB{self.db_number}", requests, NOTE)

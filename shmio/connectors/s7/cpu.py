@@ -1,10 +1,10 @@
-"""Registers of a tag table with values of the CPU itself: its mode, its clock, what it is.
+"""Registers of a tag table that have values of the CPU itself: its mode, its clock, its identity.
 
-Their addresses are ``cpu.state``, ``cpu.clock``, ``cpu.order_code`` and the like. They are asked for
-beside the reads, and a CPU that refuses a question turns only the registers bad that need it. The
-lists and their records are those of Siemens, System Software for S7-300/400, A5E00739858, 33.3,
-33.5 and 33.21; that record 7 of list 0x0011 has the firmware also on S7-1200 and S7-1500, users of
-python-snap7 have found (its ``szl.py``).
+Their addresses are ``cpu.state``, ``cpu.clock``, ``cpu.order_code`` and the like. The session asks
+for these values between reads. If the CPU refuses a question, only the registers that need its
+answer turn bad. The lists and their records are those of Siemens, System Software for S7-300/400,
+A5E00739858, 33.3, 33.5 and 33.21. On S7-1200 and S7-1500 too, record 7 of list 0x0011 contains the
+firmware; users of python-snap7 have found this (its ``szl.py``).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _STATE, _CLOCK = "state", "clock"
 
 
 class _Text(NamedTuple):
-    """Where a list has a text."""
+    """The place of a text in a system status list."""
 
     szl: int
     record: int
@@ -63,7 +63,7 @@ log = logging.getLogger("shmio.source")
 
 
 class CpuTag(NamedTuple):
-    """A register with a value of the CPU."""
+    """A register that has a value of the CPU."""
 
     place: int
     """The register's index in the layout."""
@@ -73,10 +73,10 @@ class CpuTag(NamedTuple):
 
 
 def parse(place: int, register: Register) -> CpuTag:
-    """Return the tag of a register of the CPU.
+    """Return the tag of a register that has a value of the CPU.
 
     Raises:
-        ValueError: There is no such value, or it does not fit the register.
+        ValueError: The CPU has no such value, or the value does not fit the register.
 
     """
     text = register.address.strip()
@@ -84,12 +84,15 @@ def parse(place: int, register: Register) -> CpuTag:
     if name not in _NAMES:
         known = [CPU + one for one in _NAMES]
         raise ValueError(
-            f"address: {text[:80]!r} is none; the CPU has {', '.join(known)}{meant(text.lower()[:80], known)}"
+            f"address: {text[:80]!r} is not a value of the CPU; its values are "
+            f"{', '.join(known)}{meant(text.lower()[:80], known)}"
         )
     if register.writable:
         raise ValueError("writable: values of the CPU can only be read")
     if register.dims or register.scale:
-        raise ValueError(f"{'type' if register.dims else 'scale'}: {text!r} is a single value as it is")
+        raise ValueError(
+            f"{'type' if register.dims else 'scale'}: {text!r} is a single value, without dimensions and scale"
+        )
     element = register.element
     if name == _STATE:
         length, others = _LONGEST_STATE, "BOOL, a whole number, or "
@@ -100,19 +103,21 @@ def parse(place: int, register: Register) -> CpuTag:
     else:
         length, others, fits = _TEXTS[name].length, "", False
     if not fits and (element.base not in ("STRING", "WSTRING") or element.length < length):
-        raise ValueError(f"type: that of {text!r} is {others}STRING[{length}] or longer, not {register.type}")
+        raise ValueError(
+            f"type: a register of {text!r} must be {others}STRING[{length}] or longer, not {register.type}"
+        )
     return CpuTag(place, register, name)
 
 
 class CpuValues:
-    """The values of the CPU that a tag table names, and the questions for them."""
+    """The values of the CPU that a tag table names, and the questions that ask for them."""
 
     def __init__(self, tags: Sequence[CpuTag], mode: ModeQuery) -> None:
         """Prepare the questions.
 
         Args:
             tags: The registers.
-            mode: The question for the operating mode, which the session asks anyhow.
+            mode: The question for the operating mode, which the session asks in any case.
 
         """
         self._tags = tags
@@ -129,14 +134,14 @@ class CpuValues:
         self._states = [tag for tag in tags if tag.name == _STATE]
 
     def begin(self) -> None:
-        """Forget all values at the start of a session: it may be with another CPU."""
+        """Forget all values at the start of a session, which may be with another CPU."""
         self._mode_seen = -1
         for tag in self._tags:
             if tag.place not in self._bad:  # of a bad one, its status says more
                 self._news[tag.place] = None, BAD_WAITING_FOR_INITIAL_DATA, 0
 
     def store(self, image: RegisterImage) -> None:
-        """Put what is new into the image."""
+        """Put all values that have changed since the last call into the image."""
         if self._states:
             self._look_at_mode()
         for index, (value, status, source_ns) in self._news.items():
@@ -151,7 +156,7 @@ class CpuValues:
         if mode.unknown:
             if self._mode_seen:
                 self._mode_seen = 0
-                why = "the controller does not tell its operating mode"
+                why = "the controller does not report its operating mode"
                 self._tell(self._states, lambda _: None, BAD_NOT_SUPPORTED, why)
         elif mode.mode is not None and mode.answered_ns != self._mode_seen:
             self._mode_seen = mode.answered_ns
@@ -164,7 +169,10 @@ class CpuValues:
         return mode.mode if base in INTEGERS else MODES.get(mode.mode or 0)
 
     def _tell(self, tags: Iterable[CpuTag], value_of: Callable[[CpuTag], Value], status: int, why: str) -> None:
-        """Note new values, or the status of those that have none, and why."""
+        """Note new values of registers.
+
+        A register without a value gets ``status``; ``why`` is for the log.
+        """
         now_ns = time.time_ns()
         good, bad = [], []
         for tag in tags:
@@ -189,25 +197,25 @@ _Tell = Callable[[Iterable[CpuTag], Callable[[CpuTag], Value], int, str], None]
 
 
 class _CpuQuery(Query):
-    """A question for registers, which are bad if there is no answer."""
+    """A question whose answer gives registers their values; they are bad if there is no answer."""
 
     def __init__(self, service: Service, interval_ns: int | None, tags: Sequence[CpuTag], tell: _Tell) -> None:
         super().__init__(service, interval_ns)
         self.tags, self.tell = tags, tell
 
     def refused(self, refusal: RefusedError) -> None:
-        """Turn the registers bad; ask again in the next session."""
+        """Turn the registers bad, and ask again in the next session."""
         self.rest()
         status = BAD_USER_ACCESS_DENIED if refusal.code == ACCESS_DENIED else BAD_NOT_SUPPORTED
         self.tell(self.tags, lambda _: None, status, str(refusal))
 
     def given_up(self, why: str) -> None:
-        """Turn the registers bad for good."""
-        self.tell(self.tags, lambda _: None, BAD_NOT_SUPPORTED, f"the controller {why}; it is not asked any more")
+        """Turn the registers bad; the question is never asked again."""
+        self.tell(self.tags, lambda _: None, BAD_NOT_SUPPORTED, f"the controller {why}; shmio does not ask again")
 
 
 class _TextsQuery(_CpuQuery):
-    """The question for texts of a list, once in each session."""
+    """The question for the texts of one list, asked once in each session."""
 
     def __init__(self, szl: int, tags: Sequence[CpuTag], tell: _Tell) -> None:
         super().__init__(READ_SZL, None, tags, tell)
@@ -218,17 +226,20 @@ class _TextsQuery(_CpuQuery):
         return szl_data(self._szl)
 
     def answered(self, data: bytes) -> None:
-        """Tell the texts of the records."""
+        """Give the registers the texts in the records."""
         records: dict[int, bytes] = {}
         for record in szl_records(data, self._szl):
             records.setdefault(int.from_bytes(record[:2], "big"), record)
         self.tell(
-            self.tags, lambda tag: _text(tag.name, records), BAD_NO_DATA, f"list 0x{self._szl:04X} of the CPU has none"
+            self.tags,
+            lambda tag: _text(tag.name, records),
+            BAD_NO_DATA,
+            f"list 0x{self._szl:04X} of the CPU does not contain it",
         )
 
 
 def _text(name: str, records: Mapping[int, bytes]) -> str | None:
-    """Return a text from records; None if they have none."""
+    """Return a text from records, by the number of the record; None if they do not contain it."""
     place = _TEXTS[name]
     record = records.get(place.record, b"")
     if name == "firmware":
@@ -241,17 +252,17 @@ def _text(name: str, records: Mapping[int, bytes]) -> str | None:
 
 
 class _ClockQuery(_CpuQuery):
-    """The question for the time of the CPU's clock, once a second."""
+    """The question for the time of the CPU's clock, asked once a second."""
 
     def __init__(self, tags: Sequence[CpuTag], tell: _Tell) -> None:
         super().__init__(READ_CLOCK, CLOCK_INTERVAL_NS, tags, tell)
 
     def data(self) -> bytes:
-        """Return the data of the request: none."""
+        """Return the data of the request, which are empty."""
         return b""
 
     def answered(self, data: bytes) -> None:
-        """Tell the time."""
+        """Give the registers the time."""
         clock = parse_clock(data)
         text = None if clock is None else clock.isoformat(timespec="milliseconds")
-        self.tell(self.tags, lambda _: text, BAD_NO_DATA, "the clock has no valid time; set it")
+        self.tell(self.tags, lambda _: text, BAD_NO_DATA, "the CPU's clock has no valid time: set the clock")

@@ -1,8 +1,9 @@
-"""Notices that a data block is not the one that its layout describes. No I/O.
+"""Notices that a data block in the controller is not the one that its layout describes. No I/O.
 
-S7-300 and S7-400 tell a block's length and checksum, and when it was compiled. The connector asks
+S7-300 and S7-400 report a block's length, its checksum and when it was compiled. The connector asks
 for them at the beginning of each session and once a minute, and compares them with the last answer.
-S7-1200 and S7-1500 refuse the question; then a block that is too short is noticed only by reading it.
+S7-1200 and S7-1500 refuse this question; there, a block that is too short is noticed when it is
+read.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from shmio.connectors.s7.userdata import BLOCK_INFO, BlockInfo, block_data, pars
 
 INTERVAL_NS: Final = 60_000_000_000
 MAX_BLOCKS: Final = 200
-"""Most blocks of a table that are watched."""
+"""Largest number of a table's blocks that are watched."""
 _MOST_CHANGES: Final = 5  # of a checksum alone, which are reported
 
 log = logging.getLogger("shmio.source")
@@ -30,26 +31,26 @@ class Described(NamedTuple):
 
     db_number: int
     name: str
-    """Of the layout; empty if a tag table names only the number."""
+    """The name of the layout; empty for a block of a tag table, which names only its number."""
     size: int
-    """Bytes of the layout, or up to the last register of a tag table."""
+    """Number of bytes of the layout, or up to the last register of a tag table."""
     ends: Sequence[tuple[int, str]]
-    """Of each register, in the order of the addresses: the byte behind its last one, and its name."""
+    """For each register, in the order of addresses: the offset after its last byte, and its name."""
     whole: bool
-    """Whether the layout describes all of the block, not only some addresses."""
+    """Whether all of the block is described, and not only some addresses."""
 
     def beyond(self, size: int) -> list[str]:
-        """Return the names of the registers that a block of ``size`` bytes does not have."""
+        """Return the names of the registers that do not fit in a block of ``size`` bytes."""
         return [name for end, name in self.ends if end > size]
 
 
 class BlockWatch(Query):
-    """Asks for each block in turn, and reports those that were changed."""
+    """Asks for information about each block in turn, and reports blocks that were changed."""
 
     optional = True
 
     def __init__(self, blocks: Iterable[Described]) -> None:
-        """Watch these blocks."""
+        """Create the watch for these blocks; only the first ``MAX_BLOCKS`` are watched."""
         super().__init__(BLOCK_INFO, INTERVAL_NS)
         self._blocks = list(blocks)[:MAX_BLOCKS]
         self._round: list[Described] = []  # blocks that are still to be asked for, the next one last
@@ -61,7 +62,7 @@ class BlockWatch(Query):
 
     @property
     def doubts(self) -> Mapping[int, str]:
-        """By number of a block that was changed and no longer fits its layout: what was changed."""
+        """What was changed in each block that no longer fits its layout, by block number."""
         return self._doubts
 
     def data(self) -> bytes:
@@ -71,22 +72,22 @@ class BlockWatch(Query):
         return block_data(self._round[-1].db_number)
 
     def answered(self, data: bytes) -> None:
-        """Compare a block with its last state, and go on to the next one."""
+        """Compare the information about a block with the last, and go on to the next block."""
         block = self._round[-1]
         self._compare(block, parse_block(data, block.db_number))
         self._go_on()
 
     def refused(self, refusal: RefusedError) -> None:  # noqa: ARG002 - that it is refused says enough
-        """Go on to the next block; if all are refused, ask again in the next session."""
+        """Go on to the next block; if all are refused, ask again only in the next session."""
         self._refused.add(self._round[-1].db_number)
         self._go_on()
 
     def given_up(self, why: str) -> None:
-        """Log why."""
-        log.debug("the controller %s of its blocks: a change of a block will not be noticed", why)
+        """Log that changes will not be noticed, and why."""
+        log.debug("no more questions about blocks: the controller %s; a change of a block will not be noticed", why)
 
     def lost(self, *, alive: bool = True) -> None:
-        """Begin with the first block in the next session."""
+        """Forget an open question; the next session begins with the first block."""
         self._round.clear()
         self._refused.clear()
         super().lost(alive=alive)
@@ -111,7 +112,7 @@ class BlockWatch(Query):
         if info.size and info.size != before.size:
             text = f"it had {before.size} bytes and has {info.size}"
             if _fits(block, info.size):
-                text += ", as its layout" if block.whole else ""
+                text += ", as in its layout" if block.whole else ""
             else:
                 text += _misfit(block, info.size)
                 doubt = f"{block_name(block.db_number, block.name)} was changed in the controller: {text}"
@@ -132,7 +133,10 @@ class BlockWatch(Query):
         )  # fmt: skip
 
     def _compare_first(self, block: Described, info: BlockInfo) -> None:
-        """Report a wrong length when the block is seen first; a controller may have more than a table names."""
+        """Report a wrong length at the first information about a block.
+
+        A block may be longer than a tag table needs, but not longer than a layout.
+        """
         if info.size and not _fits(block, info.size):
             log.warning(
                 "%s has %d bytes in the controller%s; compare its layout",
@@ -141,7 +145,10 @@ class BlockWatch(Query):
 
 
 def _fits(block: Described, size: int) -> bool:
-    """Return whether a block of ``size`` bytes is as its layout describes it; one may be padded to whole words."""
+    """Return whether a block of ``size`` bytes has the described length.
+
+    A block that is described as a whole may be padded by one byte.
+    """
     return block.size <= size <= block.size + 1 if block.whole else block.size <= size
 
 

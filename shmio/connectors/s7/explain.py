@@ -1,7 +1,8 @@
 """Messages that explain why a controller refused a request, and what to do about it.
 
-No public standard says when each family sends which code. The messages follow reports of users with
-real CPUs; docs/how-to/connect-an-s7-plc.md names these reports.
+No public standard says in which cases a family of controllers sends which code. The messages
+therefore follow reports of users with real CPUs. docs/how-to/connect-an-s7-plc.md names these
+reports.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ KNOWN_CODES: Final = frozenset(S7_RETURN_CODES)
 _NO_OPTIMIZED = "clear 'Optimized block access' of the block, compile and load, or read it by OPC UA"
 _ACCESS_DENIED = (
     "access denied {where}: enable 'Permit access with PUT/GET communication' and 'Full access' in the CPU's "
-    f"protection settings; if they are, {_NO_OPTIMIZED}"
+    f"protection settings; if both are enabled, {_NO_OPTIMIZED}"
 )
-_PROTECTED = "the CPU's protection level forbids it {where}: choose 'Full access' in its protection settings"
+_PROTECTED = "the CPU's protection level forbids the access {where}: choose 'Full access' in its protection settings"
 
 # Errors of a whole job, where the texts of python-snap7 do not name the remedy.
 _ERRORS = {
@@ -40,7 +41,7 @@ _ERRORS = {
 
 
 class RefusedError(ConnectorError):
-    """The controller refused a job.
+    """The controller refused a job, or an item of a job.
 
     ``code`` is the return code of the refused item; 0 if the controller refused the whole job.
     """
@@ -51,7 +52,7 @@ class RefusedError(ConnectorError):
 
 
 def explain_error(error: int) -> str:
-    """Return a message for the error class and code in an answer's header."""
+    """Return a message for the error class and code in the header of an answer."""
     if error in _ERRORS:
         return _ERRORS[error].format(where=f"(error 0x{error:04X})")
     known = S7_PROTOCOL_ERROR_CODES.get(error)
@@ -59,87 +60,89 @@ def explain_error(error: int) -> str:
 
 
 def explain_read(code: int, db_number: int, size: int) -> str:
-    """Return a message for an item's return code after a read of a block of ``size`` bytes."""
+    """Return a message for the return code of an item that reads a block of ``size`` bytes."""
     if code == OUT_OF_RANGE:
         return (
-            f"DB{db_number} has no {size} bytes (item code 0x05): the layout is of another version of the block, "
-            f"export it again; or the block is optimized, then {_NO_OPTIMIZED}"
+            f"DB{db_number} does not have {size} bytes (item code 0x05): the layout is of another version of the "
+            "block: "
+            f"export it again; or the block is optimized: {_NO_OPTIMIZED}"
         )
     return f"DB{db_number}: {explain_item(code)}"
 
 
 def explain_size(db_number: int, size: int, found: int, name: str = "", gone: Sequence[str] = ()) -> str:
-    """Return a message for a block that has only ``found`` bytes, not ``size`` as in the layout.
+    """Return a message for a block that has ``found`` bytes instead of ``size`` as in its layout.
 
-    ``name`` is that of the layout, and ``gone`` the registers behind the block's end.
+    ``name`` is the name of the layout. ``gone`` are the registers beyond the block's end.
     """
     if not found:
         return (
-            f"DB{db_number} has no byte that can be addressed (item code 0x05): it is optimized, {_NO_OPTIMIZED}; "
-            "or it is empty"
+            f"DB{db_number} has no byte that can be addressed (item code 0x05): the block is optimized: "
+            f"{_NO_OPTIMIZED}; or it is empty"
         )
     if gone:
         return (
-            f"{block_name(db_number, name)} has {found} bytes, not {size} as its layout (item code 0x05): export it "
-            f"again; beyond its end: {names_of(gone)}"
+            f"{block_name(db_number, name)} has {found} bytes, not {size} as in its layout (item code 0x05): export "
+            f"the layout again; beyond the end of the block: {names_of(gone)}"
         )
     return (
-        f"DB{db_number} has no {size} bytes but {found} bytes (item code 0x05): the layout is of another version of "
-        "the block; export it again"
+        f"DB{db_number} does not have {size} bytes but {found} bytes (item code 0x05): the layout is of another "
+        "version "
+        "of the block: export it again"
     )
 
 
 def block_name(db_number: int, name: str) -> str:
-    """Return a block's number, and its name if that says more."""
+    """Return a block's number, and its name unless this only repeats the number."""
     return f"DB{db_number}" if name.upper() in {"", f"DB{db_number}"} else f'DB{db_number} "{shorten(name, 40)}"'
 
 
 def names_of(paths: Sequence[str]) -> str:
-    """Return the first names of a list, and how many there are besides."""
+    """Return the first few names as text, with the number of those left out."""
     text = ", ".join(shorten(path, 40) for path in paths[:_MOST_NAMES])
     return text if len(paths) <= _MOST_NAMES else f"{text} and {len(paths) - _MOST_NAMES} more"
 
 
 def explain_write(code: int, db_number: int, last: int) -> str:
-    """Return a message for an item's return code after a write up to byte ``last``."""
+    """Return a message for the return code of an item that writes up to byte ``last``."""
     if code == OUT_OF_RANGE:
         return (
-            f"DB{db_number} has no byte {last} (item code 0x05): the layout is of another version of the block; export "
+            f"DB{db_number} has no byte {last} (item code 0x05): the layout is of another version of the block: export "
             "it again"
         )
     return f"DB{db_number}: {explain_item(code)}"
 
 
 def explain_place(code: int, text: str, db_number: int, last: int) -> str:
-    """Return a message for the return code of a single register of a tag table.
+    """Return a message for the return code of an item that has one register of a tag table.
 
     Args:
         code: The return code.
         text: The register's address.
-        db_number: Number of its block; 0 in other areas.
-        last: Its last byte.
+        db_number: The number of the register's data block; 0 in other areas.
+        last: The register's last byte.
 
     """
     if code == OUT_OF_RANGE and db_number:
         return (
-            f"DB{db_number} has no byte {last} (item code 0x05): correct the address {text}, or the block in the "
-            f"controller is of another version, or optimized: {_NO_OPTIMIZED}"
+            f"DB{db_number} has no byte {last} (item code 0x05): correct the address {text}; or the block in the "
+            f"controller is of another version; or it is optimized: {_NO_OPTIMIZED}"
         )
     return explain_item(code)
 
 
 def explain_item(code: int) -> str:
-    """Return a message for an item's return code, without the place."""
+    """Return a message for the return code of an item, without saying which item."""
     where = f"(item code 0x{code:02X})"
     if code == ACCESS_DENIED:
         return _ACCESS_DENIED.format(where=where)
     if code == NO_SUCH_OBJECT:
         return (
-            f"the block does not exist {where}: check dbNumber, and that it is loaded; on an S7-1200 or S7-1500 it may "
-            f"be optimized, then {_NO_OPTIMIZED}"
+            f"the block does not exist {where}: check dbNumber, and that the block is loaded; on an S7-1200 or S7-1500 "
+            f"the block may be optimized: {_NO_OPTIMIZED}"
         )
     if code == OUT_OF_RANGE:
-        return f"the controller has no such address {where}: correct it, or the block is optimized: {_NO_OPTIMIZED}"
+        return f"the controller has no such address {where}: correct it; or the block is optimized: {_NO_OPTIMIZED}"
     if code in {NO_SUCH_TYPE, OTHER_SIZE}:
         return f"the controller does not accept data of this type or length {where}"
-    return f"the controller refused it: {S7_RETURN_CODES.get(code, 'no text known')} {where}"
+    return f"the controller refused the request: {S7_RETURN_CODES.get(code, 'no text known')} {where}"

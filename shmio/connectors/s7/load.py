@@ -9,15 +9,15 @@ from typing import Final
 from shmio.connectors.load import Requests
 
 PDU_SIZES: Final = (240, 480, 960)
-"""What controllers grant: S7-300 and S7-1200 mostly 240 bytes, S7-400 480, S7-1500 960."""
+"""The usual PDU sizes in bytes: S7-300 and S7-1200 mostly grant 240, S7-400 480, S7-1500 960."""
 NOTE: Final = (
-    "this is for one request at a time; many controllers take more, and the log of the source says what was granted "
-    "(pdu=, jobs=)"
+    "this assumes one request at a time; many controllers accept more, and the log of the source shows how many the "
+    "controller has granted (jobs=, and pdu= for the size)"
 )
 
 
 def by_pdu_size(count: Callable[[int], int]) -> tuple[Requests, ...]:
-    """Return the requests of a cycle for each PDU size, sizes with the same count together.
+    """Return the requests of a cycle for each PDU size. Sizes with the same count share an entry.
 
     Args:
         count: Returns the number of requests for a PDU size.

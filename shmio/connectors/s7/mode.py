@@ -26,9 +26,10 @@ _DOUBTS = {
     0xE: "in its self-test: its program does not run yet",
     0xF: "without power",
 }
-"""The modes in which values do not change, with their texts.
+"""The modes in which values do not change, with texts that say so.
 
-In the other modes the program runs: RUN is 8; a redundant pair has 9, and B and C while it couples.
+In the other modes the program runs: RUN is 8. A redundant pair has 9, and 0xB and 0xC while its
+controllers synchronize.
 """
 MODES: Final = {
     **dict.fromkeys((1, 2, 3, 4), "STOP"),
@@ -42,29 +43,29 @@ MODES: Final = {
     0xE: "SELF-TEST",
     0xF: "NO POWER",
 }
-"""Names of the modes."""
+"""The name of each mode."""
 
 log = logging.getLogger("shmio.source")
 
 
 class ModeQuery(Query):
-    """Queries the operating mode, and stores the last answer."""
+    """Asks for the operating mode about once a second, and stores the last answer."""
 
     def __init__(self) -> None:
         super().__init__(READ_SZL, INTERVAL_NS)
         self.doubt = ""
-        """Reason why values may not change; empty if the program runs or the mode is unknown."""
+        """Why values may not change; empty if the program runs or the mode is unknown."""
         self.mode: int | None = None
-        """The number of the mode, one of ``MODES`` or another one; None if it is unknown."""
+        """The number of the mode, usually one of ``MODES``; None if it is unknown."""
         self.answered_ns = 0
-        """UTC time of the last answer, ns since 1970."""
+        """UTC time of the last answer, in ns since 1970."""
         self.unknown = False
-        """Whether the controller does not tell its mode in this session."""
+        """Whether the controller does not report its mode in this session."""
         self._logged = False
 
     @property
     def runs(self) -> bool:
-        """Whether the mode is known, and the program runs in it."""
+        """Whether the mode is known, and the program runs in this mode."""
         return self.mode in MODES and self.mode not in _DOUBTS
 
     def data(self) -> bytes:
@@ -72,7 +73,7 @@ class ModeQuery(Query):
         return szl_data(_SZL)
 
     def answered(self, data: bytes) -> None:
-        """Store the mode; stop asking in this session if the list has none."""
+        """Store the mode. If the answer has none, stop asking in this session."""
         records = szl_records(data, _SZL)
         if not records or len(records[0]) < 4:
             self._stop()
@@ -83,7 +84,7 @@ class ModeQuery(Query):
         self.doubt = f"the PLC is {words}" if words else ""
 
     def refused(self, refusal: RefusedError) -> None:  # noqa: ARG002 - all refusals mean the same
-        """Stop asking in this session; the next one may be with another controller."""
+        """Stop asking in this session. The next session may be with another controller."""
         self._stop()
 
     def _stop(self) -> None:
@@ -97,12 +98,12 @@ class ModeQuery(Query):
         super().lost(alive=alive)
 
     def given_up(self, why: str) -> None:
-        """Log why, once."""
+        """Log once that STOP will not be noticed, and why."""
         self._forget()
         self.unknown = True
         if not self._logged:
             self._logged = True
-            log.debug("the controller %s of its operating mode: STOP will not be noticed", why)
+            log.debug("no more questions about the operating mode: the controller %s; STOP will not be noticed", why)
 
     def _forget(self) -> None:
         self.doubt, self.mode = "", None

@@ -1,14 +1,14 @@
-"""Encodes and parses S7 over ISO-on-TCP: frames, sessions, jobs, reads of one item. No I/O.
+"""Encodes and parses S7 over ISO-on-TCP: frames, session set-up, jobs, reads. No I/O.
 
-A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole), ISO
-8073 class 0 (COTP: CR and CC open, DT carries data), and the S7 job (ROSCTR 1). A controller
-answers with Ack-Data (3), or with only an Ack (2) that has an error. S7 has no public standard;
-names follow Wireshark's dissector.
+A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole frame),
+ISO 8073 class 0 (COTP: CR and CC open a connection, DT carries data), and the S7 job (ROSCTR 1). A
+controller answers with Ack-Data (3), or with only an Ack (2) that has an error. S7 has no public
+standard; names follow Wireshark's dissector.
 
 The client of python-snap7 is not used. Its parsers are many times slower than one ``struct`` call
-per frame, and do not compare an answer with its request. Its encoders cannot write several items in
-one job. It starts a new time-out for each piece that it receives, so a peer that sends byte by byte
-never times out.
+for each frame, and do not compare an answer with its request. Its encoders cannot write several
+items in one job. It starts a new time-out for each piece that it receives, so a peer that sends
+byte by byte never times out.
 
 Every parser in this module raises only ConnectorError, for any input.
 """
@@ -49,7 +49,7 @@ _COTP_CR, _COTP_CC, _COTP_DR, _COTP_DT = 0xE0, 0xD0, 0x80, 0xF0
 _ACK, _ACK_DATA = 2, 3
 READ, WRITE, _SETUP = 0x04, 0x05, 0xF0
 JOB, USERDATA = 1, 7
-"""The values of ROSCTR in requests."""
+"""The values of ROSCTR (kind of PDU) in requests."""
 DATA_BLOCK: Final = 0x84
 TYPE_BIT, TYPE_BYTE = 1, 2
 CONNECTION_TYPES: Final = {"pg": 1, "op": 2, "basic": 3}
@@ -71,7 +71,7 @@ class ReadAnswer(NamedTuple):
     """The answer to a read of one item."""
 
     code: int
-    """The item's return code. There is data only if it is ITEM_OK."""
+    """The item's return code. The answer has data only if this is ITEM_OK."""
     data: memoryview
 
 
@@ -79,10 +79,12 @@ class ReadAnswer(NamedTuple):
 
 
 def frame_length(inbox: memoryview, start: int, longest: int) -> int:
-    """Return the length in bytes of the frame at ``start``, whose first four bytes were received.
+    """Return the length in bytes of the frame at ``start``.
+
+    Its first four bytes must have been received.
 
     Raises:
-        ConnectorError: It is not a frame, or is longer than ``longest`` bytes.
+        ConnectorError: The bytes are not a frame, or the frame is longer than ``longest`` bytes.
 
     """
     version, length = _TPKT.unpack_from(inbox, start)
@@ -90,7 +92,7 @@ def frame_length(inbox: memoryview, start: int, longest: int) -> int:
         sent = bytes(inbox[start : start + 8])
         raise ConnectorError(f"the peer is not an S7 controller: it sent {sent!r}, which is not ISO-on-TCP")
     if not FRAME_OVERHEAD <= length <= longest:
-        raise ConnectorError(f"frame of {length} bytes, expected {FRAME_OVERHEAD} to {longest}")
+        raise ConnectorError(f"the controller sent a frame of {length} bytes, expected {FRAME_OVERHEAD} to {longest}")
     return int(length)
 
 
@@ -101,7 +103,7 @@ def request(reference: int, parameters: bytes, data: bytes = b"", rosctr: int = 
 
 
 def address(db_number: int, place: int, count: int, kind: int = TYPE_BYTE, area: int = DATA_BLOCK) -> bytes:
-    """Return the encoded address of ``count`` bytes or of one bit in a data block or another area.
+    """Return the encoded address of ``count`` bytes, or of one bit, in a data block or other area.
 
     ``place`` is the offset in bits, or the number of a timer or counter.
     """
@@ -116,7 +118,7 @@ def reference_of(frame: memoryview) -> int:
     """Return the reference of the request to which an answer belongs; check nothing else."""
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
-        raise ConnectorError(f"answer of {len(frame)} bytes is too short")
+        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")
     return frame[REFERENCE_OFFSET] << 8 | frame[REFERENCE_OFFSET + 1]
 
 
@@ -127,12 +129,12 @@ def check_envelope(frame: memoryview) -> tuple[int, int, int]:
     """
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
-        raise ConnectorError(f"answer of {len(frame)} bytes is too short")
+        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")
     cotp, protocol, kind, parameter_length, data_length = _HEADER.unpack_from(frame)
     if cotp != _COTP_DATA:
         _check_cotp(frame)
         # The agreed TPDU size is large enough for any answer.
-        raise ConnectorError("answer in several TPDUs, though it fits into one")
+        raise ConnectorError("the controller sent an answer in several TPDUs, although it fits into one")
     if protocol != 0x32:
         raise ConnectorError(f"the peer does not speak S7 (protocol 0x{protocol:02X}, expected 0x32)")
     return kind, parameter_length, data_length
@@ -148,9 +150,9 @@ def check_answer(frame: memoryview) -> int:
     """
     kind, parameter_length, data_length = check_envelope(frame)
     if kind not in {_ACK, _ACK_DATA}:
-        raise ConnectorError(f"not an answer: ROSCTR {kind}")
+        raise ConnectorError(f"the controller's reply is not an answer: ROSCTR {kind}")
     if len(frame) < HEADER_END:
-        raise ConnectorError(f"answer of {len(frame)} bytes is too short")
+        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")
     error = frame[17] << 8 | frame[18]
     if HEADER_END + parameter_length + data_length != len(frame):
         raise ConnectorError(
@@ -168,7 +170,7 @@ def _check_cotp(frame: memoryview) -> None:
     if kind == _COTP_DR:
         raise ConnectorError("the controller ended the session")
     if kind != _COTP_DT:
-        raise ConnectorError(f"unexpected COTP TPDU 0x{kind:02X}")
+        raise ConnectorError(f"the controller sent the unexpected COTP TPDU 0x{kind:02X}")
 
 
 # -- session -----------------------------------------------------------------------------------------------------------
@@ -177,7 +179,7 @@ def _check_cotp(frame: memoryview) -> None:
 def connect_request(local_tsap: int, remote_tsap: int) -> bytes:
     """Return the COTP connection request to a CPU.
 
-    The called TSAP of most CPUs contains the connection type, and rack and slot.
+    On most CPUs, ``remote_tsap`` contains the connection type, the rack and the slot.
     """
     tsaps = struct.pack(">BBH BBH BBB", 0xC1, 2, local_tsap, 0xC2, 2, remote_tsap, 0xC0, 1, _TPDU_SIZE_CODE)
     head = struct.pack(">BBHHB", 6 + len(tsaps), _COTP_CR, 0, 1, 0)
@@ -189,7 +191,9 @@ def parse_connect_confirm(frame: memoryview) -> int:
     if frame[5] == _COTP_DR:
         raise ConnectorError("the controller refused the session")
     if frame[5] != _COTP_CC or len(frame) < 11:
-        raise ConnectorError(f"the peer is not an S7 controller: it answered COTP TPDU 0x{frame[5]:02X} to the request")
+        raise ConnectorError(
+            f"the peer is not an S7 controller: it answered COTP TPDU 0x{frame[5]:02X} to the connection request"
+        )
     if frame[4] != len(frame) - 5:
         raise ConnectorError(
             "the peer's connection confirm has the wrong length: check that host and port are those of an S7 controller"
@@ -200,7 +204,7 @@ def parse_connect_confirm(frame: memoryview) -> int:
         if code == 0xC0 and length == 1:
             exponent = frame[position + 2]
             if not 7 <= exponent <= 16:
-                raise ConnectorError(f"TPDU size code {exponent} is invalid")
+                raise ConnectorError(f"the controller's TPDU size code {exponent} is invalid")
             return int(min(1 << exponent, DEFAULT_TPDU_SIZE))
         position += 2 + length
     return DEFAULT_TPDU_SIZE
@@ -209,7 +213,7 @@ def parse_connect_confirm(frame: memoryview) -> int:
 def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
     """Return the request "setup communication".
 
-    It asks for a number of parallel jobs and a PDU size in bytes.
+    It asks for a number of parallel jobs, and for a PDU size in bytes.
     """
     return request(reference, struct.pack(">BBHHH", _SETUP, 0, jobs, jobs, pdu_size))
 
@@ -218,9 +222,9 @@ def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Ses
     """Return the session that the controller grants, limited to what was requested."""
     data_length = check_answer(frame)
     if (answered := reference_of(frame)) != reference:
-        raise ConnectorError(f"answer to a request that was not sent (reference {answered})")
+        raise ConnectorError(f"the controller answered a request that was not sent (reference {answered})")
     if len(frame) != HEADER_END + 8 or data_length or frame[HEADER_END] != _SETUP:
-        raise ConnectorError("not an answer to 'setup communication'")
+        raise ConnectorError("the controller's reply is not an answer to 'setup communication'")
     calling, called, pdu_size = struct.unpack_from(">HHH", frame, HEADER_END + 2)
     if pdu_size < MIN_PDU_SIZE:
         raise ConnectorError(f"the controller grants PDUs of only {pdu_size} bytes")
@@ -236,7 +240,7 @@ def read_request(reference: int, items: Sequence[bytes]) -> bytes:
 
 
 def parse_read_answer(frame: memoryview) -> ReadAnswer:
-    """Parse an answer to a read of one item of bytes; ``data`` is a view of the frame.
+    """Parse the answer to a read of one item of bytes; ``data`` is a view of the frame.
 
     Raises:
         RefusedError: The controller refused the job.
@@ -257,27 +261,31 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
             return ReadAnswer(ITEM_OK, frame[_ITEM_END:])
     data_length = check_answer(frame)
     if len(frame) < HEADER_END + 3:
-        raise ConnectorError(f"answer of {len(frame)} bytes is too short for a read")
+        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short for a read")
     if frame[HEADER_END] != READ or frame[HEADER_END + 1] != 1 or data_length != len(frame) - HEADER_END - 2:
-        raise ConnectorError("not an answer to a read of one item")
+        raise ConnectorError("the controller's reply is not an answer to a read of one item")
     code = frame[HEADER_END + 2]
     if code != ITEM_OK:
         return ReadAnswer(code, frame[:0])
     if len(frame) < _ITEM_END:
-        raise ConnectorError(f"answer of {len(frame)} bytes is too short for data")
+        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short for data")
     _, _, _, transport, length = _ITEM.unpack_from(frame, HEADER_END)
     if transport == _BITS and not length & 7:
         length >>= 3
     elif transport != _OCTETS:
-        raise ConnectorError(f"data of transport size 0x{transport:02X}, length {length}; bytes were asked for")
+        raise ConnectorError(
+            f"the controller sent data of transport size 0x{transport:02X}, length {length}; bytes were requested"
+        )
     # Some servers pad data of odd length, although only items before the last one need padding.
     if len(frame) - _ITEM_END not in {length, length + (length & 1)}:
-        raise ConnectorError(f"answer with {len(frame) - _ITEM_END} bytes of data, its header says {length}")
+        raise ConnectorError(
+            f"the controller's answer has {len(frame) - _ITEM_END} bytes of data, but its header says {length}"
+        )
     return ReadAnswer(code, frame[_ITEM_END : _ITEM_END + length])
 
 
 def parse_items(frame: memoryview, sizes: Sequence[int]) -> list[ReadAnswer]:
-    """Parse an answer to a read of several items of ``sizes`` bytes; data are views of the frame.
+    """Parse the answer to a read of several items of ``sizes`` bytes; data are views of the frame.
 
     Raises:
         RefusedError: The controller refused the job.
@@ -286,28 +294,33 @@ def parse_items(frame: memoryview, sizes: Sequence[int]) -> list[ReadAnswer]:
     """
     check_answer(frame)
     if len(frame) < HEADER_END + 2 or frame[HEADER_END] != READ or frame[HEADER_END + 1] != len(sizes):
-        raise ConnectorError(f"not an answer to a read of {len(sizes)} items")
+        raise ConnectorError(f"the controller's reply is not an answer to a read of {len(sizes)} items")
     answers: list[ReadAnswer] = []
     end = HEADER_END + 2
     for size in sizes:
         at = end + ((end - HEADER_END) & 1 if answers else 0)  # items begin at even places
         if at + 4 > len(frame):
-            raise ConnectorError(f"answer that ends before item {len(answers) + 1} of {len(sizes)}")
+            raise ConnectorError(f"the controller's answer ends before item {len(answers) + 1} of {len(sizes)}")
         code, transport, length = _READ_ITEM.unpack_from(frame, at)
         end = at + 4
         if code != ITEM_OK:
             if length and code not in KNOWN_CODES:  # rather data, after an item that was too short
-                raise ConnectorError(f"item with return code 0x{code:02X} and length {length}")
+                raise ConnectorError(
+                    f"the controller's answer has an inconsistent item with return code 0x{code:02X} and length "
+                    f"{length}"
+                )
             answers.append(ReadAnswer(code, frame[:0]))
             continue
         if transport in _IN_BITS and not length & 7:
             length >>= 3
         elif transport not in _IN_BYTES:
-            raise ConnectorError(f"data of transport size 0x{transport:02X}, length {length}; bytes were asked for")
+            raise ConnectorError(
+                f"the controller sent data of transport size 0x{transport:02X}, length {length}; bytes were requested"
+            )
         if length != size or end + size > len(frame):
-            raise ConnectorError(f"answer has {length} bytes of data, {size} were asked for")
+            raise ConnectorError(f"the controller's answer has {length} bytes of data, but {size} were requested")
         answers.append(ReadAnswer(code, frame[end : end + size]))
         end += size
     if len(frame) - end not in {0, 1}:  # some servers pad the last item too
-        raise ConnectorError(f"answer of {len(frame)} bytes, {end} belong to its items")
+        raise ConnectorError(f"the controller's answer has {len(frame)} bytes, but only {end} belong to its items")
     return answers

@@ -1,4 +1,4 @@
-"""Plans which items of which jobs read the registers of a tag table. No I/O."""
+"""Plans the jobs and their items that read the registers of a tag table. No I/O."""
 
 from __future__ import annotations
 
@@ -9,30 +9,33 @@ from shmio.connectors.s7 import pdu
 from shmio.layout.s7.address import Area
 
 MAX_ITEMS: Final = 20
-"""Items of a job that all known controllers accept."""
+"""Largest number of items in a job that all known controllers accept."""
 MAX_GAP: Final = 16
-"""Most unused bytes that a range includes; another item costs as much."""
+"""Largest number of unused bytes between two fields of a range.
+
+Another item costs about as much.
+"""
 _REQUEST_HEAD, _REQUEST_ITEM = 12, 12
 _ANSWER_HEAD, _ANSWER_ITEM = 14, 4
 _OPEN_JOBS: Final = 8  # jobs in which a place is sought, so that planning takes linear time
 
 
 class Field(NamedTuple):
-    """A register in the controller's memory."""
+    """The bytes of a register in the controller's memory."""
 
     register: int
     """Index of the register in the layout."""
     area: Area
     db: int
     start: int
-    """First byte; that of a timer or counter is twice its number."""
+    """Offset of the first byte. For a timer or counter, twice its number."""
     stop: int
     every: int = 1
-    """In each how many cycles it is read once."""
+    """The field is read once in this number of cycles."""
 
 
 class Range:
-    """Consecutive bytes that hold one or more fields."""
+    """Consecutive bytes that contain one or more fields."""
 
     def __init__(self, fields: Sequence[Field]) -> None:
         self.fields = tuple(fields)
@@ -41,12 +44,12 @@ class Range:
         self.start = min(one.start for one in fields)
         self.stop = max(one.stop for one in fields)
         self.alone = False
-        """Whether it needs a job of its own, because a job with others was refused."""
+        """Whether the range needs its own job, because the controller refused it in a shared job."""
         self.last = b""
-        """The bytes that were stored last."""
+        """The bytes of the range that were stored last."""
 
     def halves(self) -> list[Range]:
-        """Return the range as two, each with half of the fields; the range itself if it has one."""
+        """Return two ranges with half of the fields each; a range of one field returns itself."""
         middle = len(self.fields) // 2
         if not middle:
             return [self]
@@ -57,7 +60,7 @@ class Range:
 
 
 class Piece(NamedTuple):
-    """The part of a range that one item reads; nearly always all of it."""
+    """The part of a range that one item reads; nearly always the whole range."""
 
     range: Range
     start: int
@@ -76,9 +79,11 @@ Job = tuple[Piece, ...]
 
 
 def merge(fields: Iterable[Field], most: int, max_gap: int = MAX_GAP) -> list[Range]:
-    """Return ranges that cover the fields, those of each rate by themselves.
+    """Return ranges that cover the fields.
 
-    A range has at most ``most`` bytes unless one field has more.
+    Fields that are read at different rates do not share a range.
+
+    A range has at most ``most`` bytes, unless one field is longer.
     """
     ranges: list[Range] = []
     run: list[Field] = []
@@ -99,12 +104,18 @@ def merge(fields: Iterable[Field], most: int, max_gap: int = MAX_GAP) -> list[Ra
 
 
 def most_bytes(pdu_size: int) -> int:
-    """Return the most bytes of an item; even, as timers and counters have two bytes each."""
+    """Return the largest number of bytes in an item.
+
+    It is even, because timers and counters have two bytes each.
+    """
     return pdu_size - _ANSWER_HEAD - _ANSWER_ITEM & ~1
 
 
 def pack(ranges: Iterable[Range], pdu_size: int) -> list[Job]:
-    """Return jobs whose requests and answers fit a PDU, with at most ``MAX_ITEMS`` items each."""
+    """Return jobs whose requests and answers fit into a PDU.
+
+    A job has at most ``MAX_ITEMS`` items.
+    """
     jobs: list[list[Piece]] = []
     room: list[tuple[int, int]] = []  # of each job: bytes left in the answer, and items left
     items = min(MAX_ITEMS, (pdu_size - _REQUEST_HEAD) // _REQUEST_ITEM)

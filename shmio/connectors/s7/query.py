@@ -1,8 +1,8 @@
-"""A question about the controller itself, which is asked beside the reads of its data. No I/O.
+"""A question about the controller itself, asked between the reads of its data. No I/O.
 
-Only one is under way at a time, behind the requests of a read. A controller may refuse one, or
-never answer it: some close the connection instead. So a question without an answer ends the
-connection only a few times, and is not asked any more then.
+Only one question is open at a time, and its request is sent after those of a read. A controller may
+refuse a question, or never answer it: some close the connection instead. A question without an
+answer may therefore end the connection only a few times. After that it is not asked again.
 """
 
 from __future__ import annotations
@@ -16,50 +16,50 @@ from shmio.connectors.s7.userdata import Service, next_request, parse_answer, re
 from shmio.errors import ConnectorError
 
 PATIENCE: Final = 2
-"""Number of connections that a question without a valid answer may end."""
+"""Largest number of connections that a question may end by not being answered properly."""
 MAX_PARTS: Final = 64
 MAX_ANSWER_BYTES: Final = 16_384
 
 
 class Query(ABC):
-    """A question that is asked again and again, or once in each session."""
+    """A question that is asked periodically, or once in each session."""
 
     optional: ClassVar[bool] = False
-    """Whether it is not asked of a controller that did not answer others at all."""
+    """Whether the question is left out if the controller never answered the question for its mode."""
 
     def __init__(self, service: Service, interval_ns: int | None) -> None:
-        """Create a question; without an interval it is asked once in each session."""
+        """Create a question; if ``interval_ns`` is None, it is asked once in each session."""
         self.service = service
         self._interval_ns = interval_ns
         self._due_ns: int | None = 0
         self.deadline_ns = 0
-        """Time by which the answer to an open question must come, in ns of CLOCK_MONOTONIC."""
+        """Time by which an open question must be answered, in ns of CLOCK_MONOTONIC."""
         self._known = False  # the controller has answered at least once
         self._failures = self._malformed = 0
         self.supported = True
-        """False if the question is not asked any more, in any session."""
+        """False if the question is not asked again in any session."""
         self.silent = False
-        """True if that is because the controller did not answer at all."""
+        """True if ``supported`` is False because the controller never answered the question."""
         self.count = 1
         self.sent = 0
         self.complete = True
         self.begun_after = 0
-        """Number of answers of the session that came before the question."""
+        """Number of answers received in the session before the question was asked."""
         self._answer = bytearray()
         self._sequence = 0
         self.again: Callable[[Query], None] = lambda _: None
-        """Called to request the next part of an answer."""
+        """Called to send the request for the next part of an answer."""
 
     def due(self, now_ns: int) -> bool:
-        """Return whether to ask now."""
+        """Return whether the question is to be asked now."""
         return self.supported and self.complete and self._due_ns is not None and now_ns >= self._due_ns
 
     def overdue(self, now_ns: int) -> bool:
-        """Return whether the answer is late."""
+        """Return whether the question is open and its deadline has passed."""
         return not self.complete and now_ns >= self.deadline_ns
 
     def begin(self, now_ns: int, deadline_ns: int) -> None:
-        """Ask; the answer must come by ``deadline_ns``."""
+        """Open the question, which must be answered by ``deadline_ns``."""
         self._due_ns = None if self._interval_ns is None else now_ns + self._interval_ns
         self.deadline_ns = deadline_ns
         self.count, self.sent = 1, 0
@@ -67,7 +67,7 @@ class Query(ABC):
         self._answer.clear()
 
     def take(self, count: int, first: int) -> bytes:
-        """Return the request: for the answer, or for its next part."""
+        """Return the request: for the whole answer at first, then for its next part."""
         begin, self.sent = self.sent, self.sent + count
         if begin:
             return next_request(first & 0xFFFF, self.service, self._sequence)
@@ -108,8 +108,9 @@ class Query(ABC):
     def lost(self, *, alive: bool = True) -> None:
         """Forget an open question, because the connection was lost.
 
-        Stop asking if connections were repeatedly lost while the question was open, though the
-        controller was ``alive``: it answered other requests meanwhile.
+        Stop asking if connections were lost repeatedly while the question was open. Only
+        connections count on which the controller was ``alive``: it answered other requests in the
+        meantime.
         """
         self._due_ns = 0
         if self.complete:
@@ -121,11 +122,11 @@ class Query(ABC):
             self._give_up("does not answer the query")
 
     def rest(self) -> None:
-        """Do not ask again in this session."""
+        """Do not ask the question again in this session."""
         self._due_ns = None
 
     def hurry(self) -> None:
-        """Ask again at once."""
+        """Make the question due at once."""
         self._due_ns = 0
 
     def _give_up(self, why: str) -> None:
@@ -138,7 +139,12 @@ class Query(ABC):
 
     @abstractmethod
     def answered(self, data: bytes) -> None:
-        """Process the data of a whole answer; raise ConnectorError if it does not match the request."""
+        """Process the data of a whole answer.
+
+        Raises:
+            ConnectorError: The data do not match the request.
+
+        """
 
     @abstractmethod
     def refused(self, refusal: RefusedError) -> None:
@@ -146,4 +152,7 @@ class Query(ABC):
 
     @abstractmethod
     def given_up(self, why: str) -> None:
-        """Note that the question is not asked any more; the reason continues "the controller …"."""
+        """Process that the question is not asked again.
+
+        ``why`` continues the words "the controller …".
+        """

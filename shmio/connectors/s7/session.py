@@ -1,7 +1,7 @@
 """A session with an S7 controller: its configuration keys, reads in flight, and writes.
 
 ``submit`` sends the requests of a read and returns at once. ``collect`` waits for the image. Up to
-``depth`` reads may be in flight, and you may write at any time. Use a client in one thread only.
+``depth`` reads may be in flight, and you may write at any time. Use a session in one thread only.
 """
 
 from __future__ import annotations
@@ -51,21 +51,24 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     rack: Annotated[int, msgspec.Meta(ge=0, le=7)] = 0
     slot: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None
     connection: Literal["pg", "op", "basic"] = "pg"
-    """Type of the connection: programming device, operator panel or other (S7 basic)."""
+    """Type of the connection: programming device, operator panel, or any other (S7 basic)."""
     local_tsap: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] = 0x0100
-    """TSAP of this side."""
+    """TSAP of shmio."""
     remote_tsap: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None = None
-    """TSAP of the controller; None: that of ``connection``, ``rack`` and ``slot``."""
+    """TSAP of the controller; None: it is made from ``connection``, ``rack`` and ``slot``."""
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
     """Time-out in ms for connecting, for reading the block, and for each answer to a write."""
     packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
-    """Largest number of data bytes in one read; the controller's PDU size limits it too."""
+    """Largest number of data bytes in one read.
+
+    The PDU size that the controller grants limits it too.
+    """
     dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
     """Number of the data block; None: the number in the layout's name."""
     every: Annotated[dict[str, Annotated[int, msgspec.Meta(ge=2, le=10_000)]], msgspec.Meta(max_length=8)] = {}
-    """Of a tag table: patterns of registers that are read only in each n-th cycle, with n."""
+    """For a tag table: by pattern, n for registers that are read only in every n-th cycle."""
     maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named like the other keys
-    """Largest number of requests in flight; the controller's limit applies too."""
+    """Largest number of requests in flight; the number that the controller grants limits it too."""
 
     def __post_init__(self) -> None:
         if not _is_host(self.host):
@@ -77,26 +80,26 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
 
     @property
     def cpu_slot(self) -> int:
-        """The configured slot, or the usual one of the model."""
+        """The configured slot, or else the usual slot of the model."""
         if self.slot is not None:
             return self.slot
         return 1 if self.model is None else _CPU_SLOT[_family(self.model)]
 
     @property
     def called_tsap(self) -> int:
-        """The configured TSAP of the controller, or that of connection type, rack and slot."""
+        """The configured TSAP of the controller, or else that of connection type, rack and slot."""
         if self.remote_tsap is not None:
             return self.remote_tsap
         return pdu.CONNECTION_TYPES[self.connection] << 8 | self.rack << 5 | self.cpu_slot
 
     @property
     def peer(self) -> str:
-        """``host:port`` for messages, with IPv6 addresses in brackets."""
+        """``host:port`` for messages, with brackets around IPv6 addresses."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
 def _family(model: str) -> str:
-    """Return the model as spelled in the table, for example ``S7_1500`` for ``s7-1500``."""
+    """Return the model as S7Options lists it, for example ``S7_1500`` for ``s7-1500``."""
     return model.strip().upper().replace("-", "_").replace(" ", "_")
 
 
@@ -119,10 +122,10 @@ def _is_name(text: str) -> bool:
 
 
 class Read(Operation, Protocol):
-    """A read of all values of a cycle, which may be begun again."""
+    """A read of all values of a cycle. It can be used again for other cycles."""
 
     deadline_ns: int
-    """Time by which it must be complete, in ns of CLOCK_MONOTONIC."""
+    """Time by which the read must be complete, in ns of CLOCK_MONOTONIC."""
     refusal: RefusedError | None
     """The controller's refusal of the whole read; None if it did not refuse."""
 
@@ -135,9 +138,9 @@ class Read(Operation, Protocol):
 
 
 class S7Session(ABC):
-    """Keeps a session with one controller, in which several reads may be in flight.
+    """A session with one controller, in which several reads may be in flight.
 
-    A subclass says what is read and how writes are carried out. Any error closes the socket, so
+    A subclass defines what is read and how writes are carried out. Any error closes the socket, so
     that a late answer is never matched to a later request. You may call ``connect`` again
     afterwards.
     """
@@ -160,12 +163,12 @@ class S7Session(ABC):
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that a method takes, in s: ``timeout``, at least LONGEST_WRITE_S."""
+        """The longest time that a method may take, in s: the longer of ``timeout`` and LONGEST_WRITE_S."""
         return max(self.options.timeout / 1000, LONGEST_WRITE_S)
 
     @property
     def connected(self) -> bool:
-        """True if a session is open, as far as the client knows."""
+        """True if a session is open. The controller may have closed it unnoticed."""
         return self._transport is not None
 
     @property
@@ -188,11 +191,13 @@ class S7Session(ABC):
 
     @property
     def doubt(self) -> str:
-        """Reason why values may not change, such as a PLC in STOP; empty if there is none."""
+        """Why values may not change, such as a PLC in STOP; empty if there is no reason."""
         return self._mode.doubt
 
     def connect(self) -> None:
-        """Open a session and query the operating mode, within ``timeout`` plus the name lookup.
+        """Open a session and ask for the operating mode.
+
+        This takes at most ``timeout``, and the time to look up the host name.
 
         Raises:
             ConnectorError: No controller answers, it does not speak S7, or it refuses the session.
@@ -210,7 +215,7 @@ class S7Session(ABC):
             transport.send(pdu.setup_request(reference, asked.jobs, asked.pdu_size), deadline_ns)
             granted = pdu.parse_setup_answer(transport.next_frame(deadline_ns), reference, asked)
             if transport.left:
-                raise ConnectorError("unexpected bytes after the session was set up")
+                raise ConnectorError("the controller sent unexpected bytes after the session was set up")
             self._use(granted, transport)
         with self._close_on_error:
             self._ask()
@@ -236,14 +241,16 @@ class S7Session(ABC):
         return image
 
     def submit(self) -> None:
-        """Send the requests of one read and return. At most ``depth`` reads may be in flight.
+        """Send the requests of one read, without waiting for answers.
+
+        At most ``depth`` reads may be in flight.
 
         Raises:
             ConnectorError: There is no session, or it was lost.
 
         """
         if self._transport is None:
-            raise ConnectorError("not connected")
+            raise ConnectorError("shmio is not connected to the controller")
         if not self._idle:
             raise RuntimeError(f"no more than {self.depth} reads may be in flight")
         with self._close_on_error:
@@ -265,11 +272,12 @@ class S7Session(ABC):
 
         Raises:
             ConnectorError: There is no session, an answer is wrong, the controller refused the
-                read, or it did not answer within ``timeout`` of ``submit``. The session is closed.
+                read, or it did not answer within ``timeout`` after ``submit``. The session is
+                closed.
 
         """
         if self._transport is None:
-            raise ConnectorError("not connected")
+            raise ConnectorError("shmio is not connected to the controller")
         if not self._under_way:
             raise RuntimeError("no read is in flight")
         read = self._under_way[0]
@@ -286,20 +294,19 @@ class S7Session(ABC):
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Write a batch, and wait until the controller has answered. Reads may be in flight.
 
-        If writes change the same bits, the last one wins. A batch that does not fit into one PDU
-        takes several jobs, and is not atomic. The controller may execute jobs in flight in any
-        order. Each answer must come within ``timeout`` of the one before.
+        If writes change the same bits, the last write determines them. A batch that does not fit
+        into one PDU takes several jobs, and is not atomic. The controller may execute jobs in
+        flight in any order. Each answer must come within ``timeout`` after the previous one.
 
         Returns:
-            For each write, "" if the controller confirmed it, else why it refused the write.
+            For each write, "" if the controller confirmed it, or else why it refused the write.
 
         Raises:
-            WriteLostError: The session was lost, or the batch took longer than both
-                LONGEST_WRITE_S and ``timeout``.
+            WriteLostError: The session was lost, or the batch took longer than ``timeout_s``.
 
         """
         if self._transport is None:
-            raise WriteLostError("not connected", [Lost.UNSENT] * len(writes))
+            raise WriteLostError("shmio is not connected to the controller", [Lost.UNSENT] * len(writes))
         outcomes = [""] * len(writes)
         begun: list[BlockWrite] = []
         try:
@@ -344,19 +351,22 @@ class S7Session(ABC):
 
     @abstractmethod
     def _reads(self) -> list[Read]:
-        """Return the reads that may be in flight at once in the new session, at least one."""
+        """Return the reads that may be in flight at once in the new session; at least one."""
 
     @abstractmethod
     def _waves(self, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
-        """Divide a batch into waves that are sent one after the other.
+        """Divide a batch into waves. Each wave must be complete before the next one is sent.
 
-        Each wave stores the reasons of refusals in ``outcomes``, by the write's index.
+        If the controller refuses a write, its wave stores the reason in ``outcomes``.
         """
 
     # -- requests and answers ------------------------------------------------------------------------------------------
 
     def _add_query(self, query: Query) -> None:
-        """Ask this question too, from now on; the first one added has precedence."""
+        """Add a question to those that the session asks.
+
+        Questions added earlier have precedence.
+        """
         query.again = self._continue
         self._queries.append(query)
 
@@ -364,7 +374,12 @@ class S7Session(ABC):
         self._window.add(query)
 
     def _ask(self) -> None:
-        """Queue a question if one is due and none is open; raise TimeoutError if an answer is late."""
+        """Queue a question if one is due and none is open.
+
+        Raises:
+            TimeoutError: An open question was not answered in time.
+
+        """
         now_ns = time.monotonic_ns()
         for query in self._queries:
             if not query.complete:  # after a long period the answer may be in the socket
@@ -381,7 +396,7 @@ class S7Session(ABC):
                 return
 
     def _flush(self) -> None:
-        """Send as many waiting requests as the window allows."""
+        """Send waiting requests, as many as may be in flight."""
         assert self._transport is not None  # noqa: S101 - for the type checker
         if self._window.waiting and (requests := self._window.due()):
             try:
@@ -404,7 +419,7 @@ class S7Session(ABC):
         return True
 
     def _step(self, until_ns: int) -> int | None:
-        """Receive once, then send as many waiting requests as the window allows.
+        """Receive once, then send waiting requests, as many as may be in flight.
 
         Returns:
             The number of answers; None if nothing was received until ``until_ns``.
@@ -420,7 +435,7 @@ class S7Session(ABC):
             answers += 1
         self._answers += answers
         if window.idle and transport.left:
-            raise ConnectorError("unexpected bytes after the last answer")
+            raise ConnectorError("the controller sent unexpected bytes after the last answer")
         self._flush()
         return answers
 
@@ -429,7 +444,13 @@ class S7Session(ABC):
             raise TimeoutError
 
     def _finish_wave(self, wave: BlockWrite, end_ns: int) -> None:
-        """Wait for all jobs of a wave until ``end_ns``, and for each answer at most ``timeout``."""
+        """Wait until a wave is complete, but not longer than ``timeout`` for an answer.
+
+        Raises:
+            TimeoutError: No answer came within ``timeout``.
+            ConnectorError: The wave was not complete by ``end_ns``.
+
+        """
         deadline_ns = time.monotonic_ns() + self._timeout_ns
         while not wave.complete:
             answers = self._step(min(deadline_ns, end_ns))
@@ -440,12 +461,15 @@ class S7Session(ABC):
                 raise TimeoutError
             if now_ns >= end_ns and not wave.complete:
                 raise ConnectorError(
-                    f"{self.options.peer} has not served all writes of a cycle within {self.timeout_s:g} s: write less "
-                    "at once"
+                    f"{self.options.peer} has not answered all writes of a cycle within {self.timeout_s:g} s: "
+                    "write fewer values at once"
                 )
 
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:  # noqa: ARG002
-        """Return the refusal of a read, with more detail if there is some to be had by ``deadline_ns``."""
+        """Return the refusal of a read.
+
+        A subclass may ask the controller for details until ``deadline_ns``.
+        """
         return refusal
 
 
@@ -463,8 +487,8 @@ def _named(error: BaseException, options: S7Options, *, opening: bool = False) -
         text = f"{peer} closed the connection"
         if opening:
             text += (
-                f" during set-up: rack {options.rack}, slot {options.cpu_slot} may be wrong, all its connections in "
-                "use, or it is not an S7 controller"
+                f" during set-up: rack {options.rack}, slot {options.cpu_slot} may be wrong, all its connections may "
+                "be in use, or it may not be an S7 controller"
             )
         return ConnectorError(text)
     if isinstance(error, socket.gaierror):

@@ -1,8 +1,9 @@
 """The S7 connector for tag tables: registers at addresses in several blocks and areas.
 
-Ranges that the controller refuses are halved within the same read, until the refused registers are
-known. These are bad by themselves, are tried again now and then, and join the others when the
-controller has them again. All this is remembered when the connection is lost.
+If the controller refuses a range, the range is halved within the same read until the refused
+registers are known. Only these registers turn bad. They are read again from time to time, and as
+usual again once the controller does not refuse them. This knowledge survives a loss of the
+connection.
 """
 
 from __future__ import annotations
@@ -52,9 +53,9 @@ from shmio.model.statuses import (
 )
 
 RETRY_NS: Final = 10_000_000_000
-"""How long a register that the controller refuses is left alone."""
+"""Time in ns after which a refused register is read again."""
 MAX_RETRIED: Final = 20
-"""Most refused registers that one read tries again."""
+"""Largest number of refused registers that one read tries again."""
 _STATUS: Final = {
     ACCESS_DENIED: BAD_USER_ACCESS_DENIED,
     OUT_OF_RANGE: BAD_OUT_OF_RANGE,
@@ -67,17 +68,17 @@ _AREA_NAMES: Final = {
     Area.COUNTER: "counters", Area.TIMER: "timers",
 }  # fmt: skip
 MAX_PLACES: Final = 200
-"""Most characters about which blocks and areas are read."""
+"""Largest number of characters of a text that lists blocks and areas."""
 _MOST_LOGGED: Final = 20  # refused registers that the log names one by one
 
 log = logging.getLogger("shmio.source")
 
 
 class Planner:
-    """Knows which ranges to read, and which registers the controller refuses."""
+    """Decides which ranges each cycle reads, and remembers the registers that are refused."""
 
     def __init__(self, tags: Mapping[int, Tag]) -> None:
-        """Plan for these tags, by index in the layout."""
+        """Create a planner for these tags, by index in the layout."""
         self._tags = tags
         self.pdu_size = 0
         self._ranges: dict[Range, None] = {}  # a set in order
@@ -85,19 +86,25 @@ class Planner:
         self._jobs: dict[tuple[int, ...], list[Job]] = {}  # by the rates that are due
         self._cycle = 0
         self.refused: dict[Field, tuple[int, int]] = {}
-        """By refused field: the status, and when to try it again, ns of CLOCK_MONOTONIC."""
+        """For each refused field, its status and when to try it again, ns of CLOCK_MONOTONIC."""
         self.news: dict[int, int] = {}
-        """Statuses of refused registers, by index in the layout, that the image does not have yet."""
+        """Statuses of refused registers that the image does not show yet, by index in the layout."""
 
     def use(self, pdu_size: int) -> None:
-        """Plan for the PDU size of a new session, whose first read is of all registers; what is known is kept."""
+        """Plan for the PDU size of a new session; its first read is of all registers.
+
+        What is known about refused registers is kept.
+        """
         self._cycle = 0
         if pdu_size != self.pdu_size:
             self.pdu_size = pdu_size
             self._merge()
 
     def jobs(self, now_ns: int) -> list[Job]:
-        """Return the jobs of a read, with some refused registers if it is time to try these again."""
+        """Return the jobs of the next read.
+
+        It includes refused registers that are due for an attempt.
+        """
         jobs = self._due(self._cycle)
         self._cycle += 1
         if not self.refused:
@@ -111,11 +118,11 @@ class Planner:
 
     @property
     def count(self) -> int:
-        """Most jobs of a cycle, without those that try refused registers again."""
+        """Largest number of jobs of a cycle, without attempts to read refused registers."""
         return len(self._due(0))
 
     def _due(self, cycle: int) -> list[Job]:
-        """Return the jobs of a cycle; in cycle 0 all registers are read."""
+        """Return the jobs of a cycle. Cycle 0 reads all registers."""
         rates = tuple(rate for rate in self._rates if cycle % rate == 0)
         jobs = self._jobs.get(rates)
         if jobs is None:
@@ -123,25 +130,25 @@ class Planner:
         return jobs
 
     def split(self, whole: Range, parts: Sequence[Range]) -> None:
-        """Read the parts of a range from now on, if the range is still in use."""
+        """From now on, read the parts of a range instead of the range, if it is still in use."""
         if whole in self._ranges:
             del self._ranges[whole]
             self._ranges |= dict.fromkeys(parts)
             self._jobs = {}
 
     def replan(self) -> None:
-        """Divide the ranges among jobs again, because it has changed which need their own."""
+        """Divide the ranges among jobs again, because some need their own job now."""
         self._jobs = {}
 
     def together(self, ranges: Iterable[Range]) -> None:
-        """Let ranges share jobs again, because it is known now what was wrong."""
+        """Let ranges share jobs again, because the cause of refusals is known now."""
         for whole in ranges:
             if whole.alone:
                 whole.alone = False
                 self._jobs = {}
 
     def refuse(self, part: Range, status: int, why: str) -> None:
-        """Leave the only field of a range alone for a while."""
+        """Note that the only field of a range is refused; read it again only after ``RETRY_NS``."""
         field = part.fields[0]
         if field not in self.refused:
             self._note(field, why)
@@ -150,14 +157,14 @@ class Planner:
         self.split(part, ())
 
     def explain(self, part: Range, code: int) -> str:
-        """Return a message for an item's return code after a read of a range."""
+        """Return a message for the return code of an item that reads a range."""
         tag = self._tags[part.fields[0].register]
         if len(part.fields) > 1:
             return explain_item(code)
         return explain_place(code, tag.address.text, tag.address.db, part.stop - 1)
 
     def accept(self, part: Range) -> None:
-        """Read a range's fields with the others again, if they were refused."""
+        """Read a range's fields with the others again, if the controller had refused them."""
         if self.refused and any(field in self.refused for field in part.fields):
             for field in part.fields:
                 if self.refused.pop(field, None):
@@ -166,7 +173,7 @@ class Planner:
             self._merge()
 
     def forget(self) -> None:
-        """Store the values of all ranges again, though they may not have changed."""
+        """Make the next read store the values of all ranges, even if they have not changed."""
         for one in self._ranges:
             one.last = b""
 
@@ -187,7 +194,7 @@ class Planner:
 
 
 class TableRead:
-    """One read of all registers: its jobs, and the bytes of their answers."""
+    """One read of all registers: its jobs, and the bytes in their answers."""
 
     def __init__(
         self, planner: Planner, again: Callable[[TableRead], None], store: Callable[[TableRead], bytes]
@@ -195,9 +202,9 @@ class TableRead:
         """Create a read.
 
         Args:
-            planner: What to read.
+            planner: Returns the jobs of the read.
             again: Called to queue the read again, after jobs were added to it.
-            store: Puts the results into the image, and returns it.
+            store: Puts the results into the image, and returns the image.
 
         """
         self._planner, self._again, self._store = planner, again, store
@@ -207,7 +214,7 @@ class TableRead:
         """Start a read that must be complete by ``deadline_ns``."""
         self.deadline_ns = deadline_ns
         self.begun_ns = time.time_ns()
-        """UTC time of the start, ns since 1970."""
+        """UTC time of the start, in ns since 1970."""
         self.refusal: RefusedError | None = None
         self.sent = self._answered = self._denied = 0
         self._jobs: list[Job] = list(self._planner.jobs(time.monotonic_ns())) if deadline_ns else []
@@ -217,7 +224,7 @@ class TableRead:
         self._gone: set[Range] = set()  # ranges that were refused
         self._parts: list[Range] = []  # halves of these, which the next jobs read
         self.data_of: dict[Range, bytearray] = {}
-        """The bytes of each range; of a refused one they mean nothing."""
+        """The bytes of each range that was received."""
         self._found = False  # whether it is known what was refused
 
     @property
@@ -227,7 +234,7 @@ class TableRead:
 
     @property
     def complete(self) -> bool:
-        """True if all registers were received or refused."""
+        """True if the controller has answered all jobs so far."""
         return self._answered == len(self._jobs)
 
     @property
@@ -236,7 +243,7 @@ class TableRead:
         return self._store(self)
 
     def take(self, count: int, first: int) -> bytes:
-        """Return the next requests, with references from ``first`` on (16 bits, wrapping)."""
+        """Return the next ``count`` requests; references begin at ``first`` (16 bits, wrapping)."""
         begin, self.sent = self.sent, self.sent + count
         return b"".join(
             pdu.read_request((first + place) & 0xFFFF, [piece.address for piece in job])
@@ -244,7 +251,9 @@ class TableRead:
         )
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Process the answer to a job; after the last one, ask for the halves of what was refused.
+        """Process the answer to a job.
+
+        After the last answer, add jobs for the halves of refused ranges.
 
         Raises:
             ConnectorError: The answer does not match the request.
@@ -277,9 +286,12 @@ class TableRead:
         buffer[at : at + piece.size] = data
 
     def _refuse(self, whole: Range, status: int, why: str) -> None:
-        """Halve a range that was refused, or note its only register.
+        """Halve a range that the controller refused.
 
-        The planner knows at once, so that each session gets further, however slow the controller is.
+        If it has only one register, note that this is refused.
+
+        The planner keeps the result at once. If a session ends before the search, the next one
+        continues it.
         """
         if whole in self._gone:
             return
@@ -294,7 +306,7 @@ class TableRead:
             self._found = True
 
     def _refuse_all(self, job: Job, refusal: RefusedError) -> None:
-        """Note a job that was refused as a whole, maybe because of one of its items."""
+        """Note that the controller refused a whole job. One of the job's items may be the cause."""
         self._denied += 1
         self._denial = refusal
         ranges = dict.fromkeys(piece.range for piece in job)
@@ -306,7 +318,10 @@ class TableRead:
                 self._codes[whole] = BAD_COMMUNICATION_ERROR, str(refusal)
 
     def _settle(self) -> None:
-        """Halve ranges that were refused, and note what is known now."""
+        """Halve refused ranges and queue jobs for the halves.
+
+        If there are none, update the planner.
+        """
         refused, self._codes = self._codes, {}
         planner = self._planner
         if self._denied == len(self._jobs) and self._jobs and not self._again_alone:
@@ -333,7 +348,10 @@ class TableWrite(BlockWrite):
     """One wave of writes to registers of a tag table."""
 
     def __init__(self, pdu_size: int, items: Sequence[WriteItem], outcomes: list[str], names: dict[int, str]) -> None:
-        """Create a wave; ``names`` says by index of a write which registers it sets."""
+        """Create a wave.
+
+        ``names`` has the name of the written register by the index of the write.
+        """
         super().__init__(0, pdu_size, items, outcomes)
         self._names = names
 
@@ -376,7 +394,7 @@ class S7TableConnector(S7Session, Connector):
             self._tags[index] = Tag(index, register, address, layout.byte_order, rate)
         if not self._tags:
             raise ConfigError(
-                "layout: only values of the CPU, which are asked for beside others: add a register such as %MB0"
+                "layout: the tag table has only values of the CPU: add a register with an address such as %MB0"
             )
         self._of_cpu = of_cpu
         self._cpu = cpu.CpuValues(of_cpu, self._mode)
@@ -388,7 +406,7 @@ class S7TableConnector(S7Session, Connector):
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
 
     def describe(self) -> str:
-        """Return the peer, the parameters of the session and the requests of a cycle as a text for logs."""
+        """Return the peer, the session's parameters and the number of requests in a cycle, for the log."""
         requests = self._planner.count
         return (
             f"to {self.options.peer} {len(self._layout.registers)} registers pdu={self.pdu_size} jobs={self.jobs} "
@@ -396,7 +414,7 @@ class S7TableConnector(S7Session, Connector):
         )
 
     def load(self) -> Load:
-        """Return the requests of a cycle that reads all registers, by the PDU size that the controller may grant."""
+        """Return the requests of a cycle that reads all registers, for each possible PDU size."""
 
         def count(pdu_size: int) -> int:
             planner = Planner(self._tags)
@@ -412,7 +430,7 @@ class S7TableConnector(S7Session, Connector):
         reads = f"{counted(len(fields), 'register')} in {shorten(', '.join(places), MAX_PLACES)}"
         reads += f", {slow} of them not in each cycle" if slow else ""
         beside = (
-            f"; values of the CPU ({counted(len(self._of_cpu), 'register')}) are asked for beside"
+            f"; values of the CPU ({counted(len(self._of_cpu), 'register')}) are requested in addition"
             if self._of_cpu
             else ""
         )
@@ -421,7 +439,7 @@ class S7TableConnector(S7Session, Connector):
     # -- reading -------------------------------------------------------------------------------------------------------
 
     def _used(self, pdu_size: int) -> int:
-        """Return the PDU size that requests use, of the size that the controller granted."""
+        """Return the PDU size that requests use if the controller has granted ``pdu_size``."""
         limit = self.options.packetSize or pdu_size
         return min(pdu_size, max(pdu.MIN_PDU_SIZE, limit + pdu.READ_OVERHEAD))
 
@@ -438,7 +456,7 @@ class S7TableConnector(S7Session, Connector):
         self._window.add(read, urgent=True)
 
     def _store(self, read: TableRead) -> bytes:
-        """Put the results of a read into the image, and return a copy of it."""
+        """Put the results of a read into the image, and return a copy of the image."""
         image = self._image
         assert image is not None  # noqa: S101 - _reads() checked it
         self._cpu.store(image)
@@ -502,10 +520,11 @@ class S7TableConnector(S7Session, Connector):
             yield WriteItem(place, start + at + len(part) - 1, byte_item(db, start + at, part, area))
 
     def _steps(self, write: Write) -> Iterator[tuple[Tag, int, int | None, bytes]]:
-        """Yield (tag, first byte, bit, data) of each change that a write makes in the controller.
+        """Yield each change that a write makes in the controller, as (tag, first byte, bit, data).
 
         Raises:
-            ValueError: The controller cannot take the value, or the write names nothing that can be written.
+            ValueError: The controller cannot take the value, or the write sets no register that can
+                be written.
 
         """
         offset, mask, data = write
@@ -534,10 +553,10 @@ class S7TableConnector(S7Session, Connector):
                 for one in self._of_cpu
             ):
                 raise ValueError("values of the CPU can only be read")
-            raise ValueError("no register of the tag table is there")
+            raise ValueError("the tag table has no register at the written bytes")
 
     def _elements(self, tag: Tag, write: Write) -> Iterator[tuple[Tag, int, int | None, bytes]]:
-        """Yield the changes of a write of bytes to one register."""
+        """Yield the changes that a write of bytes makes to one register, as :meth:`_steps` does."""
         register = tag.register
         image, covered = bytearray(self._layout.size), bytearray(self._layout.size)
         apply(write, image)
@@ -559,7 +578,7 @@ class S7TableConnector(S7Session, Connector):
 
 
 def _described(tags: Iterable[Tag]) -> Iterator[Described]:
-    """Yield the data blocks that tags need."""
+    """Yield a description of each data block that contains registers of these tags."""
     fields: dict[int, list[tuple[int, int, str]]] = {}
     for tag in tags:
         if tag.address.area is Area.BLOCK:
@@ -573,7 +592,12 @@ def _described(tags: Iterable[Tag]) -> Iterator[Described]:
 
 
 def _rates(every: dict[str, int], layout: Layout) -> list[tuple[Glob, int]]:
-    """Return the patterns of the key ``every``; ConfigError if one is wrong or matches nothing."""
+    """Return the patterns of the key ``every`` with their numbers of cycles.
+
+    Raises:
+        ConfigError: A pattern is malformed, or matches no register.
+
+    """
     rates = []
     for pattern, rate in every.items():
         try:
@@ -587,15 +611,15 @@ def _rates(every: dict[str, int], layout: Layout) -> list[tuple[Glob, int]]:
 
 
 def _linear(tag: Tag, start: int, bit: int | None) -> int:
-    """Return a number of a bit of the controller that orders all areas and blocks."""
+    """Return a number for a bit in the controller; it increases over all areas and blocks."""
     return ((tag.address.area << 16 | tag.address.db) << 24) + 8 * start + (bit or 0)
 
 
 def _covered(register: Register, there: bytes | bytearray) -> Iterator[tuple[int, int]]:
-    """Yield (first, count) of each run of elements that a write covers.
+    """Yield (first, count) for each run of elements that a write covers.
 
     Raises:
-        ValueError: It covers only a part of an element.
+        ValueError: The write covers only a part of an element.
 
     """
     size, stride = register.element.size, register.element.stride

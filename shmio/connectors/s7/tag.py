@@ -1,4 +1,4 @@
-"""A register of a tag table, with its place among the fields that are read."""
+"""A register of a tag table, with its field: the bytes that are read for it."""
 
 from __future__ import annotations
 

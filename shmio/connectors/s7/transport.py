@@ -1,8 +1,8 @@
 """The TCP connection to a controller, and the window of requests in flight on it.
 
-Every wait has a deadline. Reads of the block, writes and the mode query share the connection and
-the number of jobs that the controller granted. Every request has a unique reference, and each
-answer is passed once, to the operation whose request has its reference.
+Every wait has a deadline. Reads, writes and questions share the connection and the number of jobs
+that the controller granted. Every request has a unique reference. Each answer is passed once: to
+the operation whose request has the answer's reference.
 """
 
 from __future__ import annotations
@@ -21,24 +21,29 @@ from shmio.errors import ConnectorError
 class Transport:
     """One TCP connection.
 
-    Deadlines are in ns of CLOCK_MONOTONIC, and are met to about 0.1 ms.
+    Deadlines are in ns of CLOCK_MONOTONIC. They are met with an accuracy of about 0.1 ms.
     """
 
     def __init__(self, host: str, port: int, timeout_ns: int) -> None:
-        """Connect within ``timeout_ns`` plus the host name lookup; raise OSError on failure."""
+        """Connect within ``timeout_ns``, not counting the time to look up the host name.
+
+        Raises:
+            OSError: No connection could be opened.
+
+        """
         places = tcp.look_up(host, port)
         self.deadline_ns = time.monotonic_ns() + timeout_ns
-        """Time at which ``timeout_ns`` has passed, in ns of CLOCK_MONOTONIC."""
+        """The end of ``timeout_ns``, in ns of CLOCK_MONOTONIC."""
         self._socket = tcp.connect(places, timeout_ns / 1e9)
         self._socket.setblocking(False)
         self.taken = 0
-        """Number of bytes that the kernel accepted in the last ``send``, even if it failed."""
+        """Number of bytes that the kernel accepted in the last ``send``, even if that failed."""
         self.reserve(1, 512)  # longer than any connection confirm
 
     def reserve(self, frames: int, longest: int) -> None:
         """Allocate a buffer for ``frames`` frames of at most ``longest`` bytes.
 
-        Take all received frames before you call it.
+        Take all received frames out of the buffer before you call this.
         """
         self._longest = longest
         self._inbox = memoryview(bytearray(frames * longest))
@@ -50,9 +55,13 @@ class Transport:
         return self._end - self._start
 
     def send(self, data: bytes | memoryview, deadline_ns: int) -> None:
-        """Send all of ``data``; raise TimeoutError if the peer does not accept it in time.
+        """Send all of ``data``.
 
-        The kernel buffers answers that come meanwhile; its buffer suffices for so few requests.
+        The kernel's buffer is large enough for answers that arrive meanwhile.
+
+        Raises:
+            TimeoutError: The peer has not accepted the data by ``deadline_ns``.
+
         """
         self.taken = 0
         with suppress(BlockingIOError):
@@ -64,9 +73,9 @@ class Transport:
             self.taken += self._socket.send(data[self.taken :])
 
     def receive(self, until_ns: int) -> bool:
-        """Wait for data until ``until_ns``, and receive it. Return False if nothing came.
+        """Wait for data until ``until_ns``, and receive them. Return False if nothing came.
 
-        Take all whole frames before the next call, so that there is room in the buffer.
+        Take all complete frames before the next call, so that there is room in the buffer.
 
         Raises:
             EOFError: The peer closed the connection.
@@ -86,7 +95,10 @@ class Transport:
         return True
 
     def frame(self) -> memoryview | None:
-        """Return the next whole frame, valid until the next ``receive``; None if there is none."""
+        """Return the next complete frame, valid until the next ``receive``.
+
+        None if there is none.
+        """
         if self._end - self._start < 4:
             return None
         length = pdu.frame_length(self._inbox, self._start, self._longest)
@@ -97,7 +109,12 @@ class Transport:
         return frame
 
     def next_frame(self, deadline_ns: int) -> memoryview:
-        """Wait for a whole frame and return it; raise TimeoutError if it does not come in time."""
+        """Wait for a complete frame and return it.
+
+        Raises:
+            TimeoutError: The frame has not arrived by ``deadline_ns``.
+
+        """
         while (frame := self.frame()) is None:
             if not self.receive(deadline_ns):
                 raise TimeoutError
@@ -124,20 +141,25 @@ class Operation(Protocol):
 
     @property
     def complete(self) -> bool:
-        """True if no more answers are expected."""
+        """True if the operation expects no more answers."""
 
     def take(self, count: int, first: int) -> bytes | memoryview:
-        """Return the next ``count`` requests as frames, with references from ``first`` on.
+        """Return the next ``count`` requests as frames; references begin at ``first``.
 
         References have 16 bits and wrap.
         """
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Process the answer to request ``index``; raise ConnectorError if it does not match."""
+        """Process the answer to request ``index``.
+
+        Raises:
+            ConnectorError: The answer does not match the request.
+
+        """
 
 
 class Window:
-    """Limits the requests in flight to ``jobs``, and matches answers to them. No I/O.
+    """Limits the number of requests in flight to ``jobs``, and matches answers to requests. No I/O.
 
     References start at ``reference`` and wrap after 65535.
     """
@@ -160,14 +182,17 @@ class Window:
         return bool(self._queue)
 
     def add(self, operation: Operation, *, urgent: bool = False) -> None:
-        """Queue the requests of an operation; if ``urgent``, in front of all others."""
+        """Queue the requests of an operation; if ``urgent``, before all others."""
         if urgent:
             self._queue.appendleft(operation)
         else:
             self._queue.append(operation)
 
     def due(self) -> bytes | memoryview:
-        """Return the requests to send now, in one piece; empty if there are none."""
+        """Return the requests that may be sent now, as one sequence of bytes.
+
+        Empty if there are none.
+        """
         parts: list[bytes | memoryview] = []
         self._given.clear()
         while self._queue and (free := self.jobs - len(self._under_way)) > 0:
@@ -183,12 +208,12 @@ class Window:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def take_back(self) -> None:
-        """Mark the requests that ``due`` returned last as unsent, after the connection was lost."""
+        """After the connection was lost, mark the requests that ``due`` returned last as not sent."""
         for operation, begin in self._given:
             operation.sent = begin
 
     def accept(self, frame: memoryview) -> None:
-        """Pass an answer to the operation that sent the request.
+        """Pass an answer to the operation that sent its request.
 
         Raises:
             ConnectorError: No request in flight has the answer's reference.
@@ -198,5 +223,5 @@ class Window:
         owner = self._under_way.pop(reference, None)
         if owner is None:
             pdu.check_answer(frame)  # raises a more precise error if it is not an answer
-            raise ConnectorError(f"answer to a request that is not in flight (reference {reference})")
+            raise ConnectorError(f"the controller answered a request that is not in flight (reference {reference})")
         owner[0].accept(owner[1], frame)

@@ -1,9 +1,11 @@
-"""Encodes and parses userdata: system status lists (SZL), the clock, information about blocks. No I/O.
+"""Encodes and parses userdata: system status lists (SZL), the clock, information about blocks.
 
-Userdata (ROSCTR 7) are requests for what a CPU knows of itself. Names follow Wireshark's S7
-dissector. An answer that does not fit a PDU comes in parts, and each part after the first one is
-requested by itself. SZLs are described in Siemens, System Software for S7-300/400, A5E00739858,
-chapter 33.
+No I/O.
+
+Userdata (ROSCTR 7) are requests for what a CPU knows about itself. Names follow Wireshark's S7
+dissector. An answer that does not fit into a PDU comes in parts, and each part after the first must
+be requested. SZLs are described in Siemens, System Software for S7-300/400, A5E00739858, chapter
+33.
 
 Every parser in this module raises only ConnectorError, for any input.
 """
@@ -29,7 +31,7 @@ class Service(NamedTuple):
 
 READ_SZL: Final = Service(4, 1, "read SZL")
 READ_CLOCK: Final = Service(7, 1, "read clock")
-BLOCK_INFO: Final = Service(3, 3, "tell of a block")
+BLOCK_INFO: Final = Service(3, 3, "read block information")
 
 _PARAMETERS = struct.Struct(">3s 5B BBH")  # head; length, kind, group, function, sequence; unit, last unit, error
 _PARAMETERS_HEAD = b"\x00\x01\x12"
@@ -38,18 +40,21 @@ _ITEM = struct.Struct(">BBH")  # return code, transport size, length in bytes
 _OCTETS = 0x09
 _SZL_HEAD = struct.Struct(">HHHH")  # SZL and index; size and number of records
 _BLOCK = struct.Struct(">12xHI 4x IHIH 2x2x2x H 24x2xH")
-"""Of the information about a block: number, bytes in load memory; ms and day of the last changes of
-its code and of its interface; bytes in work memory; checksum."""
+"""Information about a block.
+
+Fields: number; bytes in load memory; ms and day of the last change of the code, and of the
+interface; bytes in work memory; checksum.
+"""
 _DATA_BLOCK_CODE = b"0A"
 _ACTIVE = b"A"  # the block in the work memory
 
 
 class Part(NamedTuple):
-    """An answer, or a part of one."""
+    """An answer, or a part of an answer."""
 
     data: bytes
     sequence: int
-    """With which the next part is requested."""
+    """The number that a request for the next part must contain."""
     more: bool
     """Whether another part follows."""
 
@@ -78,7 +83,7 @@ def parse_answer(frame: memoryview, service: Service) -> Part:
 
     """
     kind, parameters_size, data_size = pdu.check_envelope(frame)
-    what = f"not an answer to '{service.name}'"
+    what = f"the controller's reply is not an answer to '{service.name}'"
     if kind != pdu.USERDATA:
         try:
             pdu.check_answer(frame)
@@ -99,12 +104,12 @@ def parse_answer(frame: memoryview, service: Service) -> Part:
     if (group, function) != (0x80 | service.group, service.function):
         raise ConnectorError(what)
     if length != data_size - _ITEM.size:
-        raise ConnectorError(f"{what}: {data_size - _ITEM.size} bytes of data, its header says {length}")
+        raise ConnectorError(f"{what}: {data_size - _ITEM.size} bytes of data, but its header says {length}")
     return Part(bytes(frame[begin + _ITEM.size :]), sequence, bool(last))
 
 
 def _refused(service: Service, number: str, code: int = 0) -> RefusedError:
-    return RefusedError(f"the CPU refuses to '{service.name}' ({number})", code)
+    return RefusedError(f"the CPU refuses the request '{service.name}' ({number})", code)
 
 
 def szl_data(szl: int) -> bytes:
@@ -113,17 +118,19 @@ def szl_data(szl: int) -> bytes:
 
 
 def szl_records(data: bytes, szl: int) -> list[bytes]:
-    """Return the records in the data of an answer; those that are cut off are left out.
+    """Return the complete records in the data of an answer.
 
     Raises:
-        ConnectorError: It is another list, or the head is missing.
+        ConnectorError: The answer is for another list, or its head is missing.
 
     """
     if len(data) < _SZL_HEAD.size:
-        raise ConnectorError(f"answer to '{READ_SZL.name}' without its head")
+        raise ConnectorError(f"the controller's answer to '{READ_SZL.name}' lacks its head")
     found, _, size, count = _SZL_HEAD.unpack_from(data)
     if found != szl:
-        raise ConnectorError(f"not an answer to '{READ_SZL.name}' 0x{szl:04X}, but to 0x{found:04X}")
+        raise ConnectorError(
+            f"the controller's reply is not an answer to '{READ_SZL.name}' 0x{szl:04X}, but to 0x{found:04X}"
+        )
     if not size:
         return []
     starts = range(_SZL_HEAD.size, len(data) - size + 1, size)
@@ -131,7 +138,10 @@ def szl_records(data: bytes, szl: int) -> list[bytes]:
 
 
 def parse_clock(data: bytes) -> datetime | None:
-    """Return the time of a CPU's clock, without a time zone; None if it is no valid time."""
+    """Return the time of a CPU's clock, without a time zone.
+
+    None if the data are not a valid time.
+    """
     digits = (
         data[2:9].hex() + data[9:10].hex()[:1]
     )  # after a reserved byte and the century, which CPUs fill in differently
@@ -148,12 +158,12 @@ def parse_clock(data: bytes) -> datetime | None:
 
 
 class BlockInfo(NamedTuple):
-    """What a CPU knows of a data block. Any loading of a changed block changes it."""
+    """What a CPU knows about a data block. It differs whenever a changed block was loaded."""
 
     load_size: int
-    """Bytes in load memory."""
+    """The block's size in load memory, in bytes."""
     code_changed: tuple[int, int]
-    """Day since 1984-01-01, and ms of that day, of the last change of its code."""
+    """When the block was changed last: days since 1984-01-01, and ms within the day."""
     interface_changed: tuple[int, int]
     size: int
     """Length of the data in bytes."""
@@ -166,15 +176,17 @@ def block_data(db_number: int) -> bytes:
 
 
 def parse_block(data: bytes, db_number: int) -> BlockInfo:
-    """Return the information about a data block.
+    """Return the information about a data block in an answer.
 
     Raises:
-        ConnectorError: The information is of another block, or too short.
+        ConnectorError: The information is about another block, or is too short.
 
     """
     if len(data) < _BLOCK.size:
-        raise ConnectorError(f"answer to '{BLOCK_INFO.name}' of {len(data)} bytes is too short")
+        raise ConnectorError(f"the controller's answer to '{BLOCK_INFO.name}' of {len(data)} bytes is too short")
     number, load_size, code_ms, code_day, interface_ms, interface_day, size, checksum = _BLOCK.unpack_from(data)
     if number != db_number:
-        raise ConnectorError(f"not an answer to '{BLOCK_INFO.name}' of DB{db_number}, but of DB{number}")
+        raise ConnectorError(
+            f"the controller's reply is not an answer to '{BLOCK_INFO.name}' of DB{db_number}, but of DB{number}"
+        )
     return BlockInfo(load_size, (code_day, code_ms), (interface_day, interface_ms), size, checksum)

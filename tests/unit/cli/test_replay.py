@@ -76,7 +76,10 @@ def test_impossible_requests_are_refused_in_one_line(
     assert capsys.readouterr().err == "source 'none' plays no recording; these do: cell\n"
     assert replay(instance, "seek", "0.2") == 0
     assert replay(instance, "until", "0.1") == 1
-    assert capsys.readouterr().err == "cell: that time has passed: the replay is at 0.200 s; seek to an earlier time\n"
+    assert (
+        capsys.readouterr().err
+        == "cell: the requested time has passed: the replay is at 0.200 s; seek to an earlier time\n"
+    )
     assert replay(instance, "to-event", "accepted") == 1
     assert capsys.readouterr().err == "there is no event accepted between here and the end of the played part\n"
 

@@ -118,7 +118,7 @@ def test_a_table_says_which_blocks_and_areas_it_reads() -> None:
         "t", {"a": {"type": "INT", "address": "%MW2"}, "state": {"type": "STRING[12]", "address": "cpu.state"}}
     )
     assert load("s7", layout.with_statuses(), host="plc").note.endswith(
-        "values of the CPU (1 register) are asked for beside"
+        "values of the CPU (1 register) are requested in addition"
     )
 
 

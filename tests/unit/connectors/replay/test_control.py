@@ -192,7 +192,7 @@ def test_play_until_a_past_time_is_refused(paused_replay: tuple[Playing, Attachm
     attachment.replay.seek(0.2)
     playing.next()
     with pytest.raises(
-        CommandError, match=r"^cell: that time has passed: the replay is at 0\.200 s; seek to an earlier time$"
+        CommandError, match=r"^cell: the requested time has passed: the replay is at 0\.200 s; seek to an earlier time$"
     ):
         attachment.replay.play_until(0.1)
     [status] = attachment.replay.status()

@@ -226,5 +226,5 @@ def test_a_recording_of_more_sources_than_an_instance_may_have_is_refused(tmp_pa
         work.frame(1, image(1), f"s{number}")
     work.writer.finish()
     assert work.output.close(30)
-    with pytest.raises(RecordingError, match=r"has 257 sources, an instance at most 256: shmio-dump cut"):
+    with pytest.raises(RecordingError, match=r"has 257 sources, but an instance has at most 256: copy some"):
         Recording([file])

@@ -38,7 +38,7 @@ def test_part_begins_with_the_frame_before_its_start(tmp_path: Path, instance: s
 @pytest.mark.parametrize(
     ("start", "end", "error"),
     [
-        (5.0, None, "start, end: there is nothing to play between them; .* has 0.400 s from "),
+        (5.0, None, "start, end: there is nothing to play between these times; .* has 0.400 s from "),
         (0.2, 0.1, "there is nothing to play"),
         ("yesterday", None, "start: 'yesterday' is neither a time such as"),
         (None, float("nan"), "end: nan is neither"),
@@ -58,7 +58,7 @@ def test_invalid_part_is_refused(
 
 def test_missing_source_is_refused(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
-    with pytest.raises(ConfigError, match=r"source: .* has no frames of a source 'arm'; it has: cell"):
+    with pytest.raises(ConfigError, match=r"source: .* has no frames of a source 'arm'; its sources are: cell"):
         Replay(Replay.Options(file=str(file)), "arm")
     named = Replay(Replay.Options(file=str(file), source="cell"), "arm")
     assert named.layout.name == "DB1"

@@ -63,7 +63,7 @@ def test_answer_with_less_or_more_data_is_refused() -> None:
     for count in (3, 5):
         other = bytearray(requests[0])
         struct.pack_into(">H", other, 23, count)
-        with pytest.raises(ConnectorError, match=rf"{count} bytes of data, 4 were asked for"):
+        with pytest.raises(ConnectorError, match=rf"{count} bytes of data, but 4 were requested"):
             reading.accept(0, answer(bytes(other), bytes(range(10))))
 
 

@@ -223,7 +223,7 @@ def changed(**at: int) -> memoryview:
         (changed(_16=2), "names 2 of parameters and 2"),
         (changed(_14=1, _16=4), "not an answer to a write"),
         (changed(_19=4), "not an answer to a write"),
-        (changed(_20=2), "3 return codes, 3 items"),
+        (changed(_20=2), "3 return codes, but 3 items"),
         (memoryview(ANSWER[:18]), "too short"),
         (memoryview(frames.answer(3, b"", b"")), "not an answer to a write"),
         (memoryview(frames.answer(3, b"\x05", b"")), "not an answer to a write"),
@@ -236,7 +236,7 @@ def test_refuses_a_wrong_answer(frame: memoryview, text: str) -> None:
 
 
 def test_wrong_number_of_codes_is_refused() -> None:
-    with pytest.raises(ConnectorError, match="3 return codes, 2 items were written"):
+    with pytest.raises(ConnectorError, match="3 return codes, but 2 items were written"):
         parse_write_answer(memoryview(ANSWER), 2)
 
 

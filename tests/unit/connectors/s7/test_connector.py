@@ -317,7 +317,7 @@ def assert_recovers_open(plc: Plc, client: S7Client) -> None:
 def test_block_shorter_than_the_layout(plc: Plc) -> None:
     client = plc.client(size=SIZE + 1)
     client.connect()
-    wanted = rf"^DB201 has no {SIZE + 1} bytes but {SIZE} bytes \(item code 0x05\): .*export it again"
+    wanted = rf"^DB201 does not have {SIZE + 1} bytes but {SIZE} bytes \(item code 0x05\): .*export it again"
     with pytest.raises(ConnectorError, match=wanted):
         client.read()
     assert not client.connected

@@ -21,10 +21,10 @@ from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
         (Traits(fault=Fault.PUT_GET_OFF), r"\(error 0x8104\): enable 'Permit access with PUT/GET"),
         (Traits(fault=Fault.PROTECTED), r"DB201: access denied \(item code 0x03\): .*'Full access'"),
         (Traits(fault=Fault.OPTIMIZED), r"DB201 has no byte that can be addressed.*clear 'Optimized block access'"),
-        (Traits(block_size=1), r"DB201 has no 2180 bytes but 1 bytes .*export it again"),
-        (Traits(block_size=SIZE - 1), r"DB201 has no 2180 bytes but 2179 bytes"),
-        (Traits(block_size=963, max_pdu_size=240, max_jobs=1), r"DB201 has no 2180 bytes but 963 bytes"),
-        (Traits(block_size=1234, max_pdu_size=240, max_jobs=24), r"DB201 has no 2180 bytes but 1234 bytes"),
+        (Traits(block_size=1), r"DB201 does not have 2180 bytes but 1 bytes .*export it again"),
+        (Traits(block_size=SIZE - 1), r"DB201 does not have 2180 bytes but 2179 bytes"),
+        (Traits(block_size=963, max_pdu_size=240, max_jobs=1), r"DB201 does not have 2180 bytes but 963 bytes"),
+        (Traits(block_size=1234, max_pdu_size=240, max_jobs=24), r"DB201 does not have 2180 bytes but 1234 bytes"),
     ],
 )
 def test_refusal_is_reported_with_a_remedy(make_plc: MakePlc, traits: Traits, text: str) -> None:
@@ -47,7 +47,7 @@ def test_refusal_is_reported_if_the_size_cannot_be_found(make_plc: MakePlc) -> N
         return frame if answers <= 3 else None
 
     plc.proxy.edit(only_the_read)
-    with pytest.raises(ConnectorError, match=r"^DB201 has no 2180 bytes \(item code 0x05\).*export it again"):
+    with pytest.raises(ConnectorError, match=r"^DB201 does not have 2180 bytes \(item code 0x05\).*export it again"):
         client.read()
     assert not client.connected
 

@@ -148,7 +148,7 @@ def test_an_answer_for_fewer_items(plc: Plc) -> None:
         return frame[:3] + bytes((len(frame) - 1,)) + frame[4:16] + b"\1" + frame[17:20] + b"\1" + frame[21:-1]
 
     plc.proxy.edit(shorten, frames=1)
-    with pytest.raises(ConnectorError, match="1 return codes, 2 items were written"):
+    with pytest.raises(ConnectorError, match="1 return codes, but 2 items were written"):
         client.write([Write(0, 0, b"x"), Write(2, 0, b"y")])
     assert_recovers(plc, client)
 
@@ -255,7 +255,7 @@ def test_refused_read_does_not_affect_a_write(make_plc: MakePlc) -> None:
     client = plc.connected()
     client.submit()
     assert client.write([Write(0, 0, b"x")]) == [""]
-    with pytest.raises(ConnectorError, match="DB201 has no 2180 bytes but 1000 bytes"):
+    with pytest.raises(ConnectorError, match="DB201 does not have 2180 bytes but 1000 bytes"):
         client.collect(time.monotonic_ns() + 10**10)
     assert not client.connected
 
@@ -288,7 +288,7 @@ def test_duration_of_a_batch_is_bounded(make_plc: MakePlc, clock: Clock, timeout
     plc = make_plc(Traits(max_jobs=1))
     client = plc.connected(timeout=1000 * timeout_s)
     clock.slow_down(plc, 4)
-    with pytest.raises(ConnectorError, match=f"has not served all writes of a cycle within {most_s} s: write less"):
+    with pytest.raises(ConnectorError, match=f"has not answered all writes of a cycle within {most_s} s: write fewer"):
         client.write([Write(2 * place, 1, b"\1") for place in range(180)])  # nine jobs
     assert_recovers(plc, client)
 

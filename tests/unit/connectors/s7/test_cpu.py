@@ -149,7 +149,7 @@ def test_a_cpu_that_refuses_turns_only_these_registers_bad(caplog: pytest.LogCap
     assert set(statuses.values()) == {BAD_NOT_SUPPORTED}
     assert len(caplog.records) == 4
     assert (
-        "code (cpu.order_code), firmware (cpu.firmware): bad: the CPU refuses to 'read SZL' (error 0x8104)"
+        "code (cpu.order_code), firmware (cpu.firmware): bad: the CPU refuses the request 'read SZL' (error 0x8104)"
         in caplog.text
     )
     assert "state (cpu.state), number (cpu.state), runs (cpu.state): bad: the controller does not" in caplog.text
@@ -208,7 +208,7 @@ def test_a_cpu_that_never_answers_is_not_asked_for_ever(caplog: pytest.LogCaptur
                     reads = 0
     assert failures == 8
     assert codes(layout, raw) == [GOOD] + [BAD_NOT_SUPPORTED] * (len(CPU) - 1)
-    assert "is not asked any more" in caplog.text
+    assert "does not ask again" in caplog.text
 
 
 def test_a_cable_that_is_pulled_while_a_question_is_open_is_no_refusal() -> None:
@@ -255,12 +255,12 @@ def test_values_of_the_cpu_cannot_be_written() -> None:
     [
         (
             {"type": "INT", "address": "cpu.stat"},
-            r"address: 'cpu\.stat' is none; the CPU has cpu.state, .*did you mean cpu.state",
+            r"address: 'cpu\.stat' is not a value of the CPU; its values are cpu.state, .*did you mean cpu.state",
         ),
         ({"type": "REAL", "address": "cpu.state"}, r"type: .*STRING\[9\] or longer, not REAL"),
         ({"type": "STRING[8]", "address": "cpu.state"}, r"type: .*STRING\[9\]"),
         ({"type": "INT", "address": "cpu.clock"}, "type: .*DATE_AND_TIME, DTL, LDT"),
-        ({"type": "DTL", "address": "cpu.order_code"}, r"type: .* is STRING\[20\]"),
+        ({"type": "DTL", "address": "cpu.order_code"}, r"type: .* must be STRING\[20\]"),
         ({"type": "ARRAY[1..2] OF INT", "address": "cpu.state"}, "type: .*single value"),
         ({"type": "INT", "address": "cpu.state", "scale": 2}, "scale: .*single value"),
         ({"type": "BOOL", "address": "cpu.state", "writable": True}, "writable: .*only be read"),
@@ -274,7 +274,7 @@ def test_a_wrong_register_is_a_fault_of_the_configuration(tag: dict[str, object]
 
 def test_a_table_of_nothing_else_is_a_fault_of_the_configuration() -> None:
     layout = table({"x": CPU["state"]})
-    with pytest.raises(ConfigError, match="add a register such as %MB0"):
+    with pytest.raises(ConfigError, match="add a register with an address such as %MB0"):
         S7Connector.for_layout(layout)(S7Options(host="127.0.0.1"), layout)
 
 

@@ -83,7 +83,8 @@ def test_a_block_that_is_too_short_names_itself_both_lengths_and_what_is_missing
     ):
         connector.read()
     assert str(caught.value) == (
-        'DB1 "Press" has 60 bytes, not 100 as its layout (item code 0x05): export it again; beyond its end: Counts, '
+        'DB1 "Press" has 60 bytes, not 100 as in its layout (item code 0x05): export the layout again; beyond the '
+        "end of the block: Counts, "
         "Door, Mode"
     )
     assert len(str(caught.value)) < 256
@@ -93,7 +94,9 @@ def test_a_block_that_becomes_shorter_while_it_is_read() -> None:
     with emulated(bytearray(SIZE)) as server, reading(press(), server.address.port) as connector:
         connector.read()
         server.load_block(1, bytearray(98))
-        with pytest.raises(ConnectorError, match=r'^DB1 "Press" has 98 bytes, not 100 .* beyond its end: Mode$'):
+        with pytest.raises(
+            ConnectorError, match=r'^DB1 "Press" has 98 bytes, not 100 .* beyond the end of the block: Mode$'
+        ):
             connector.read()
 
 
@@ -125,7 +128,7 @@ def test_a_block_that_becomes_longer_is_uncertain(
     assert len(found) == 2
     assert found[0].startswith('DB1 "Press" was changed in the controller since 20')
     assert found[0].endswith(" UTC: it had 100 bytes and has 104, its layout has 100; compare its layout")
-    assert found[1].endswith(" UTC: it had 104 bytes and has 100, as its layout; compare its layout")
+    assert found[1].endswith(" UTC: it had 104 bytes and has 100, as in its layout; compare its layout")
 
 
 @pytest.mark.parametrize("layout", [press(), table({"x": {"type": "INT", "address": "DB1.DBW4"}})])

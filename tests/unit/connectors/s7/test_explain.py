@@ -14,7 +14,7 @@ from shmio.segment._atomics import REASON_SIZE
     ("code", "text"),
     [
         (0x0A, r"^DB201: the block does not exist \(item code 0x0A\).*dbNumber.*optimized"),
-        (0x05, r"^DB201 has no 2180 bytes \(item code 0x05\).*export it again.*Optimized"),
+        (0x05, r"^DB201 does not have 2180 bytes \(item code 0x05\).*export it again.*Optimized"),
         (0x03, r"access denied \(item code 0x03\): enable.*PUT/GET.*Full access"),
         (0x06, "type or length"),
         (0x07, "type or length"),
@@ -32,8 +32,8 @@ def test_refused_writes() -> None:
 
 
 def test_wrong_block_sizes() -> None:
-    assert re.search(r"no 2180 bytes but 100 bytes .*export it again$", explain.explain_size(201, 2180, 100))
-    assert re.search("optimized, clear 'Optimized block access'", explain.explain_size(201, 2180, 0))
+    assert re.search(r"not have 2180 bytes but 100 bytes .*export it again$", explain.explain_size(201, 2180, 100))
+    assert re.search("optimized: clear 'Optimized block access'", explain.explain_size(201, 2180, 0))
 
 
 @pytest.mark.parametrize(

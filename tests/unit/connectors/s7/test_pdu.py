@@ -74,7 +74,7 @@ def test_reads_octets_and_a_padded_odd_length() -> None:
         (changed(GOOD_ANSWER, _20=2), "not an answer to a read"),
         (changed(GOOD_ANSWER, _22=3), "transport size 0x03"),
         (changed(GOOD_ANSWER, _24=0x21), "transport size 0x04"),
-        (changed(GOOD_ANSWER, _24=0x28), "4 bytes of data, its header says 5"),
+        (changed(GOOD_ANSWER, _24=0x28), "4 bytes of data, but its header says 5"),
         (memoryview(GOOD_ANSWER[:18]), "too short"),
     ],
 )
