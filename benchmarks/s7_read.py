@@ -29,7 +29,6 @@ ROUND_TRIPS_MS = (0, 1, 3)  # added to the loopback's own
 def shmio_client(
     stack: ExitStack, address: Address, size: int, *, packet_size: int | None = None, jobs: int | None = None
 ) -> S7Client:
-    """Connect shmio's client."""
     options = S7Options(host=address.host, port=address.port, packetSize=packet_size, maxJobs=jobs)
     client = S7Client(options, NUMBER, size)
     client.connect()

@@ -94,7 +94,7 @@ def whole(frame: Frame) -> bool:
 
 
 def publish(instance: str) -> None:
-    """Publish until killed."""
+    """Publish large frames as fast as possible, until the process is killed."""
     with Segment.open(instance, writable=True) as segment:
         writer = segment.writer("torn")
         print("ready", flush=True)

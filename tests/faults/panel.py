@@ -55,7 +55,7 @@ class Panel:
         return [*self._silent, *late]
 
     def check(self) -> None:
-        """Complain about checkers that have ended."""
+        """Report a violation if a checker has ended."""
         for popen, _ in self._checkers:
             if popen.poll() is not None:
                 self._complain(f"a checker ended with status {popen.returncode}: {popen.args!r}")

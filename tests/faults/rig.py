@@ -117,7 +117,6 @@ class Instance:
                 raise RuntimeError(f"{verb} {' '.join(arguments)} failed: {done.stderr}")
 
     def down(self) -> None:
-        """Stop the instance."""
         done = self.supervisor("down")
         if done.returncode:
             raise RuntimeError(f"down failed: {done.stderr}")
@@ -128,7 +127,6 @@ class Instance:
             self.supervisor("down")
 
     def status(self) -> InstanceStatus:
-        """Return the status of the instance."""
         return read_status(self.instance)
 
     def processes(self) -> dict[str, Process]:
@@ -212,7 +210,6 @@ class Rig(Instance):
 
 
 def compile_c(source: Path, program: Path, *arguments: str) -> None:
-    """Compile a C program."""
     subprocess.run(
         ["cc", "-std=c11", "-O2", "-Wall", "-Wextra", "-Werror", str(source), "-o", str(program), *arguments],
         check=True,

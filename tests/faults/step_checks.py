@@ -131,7 +131,7 @@ class RecordedSteps:
         cycles: Mapping[str, set[int]],
         missed: Mapping[str, int],
     ) -> None:
-        """Check the recording.
+        """Check the recording of a run.
 
         Args:
             done: Numbers of the steps that were reported as done.

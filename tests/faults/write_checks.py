@@ -71,7 +71,6 @@ class PublishCheck(_ValueCheck):
     """Times at which each value was sent, and at which the PLC got it."""
 
     def sent(self, value: int, now_ns: int) -> None:
-        """Record that a value is sent."""
         self._landed[value] = now_ns, None
         self.counts.values += 1
 

@@ -78,7 +78,7 @@ class Mutant:
 
     @property
     def title(self) -> str:
-        """Description for people."""
+        """The fault as people read it: where it is, and what it changes."""
         return f"{self.path}:{self.line}: {self.before}  ->  {self.after}"
 
 

@@ -57,14 +57,13 @@ class Model:
             thread.start()
 
     def publish(self, cycle: int) -> None:
-        """Publish the current image."""
         quality = Quality.BAD if self.failure else Quality.GOOD
         self.output.publish(
             Image(bytes(self.image), cycle, time.time_ns(), quality, Provenance.SIMULATED, self.failure)
         )
 
     def answer(self) -> None:
-        """Answer steps again."""
+        """Answer steps again, after ``mute`` was set."""
         self.mute = False
         self._bell.ring()
 

@@ -57,7 +57,6 @@ def read(file: Path) -> list[Message]:
 
 
 def everything(file: Path) -> list[Message]:
-    """Return all messages."""
     with Reader(file) as reader:
         return list(reader.messages())
 
@@ -78,7 +77,6 @@ def numbers(file: Path, source: str = "cell", kind: type[Frame] | type[Event] = 
 
 
 def gaps(file: Path) -> list[Gap]:
-    """Return the gaps in a file."""
     with Reader(file) as reader:
         return survey(reader).gaps
 

@@ -110,7 +110,6 @@ class Build:
         self.writer.event(self.blocks[source], event, utc_ns)
 
     def gap(self, first: int, last: int, source: str = "cell", what: str = "frames") -> None:
-        """Add a gap."""
         number = list(self.blocks).index(source) + 1
         before_ns = START_NS + (last + 1) * PERIOD_NS
         after_ns = START_NS + (first - 1) * PERIOD_NS
@@ -126,7 +125,6 @@ class Build:
         self.writer.process(ProcessChange("cell", "source", 4711, what, "", 0), START_NS + at * PERIOD_NS)
 
     def chunk(self) -> None:
-        """End the chunk."""
         self.writer.flush()
         self.output.flush()
 

@@ -275,7 +275,7 @@ def test_a_new_process_that_does_not_run_is_reported_and_the_rest_continues(laun
 
 
 def test_the_supervisor_works_while_a_reload_is_planned(launch: Launch) -> None:
-    """Compiling a large layout takes seconds."""
+    """A reload compiles layouts, and a large layout takes seconds."""
     cell = launch()
     cell.wait_state("running")
     os.mkfifo(cell.folder / "slow")

@@ -63,13 +63,11 @@ class Recorded:
         return Stamp(self._segment.header.started_ns + clock_ns, clock_ns, 7_000 * S + clock_ns)
 
     def frame(self, clock_ns: int, raw: bytes, **told: Any) -> None:
-        """Publish a frame."""
         at = self.stamp(clock_ns)
         self.cycle += 1
         self.writer.publish(raw, cycle=self.cycle, source_ns=clock_ns, asked_ns=at.publish_ns - 3000, at=at, **told)
 
     def event(self, clock_ns: int, record: Record, quality: Quality = Quality.GOOD) -> None:
-        """Publish an event."""
         self.writer.cycle = self.cycle
         self.writer.event(record, quality=quality, at=self.stamp(clock_ns))
 

@@ -49,7 +49,6 @@ class Bridge:
         assert self._line() == "ready"
 
     def kill(self) -> None:
-        """Kill the process."""
         self._process.kill()
         self._process.communicate(timeout=20)
 
@@ -58,7 +57,7 @@ class Bridge:
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let the process continue."""
+        """Let the process continue after ``freeze``."""
         self._process.send_signal(signal.SIGCONT)
 
     def _line(self) -> Any:

@@ -46,16 +46,13 @@ class Peer:
         assert self._line() == "ready"
 
     def kill(self) -> None:
-        """Kill the process."""
         self._process.kill()
         self._process.communicate(timeout=20)
 
     def freeze(self) -> None:
-        """Stop the process (SIGSTOP)."""
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let the process continue."""
         self._process.send_signal(signal.SIGCONT)
 
     def _line(self) -> Any:

@@ -52,7 +52,6 @@ class Listener:
         self.client.on_connect = self.client.on_message = None
 
     def message(self) -> MQTTMessage:
-        """Return the next message."""
         message = self._come.get(timeout=TIMEOUT_S)
         self.heard.append((message.topic, bytes(message.payload)))
         return message

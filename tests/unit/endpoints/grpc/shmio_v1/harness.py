@@ -48,7 +48,6 @@ class Stream:
         return found
 
     async def update(self) -> Any:
-        """Return the next update."""
         while not isinstance(found := await self.next(), wire.Update):
             pass
         return found

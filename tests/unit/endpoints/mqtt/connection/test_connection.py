@@ -69,7 +69,7 @@ class Broker:
         self.say("20 03 00 00 00", lambda: self.connection.up)
 
     def hang_up(self) -> None:
-        """Close the connection without a message."""
+        """Close the connection without a DISCONNECT packet."""
         self._socket.close()
         self.turn_until(lambda: not self.connection.up)
 
@@ -85,7 +85,6 @@ class Broker:
                 length -= len(self._socket.recv(length))
 
     def put(self, packet: str) -> None:
-        """Send a packet."""
         self._socket.sendall(bytes.fromhex(packet))
 
     def say(self, packet: str, until: Callable[[], bool]) -> None:

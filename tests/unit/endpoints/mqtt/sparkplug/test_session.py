@@ -70,12 +70,12 @@ class Host:
         return found
 
     def command(self, kind: str, *metrics: wire.Metric, device: str = "") -> None:
-        """Send a command."""
+        """Send an NCMD or DCMD with these metrics."""
         topic = NODE.format(kind) + (f"/{device}" if device else "")
         self.send(topic, wire.Payload(timestamp=1, metrics=metrics).SerializeToString())
 
     def send(self, topic: str, data: bytes, *, retain: bool = False) -> None:
-        """Send any payload."""
+        """Send any payload on any topic."""
         self._listener.client.publish(topic, data, 0, retain).wait_for_publish(30)
 
 
