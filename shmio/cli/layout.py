@@ -17,7 +17,7 @@ from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.logs import printable
 from shmio.version import __version__
 
-_HEADINGS = ("offset", "size", "type", "path", "initial", "comment")
+_HEADINGS = ("offset", "size", "type", "path", "over", "initial", "comment")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -127,7 +127,15 @@ def _row(register: Register) -> tuple[str, ...]:
     place = str(register.offset) if register.bit is None else f"{register.offset}.{register.bit}"
     bounds = ", ".join(f"{low}..{high}" for low, high in register.dims)
     kind = f"ARRAY[{bounds}] OF {register.type}" if register.dims else register.type
-    return place, str(register.size), kind, register.path, _short(register.initial or ""), register.comment
+    return (
+        place,
+        str(register.size),
+        kind,
+        register.path,
+        register.over,
+        _short(register.initial or ""),
+        register.comment,
+    )
 
 
 def _short(text: str) -> str:

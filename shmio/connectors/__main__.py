@@ -84,6 +84,7 @@ def _loop_of(worker: Worker) -> _LoopHandle:
         return _replay_loop(worker, options)
     layout = segment.blocks[worker.name].layout
     if issubclass(found, Connector):
+        layout = layout.base  # names over the block are no registers of the device
         found = found.for_layout(layout)
     source = found(options, layout)
     writer = segment.writer(worker.name)  # after the source: a configuration error must not change the segment

@@ -77,6 +77,8 @@ class FiniteCheck:
                     self._exponents[starts + at] = bits
                     self._starts[starts + at] = starts
         self._guarded = (self._exponents != 0).tobytes()
+        over = (one for one in layout.registers[len(layout.own) :] if one.type in _EXPONENTS and not one.dims)
+        self._names = {one.offset: one.path for one in over}  # views of bytes
 
     def refusal(self, writes: Iterable[Write]) -> str:
         """Return why these writes are refused, naming one register; empty if they are allowed.
@@ -93,7 +95,7 @@ class FiniteCheck:
             starts = self._starts[offset:stop]
             wrong = np.setdiff1d(starts[np.flatnonzero(wanted)], starts[zeros])
             if len(wrong):
-                path = path_at(self._layout, int(wrong[0]))
+                path = self._names.get(int(wrong[0])) or path_at(self._layout, int(wrong[0]))
                 return (
                     f"{path}: NaN and infinities are written only if the source's `allow_nonfinite` names the register"
                 )

@@ -15,6 +15,7 @@ from typing import Literal, TypeVar
 from shmio.errors import Diagnostic
 from shmio.layout import emit, tags
 from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Layout
+from shmio.layout.overlay_table import OverlayTable, lay_tables
 from shmio.layout.place import MAX_TEXT, Cost, Group, Placer
 from shmio.layout.report import Report, TooManyErrors
 from shmio.layout.source import lexer, parser
@@ -78,6 +79,8 @@ def compile_sources(
 ) -> Compiled:
     """Compile the data blocks of files that may use each other's types, or one tag table.
 
+    Tag tables beside the source of a data block lie over it.
+
     Args:
         sources: The files.
         blocks: Names of the data blocks to compile, in any case. Errors in other blocks are
@@ -98,10 +101,11 @@ class Program:
     """Parsed sources, whose data blocks can be compiled together or one at a time."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
-        """Parse the sources; raise LayoutError for an invalid tag table, or one with other files."""
+        """Parse the sources; raise LayoutError for an invalid tag table, or several without a data block."""
         self._files = [source.file for source in sources]
         self._general = Report(self._files)
         self._table: Layout | None = None
+        self._overlays: list[OverlayTable] = []
         self._units: list[Unit] = []
         self._types: dict[str, TypeDeclaration] = {}
         self._constants: dict[str, ConstantDeclaration] = {}
@@ -112,14 +116,17 @@ class Program:
 
     def _read(self, sources: Sequence[Source]) -> None:
         report = self._general
-        for source in sources:
-            if source.file.lower().endswith(tags.SUFFIXES):
-                if len(sources) == 1:
-                    self._table = tags.compile_tags(source.file, source.text, report)
-                    self.blocks = (BlockName(self._table.name, None),)
-                    return
-                report.add(Diagnostic(source.file, 1, 1, "a tag table cannot be combined with other files"))
+        tables = [source for source in sources if source.file.lower().endswith(tags.SUFFIXES)]
+        if tables and len(tables) == len(sources):
+            if len(tables) > 1:
+                what = "a tag table is a layout of its own, or lies over a data block whose source is beside it"
+                report.add(Diagnostic(tables[1].file, 1, 1, f"{what}: give one of them, or add that source"))
                 report.raise_errors()
+            self._table = tags.compile_tags(tables[0].file, tables[0].text, report)
+            self.blocks = (BlockName(self._table.name, None),)
+            return
+        self._overlays = [OverlayTable(table.file, table.text) for table in tables]
+        sources = [source for source in sources if source not in tables]
         for source in sources:
             self._units.append(_read(source, report))
         types, doubles = self._by_name([declaration for unit in self._units for declaration in unit.types])
@@ -199,6 +206,9 @@ class Program:
                 layout = _layout(block, group, self._is_optimized(block), own, report)
                 if layout is not None:
                     layouts.append(layout)
+            if not report.errors:
+                held = [block.name for block in self.blocks]
+                layouts = lay_tables(self._overlays, layouts, held, report, chosen=blocks is not None)
         report.raise_errors()
         unused = tuple(name for name in type_bytes or () if name.lower() not in placer.placed)
         return Compiled(tuple(layouts), tuple(report.warnings), unused)

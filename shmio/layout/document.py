@@ -29,6 +29,7 @@ from shmio.layout.model import (
     shape_of,
     status_bytes,
 )
+from shmio.layout.overlay import overlay_register
 from shmio.layout.topic import check_canonical
 
 MAX_JSON_BYTES = 128 << 20
@@ -70,6 +71,7 @@ def load_layout(data: bytes) -> Layout:
         document.name, document.number, document.size, document.optimized, registers,
         document.byte_order, document.status_offset,
     )  # fmt: skip
+    _check_overlay(layout)
     vars(layout)["hash"] = hashlib.sha256(data).digest()  # making the JSON again would take longer
     return layout
 
@@ -78,9 +80,16 @@ def _check(document: _Layout) -> None:
     """Raise LayoutError if a register is impossible, or two contradict each other."""
     kinds: dict[tuple[str, Dims], tuple[int, int, bool]] = {}
     end_bits = elements = 0
+    over = 0
     for register in document.registers:
         kind = register.type, register.dims
         size, count, has_bit = kinds.get(kind) or kinds.setdefault(kind, _kind(register))
+        if register.over:
+            over += 1
+            elements += register.count
+            continue
+        if over:
+            raise LayoutError(f"layout: {register.path!r} is behind registers that lie over the block")
         if register.size != size or register.count != count or register.partial:
             raise LayoutError(f"layout: {register.path!r} has a size or count that does not fit its type")
         bit = register.bit
@@ -94,7 +103,7 @@ def _check(document: _Layout) -> None:
     size = document.size if document.status_offset is None else document.status_offset
     if end_bits > size * 8 or size > MAX_BLOCK_BYTES or elements > MAX_ELEMENTS:
         raise LayoutError(f"layout: the registers do not fit the block of {size} bytes")
-    if document.status_offset is not None and document.size != size + status_bytes(len(document.registers)):
+    if document.status_offset is not None and document.size != size + status_bytes(len(document.registers) - over):
         raise LayoutError(f"layout: the status area at {size} does not fit the image of {document.size} bytes")
     if document.status_offset is not None and size % 8:
         raise LayoutError(f"layout: the status area at {size} is not aligned to 8 bytes")
@@ -106,6 +115,28 @@ def _check(document: _Layout) -> None:
         check_canonical(paths)
     except PathError as error:
         raise LayoutError(f"layout: {error}") from None
+
+
+def _check_overlay(layout: Layout) -> None:
+    """Raise LayoutError unless each register over the block lies where its path of the block says.
+
+    Rows of bits get the mark that the JSON does not have.
+    """
+    own = len(layout.own)
+    for register in layout.registers[own:]:
+        try:
+            found = overlay_register(layout.base, register.path, register.over, (register.element, register.dims))
+        except ValueError as error:
+            raise LayoutError(f"layout: {register.path!r}: {error}") from None
+        except PathError as error:
+            raise LayoutError(f"layout: {register.path!r} lies over nothing: {error}") from None
+        if _place_of(found) != _place_of(register):
+            raise LayoutError(f"layout: {register.path!r} does not lie over {register.over!r}")
+        msgspec.structs.force_setattr(register, "partial", found.partial)
+
+
+def _place_of(register: Register) -> tuple[object, ...]:
+    return register.offset, register.bit, register.size, register.count
 
 
 def _kind(register: Register) -> tuple[int, int, bool]:

@@ -24,7 +24,7 @@ def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
     """
     frame = bytearray(layout.size)
     unread: list[str] = []
-    for register in layout.registers:
+    for register in layout.own:
         if register.initial is None and _default_is_zeros(register.element):
             continue
         value = _default(register) if register.initial is None else _given(register)

@@ -169,6 +169,8 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
             value = number * factor + offset. None: the value is the number.
         deadband: Change of the value up to which the connector may keep the old value.
         writable: Whether the tag table lets commands write the register.
+        over: Path of the part of the block that this register names, if it is of a tag table over a
+            data block; "" for a register of its own.
 
     """
 
@@ -187,6 +189,7 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
     scale: tuple[float, float] | None = None
     deadband: _Deadband = 0.0
     writable: bool = False
+    over: _Address = ""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -204,9 +207,11 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
 
 @dataclass(frozen=True)
 class Layout:
-    """A block's registers in address order.
+    """A block's registers in address order, and behind them those that lie over them.
 
     Attributes:
+        registers: The registers of the block, none of which overlaps another, and then those of tag
+            tables over it, which do: see :attr:`own`.
         size: Size of an image of the block in bytes, with its status area.
         status_offset: Where the image has its status area, which holds a status code and a source
             time for each register: see :class:`shmio.model.statuses.StatusArea`. None: it has none.
@@ -225,6 +230,19 @@ class Layout:
     def by_path(self) -> Mapping[str, int]:
         """The index into ``registers`` for each path."""
         return {register.path: index for index, register in enumerate(self.registers)}
+
+    @cached_property
+    def own(self) -> tuple[Register, ...]:
+        """The registers without those of tag tables over the block: in address order, without overlaps."""
+        count = len(self.registers)
+        while count and self.registers[count - 1].over:
+            count -= 1
+        return self.registers[:count]  # the same object if there are no others
+
+    @cached_property
+    def base(self) -> Layout:
+        """The layout without the registers of tag tables over the block, as programs before version 0.2 read it."""
+        return self if len(self.own) == len(self.registers) else replace(self, registers=self.own)
 
     @cached_property
     def hash(self) -> bytes:
@@ -290,7 +308,7 @@ class Layout:
         if self.status_offset is not None:
             return self
         start = -(-self.size // 8) * 8
-        return replace(self, status_offset=start, size=start + status_bytes(len(self.registers)))
+        return replace(self, status_offset=start, size=start + status_bytes(len(self.own)))
 
     def describe(self) -> dict[str, object]:
         """Return the layout as the object of ``shmio-layout --json``: JSON types, without ``byte_order``.
@@ -317,8 +335,8 @@ class Layout:
         return msgspec.json.encode(self.describe() | {"byte_order": self.byte_order})
 
 
-_OF_TAGS: Final = ("unit", "address", "scale", "deadband", "writable")
-_DEFAULTS: Final = {"unit": "", "address": "", "scale": None, "deadband": 0.0, "writable": False}
+_OF_TAGS: Final = ("unit", "address", "scale", "deadband", "writable", "over")
+_DEFAULTS: Final = {"unit": "", "address": "", "scale": None, "deadband": 0.0, "writable": False, "over": ""}
 
 
 def _describe(register: Register) -> Mapping[str, object]:

@@ -23,7 +23,6 @@ from shmio.logs import printable
 
 SUFFIXES: Final = (".csv", ".xlsx")
 COLUMNS: Final = ("path", "type", "address", "unit", "comment", "scale", "initial", "deadband", "writable")
-_NEEDED: Final = ("path", "type")
 _BOOLS: Final = {"true": True, "yes": True, "1": True, "x": True, "false": False, "no": False, "0": False}
 _NUMBER: Final = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 
@@ -35,11 +34,11 @@ class Sheet(NamedTuple):
     rows: Mapping[str, int]
 
 
-def read_sheet(file: str, data: bytes, report: Report) -> Sheet:
-    """Read a table, and add its errors to the report."""
+def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type")) -> Sheet:
+    """Read a table, and add its errors to the report; ``needed`` are the columns that each row must fill."""
     try:
         rows, comma = _rows_of(file, data)
-        return _sheet(file, rows, report, decimal_comma=comma)
+        return _sheet(file, rows, report, needed, decimal_comma=comma)
     except WorkbookError as error:
         report.add(Diagnostic(file, error.row, 1, f"not a tag table: {error}"))
         return Sheet({}, {})
@@ -75,11 +74,18 @@ def _sheet_of_tags(names: Sequence[str]) -> str | None:
     return next((name for name in names if name.lower() == "tags"), names[0] if names else None)
 
 
-def _sheet(file: str, rows: Iterable[tuple[int, Sequence[str]]], report: Report, *, decimal_comma: bool) -> Sheet:
+def _sheet(
+    file: str,
+    rows: Iterable[tuple[int, Sequence[str]]],
+    report: Report,
+    needed: Sequence[str],
+    *,
+    decimal_comma: bool,
+) -> Sheet:
     """Convert rows to entries as of a TOML table; raise ValueError if the header is wrong."""
     rows = iter(rows)
     _, header = next(rows, (1, ()))
-    columns = _columns([cell.strip().lower() for cell in header])
+    columns = _columns([cell.strip().lower() for cell in header], needed)
     registers: dict[str, object] = {}
     places: dict[str, int] = {}
     for number, row in rows:
@@ -94,6 +100,8 @@ def _sheet(file: str, rows: Iterable[tuple[int, Sequence[str]]], report: Report,
                 raise ValueError("the path is missing")
             if path in registers:
                 raise ValueError(f"given twice, first in row {places[path]}")
+            if missing := [name for name in needed if name != "path" and name not in cells]:
+                raise ValueError(f"the {missing[0]} is missing")
             registers[path] = _entry(cells, decimal_comma=decimal_comma)
             places[path] = number
         except ValueError as error:
@@ -105,11 +113,11 @@ def _sheet(file: str, rows: Iterable[tuple[int, Sequence[str]]], report: Report,
     return Sheet(registers, places)
 
 
-def _columns(header: Sequence[str]) -> list[str]:
+def _columns(header: Sequence[str], needed: Sequence[str]) -> list[str]:
     """Return the names of the columns; raise ValueError if one is missing, unknown or duplicate."""
     while header and not header[-1]:
         header = header[:-1]
-    if missing := [name for name in _NEEDED if name not in header]:
+    if missing := [name for name in needed if name not in header]:
         found = shorten(printable(", ".join(header))) or "nothing"
         raise ValueError(
             f"its first row must name the columns {' and '.join(missing)}; it has {found}. "
@@ -126,11 +134,9 @@ def _columns(header: Sequence[str]) -> list[str]:
 
 def _entry(cells: Mapping[str, str], *, decimal_comma: bool) -> dict[str, object]:
     """Return a row's cells as an entry of a TOML table; raise ValueError if one is wrong."""
-    if "type" not in cells:
-        raise ValueError("the type is missing")
     entry: dict[str, object] = {name: cells[name] for name in COLUMNS[1:5] if name in cells}
     if "initial" in cells:
-        real = cells["type"].upper() in ("REAL", "LREAL")
+        real = cells.get("type", "").upper() in ("REAL", "LREAL")
         entry["initial"] = _with_point(cells["initial"], decimal_comma) if real else cells["initial"]
     if "scale" in cells:
         numbers = [_number("scale", part, decimal_comma) for part in re.split(r"[\s;]+", cells["scale"])]

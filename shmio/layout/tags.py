@@ -27,17 +27,17 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import PurePath
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, TypeVar
 
 import msgspec
 from msgspec.structs import replace
 
 from shmio.config.faults import MAX_PARTS, explain, explain_toml, too_long
-from shmio.errors import Diagnostic, PathError, ValueRangeError
+from shmio.errors import Diagnostic, LayoutError, PathError, ValueRangeError
 from shmio.layout import tag_sheets
 from shmio.layout.model import (
     MAX_BLOCK_BYTES,
@@ -70,8 +70,10 @@ _TABLE = r"registers[ \t]*\.[ \t]*"
 _KEY = re.compile(rf"^[ \t]*(?:(?:{_TABLE})?{_NAME}[.=]|\[[ \t]*{_TABLE}{_NAME}[].])", re.MULTILINE)
 _ARRAY = re.compile(r"ARRAY\s*\[([^\]]*)\]\s*OF\s+(\S+)", re.IGNORECASE)
 _BOUNDS = re.compile(r"\s*(-?[0-9]{1,9})\s*\.\.\s*(-?[0-9]{1,9})\s*")
+_PATH = re.compile(r"[/.%]")
 _TEXTS: Final = frozenset({"STRING", "WSTRING", "CHAR", "WCHAR"})
 _Scalar = bool | int | float | str
+_Read = TypeVar("_Read")
 
 
 class _Tag(msgspec.Struct, forbid_unknown_fields=True):
@@ -101,20 +103,25 @@ def compile_tags(file: str, data: bytes, report: Report) -> Layout:
     """
     if file.lower().endswith(tag_sheets.SUFFIXES):
         return _compile_sheet(file, data, report)
-    table = _read(file, data, report)
-    report.raise_errors()
-    lines = _Lines(data.decode())
+    table = read_toml(file, data, report, _Table)
+    lines = Lines(data.decode())
     return _place_table(file, table, report, lines.line_of)
 
 
 def _compile_sheet(file: str, data: bytes, report: Report) -> Layout:
     """Compile a table of a CSV file or a spreadsheet; LayoutError as for :func:`compile_tags`."""
+    sheet = read_sheet(file, data, report)
+    return _place_table(file, _Table(dict(sheet.registers)), report, lambda path: sheet.rows.get(path, 1))
+
+
+def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type")) -> tag_sheets.Sheet:
+    """Return the rows of a CSV file or a spreadsheet; LayoutError: they are wrong."""
     if len(data) > MAX_SOURCE_BYTES:
         report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
         report.raise_errors()
-    sheet = tag_sheets.read_sheet(file, data, report)
+    sheet = tag_sheets.read_sheet(file, data, report, needed)
     report.raise_errors()
-    return _place_table(file, _Table(dict(sheet.registers)), report, lambda path: sheet.rows.get(path, 1))
+    return sheet
 
 
 def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder = "little") -> Layout:
@@ -136,27 +143,36 @@ def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder
     return _place_table(name, _Table(dict(registers), name, byte_order), Report([name]), places.__getitem__)
 
 
-def _read(file: str, data: bytes, report: Report) -> _Table:
-    """Return the file's content; after an error report it and return an empty table."""
+def read_toml(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read:
+    """Return the content of a table's file; LayoutError: it cannot be read."""
+    found = _read(file, data, report, kind)
+    report.raise_errors()
+    if found is None:
+        raise LayoutError(f"{file}: it cannot be read")
+    return found
+
+
+def _read(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read | None:
+    """Return the file's content; after an error report it and return None."""
     if len(data) > MAX_SOURCE_BYTES:
         report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
-        return _Table({})
+        return None
     try:
         text = data.decode()
     except UnicodeDecodeError as error:
         report.add(Diagnostic(file, data.count(b"\n", 0, error.start) + 1, 1, "it is not in UTF-8"))
-        return _Table({})
+        return None
     if line := too_long(text, MAX_SOURCE_BYTES):
         what = f"a key has more than {MAX_PARTS} parts; write a path with dots in quotes"
         report.add(Diagnostic(file, line, 1, what))
-        return _Table({})
+        return None
     try:
-        return msgspec.convert(tomllib.loads(text), _Table)
+        return msgspec.convert(tomllib.loads(text), kind)
     except msgspec.ValidationError as error:
         report.add(Diagnostic(file, 1, 1, f"not a tag table: {explain(error)}"))
     except (ValueError, RecursionError) as error:
         report.add(_syntax_error(file, text, error))
-    return _Table({})
+    return None
 
 
 def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
@@ -176,7 +192,7 @@ def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
     return Diagnostic(file, line, 1, f"{key}: given twice; write a path with a dot in quotes")
 
 
-class _Lines:
+class Lines:
     """Finds the line of a key of a table on demand."""
 
     def __init__(self, text: str) -> None:
@@ -286,7 +302,7 @@ class _Placer:
         if len(self._registers) >= MAX_REGISTERS:
             self._complain(key, f"expected at most {MAX_REGISTERS} registers, structures' members included")
             raise TooManyErrors
-        element, dims = _type(tag.type)
+        element, dims = parse_type(tag.type)
         shape = shape_of(dims)
         bit = 0 if element.base == "BOOL" else None
         size, align = array_size(element, shape), _align(element)
@@ -360,7 +376,7 @@ def _check_length(initial: str, shape: tuple[int, ...]) -> None:
             raise ValueError(f"initial: expected at most {math.prod(shape)} values, found more")
 
 
-def _type(text: str) -> tuple[ElementType, Dims]:
+def parse_type(text: str) -> tuple[ElementType, Dims]:
     """Return the element type and the array bounds; ValueError if the text is no type."""
     dims: list[tuple[int, int]] = []
     if array := _ARRAY.fullmatch(text.strip()):
@@ -375,6 +391,11 @@ def _type(text: str) -> tuple[ElementType, Dims]:
     if math.prod(shape_of(tuple(dims))) > MAX_ELEMENTS:
         raise ValueError(f"expected at most {MAX_ELEMENTS} elements")
     element = element_type(text.strip())
+    if element is None and _PATH.search(text):
+        raise ValueError(
+            f"there is no type {shorten(text)!r}; a table of names over a data block is given beside the block's "
+            'source: layout = "cell.db" and tags = "names.toml"'
+        )
     if element is None:
         raise ValueError(
             f"there is no type {text!r}; valid: BOOL, INT, DINT, REAL, LREAL, STRING[20] and similar, and the "

@@ -28,6 +28,7 @@ from shmio.config import Declaration
 from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError, ValueRangeError
 from shmio.layout.glob import choose
 from shmio.layout.model import Layout, Register
+from shmio.layout.overlay import names_in
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.local.events import Events
@@ -366,10 +367,10 @@ class Attachment:
         direction = Direction.IN if "in" in directions else Direction.OUT
         source_writer = self._source_writer(block)
         events = block.events.cursor()  # created before the shadow is laid, so that no diversion is missed
-        number = source_writer.inject(
-            [topic.path or "**" for topic in topics], direction=direction, priority=priority, keep=keep, name=name
-        )
-        return Shadow(source_writer, number, direction, events, partial(self._next, block), keep=keep)
+        patterns = [topic.path or "**" for topic in topics]
+        number = source_writer.inject(patterns, direction=direction, priority=priority, keep=keep, name=name)
+        names = names_in(block.layout, patterns)
+        return Shadow(source_writer, number, direction, events, partial(self._next, block), keep=keep, names=names)
 
     def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[Diversion]:
         """Iterate over the commands that write to registers of one source, from now on.

@@ -17,6 +17,8 @@ from shmio.config import Declaration
 from shmio.config.campaign import parse_campaign
 from shmio.config.declaration import check_declarations
 from shmio.errors import CommandError, ConfigError, DeclarationError, PathError, ValueRangeError
+from shmio.layout.model import Register
+from shmio.layout.overlay import names_in
 from shmio.layout.topic import Topic, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import cover, merge
@@ -83,8 +85,19 @@ class Shadow:
         next_event: Next,
         *,
         keep: bool,
+        names: Sequence[Register] = (),
     ) -> None:
-        """Wrap an existing injection. ``events`` is a cursor that is older than the injection."""
+        """Wrap an existing injection.
+
+        Args:
+            source_writer: The writing side of its source.
+            number: Number of the injection.
+            direction: Direction that it covers.
+            events: A cursor that is older than the injection.
+            next_event: Waits for the cursor's next event.
+            keep: Whether the injection stays when it is closed.
+            names: The registers over the block that it was laid over by their names.
+        """
         self.source = source_writer.block.source
         self.number = number
         """Number of the injection.
@@ -98,6 +111,7 @@ class Shadow:
         self._image = bytearray(source_writer.block.layout.size)  # all writes diverted so far
         self._next_event = next_event
         self._keep = keep
+        self._names = names
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Give values: to consumers, or, for a shadow over ``/in``, to the device.
@@ -148,7 +162,8 @@ class Shadow:
     def _diversion(self, diverted: CommandWrites) -> Diversion:
         apply(self._image, diverted.writes)
         event = diverted.event
-        written = decode_writes(self._source_writer.block.layout, bytes(self._image), diverted.writes)
+        layout = self._source_writer.block.layout
+        written = decode_writes(layout, bytes(self._image), diverted.writes, self._names)
         return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, self._events.take_missed())
 
     def lift(self) -> None:
@@ -199,11 +214,16 @@ def written(
     bits = cover(block.layout, chosen)
     if not any(bits):
         raise PathError(f"{block.source}: {', '.join(chosen)} names no register")
-    return _written(block, bits, events, next_event, timeout_s)
+    return _written(block, bits, names_in(block.layout, chosen), events, next_event, timeout_s)
 
 
 def _written(
-    block: Block, bits: bytes, events: Cursor[Event], next_event: Next, timeout_s: float | None
+    block: Block,
+    bits: bytes,
+    names: Sequence[Register],
+    events: Cursor[Event],
+    next_event: Next,
+    timeout_s: float | None,
 ) -> Iterator[Diversion]:
     layout, gatherer = block.layout, CommandAssembler(EventKind.ACCEPTED)
     last = block.latest()
@@ -216,7 +236,7 @@ def _written(
             apply(image, accepted.writes)
             mask = bytearray(a & b for a, b in zip(mask, bits, strict=True))
             if any(mask):
-                found = decode_writes(layout, bytes(image), merge(image, mask, [(0, layout.size)]))
+                found = decode_writes(layout, bytes(image), merge(image, mask, [(0, layout.size)]), names)
                 told = accepted.event
                 yield Diversion(found, told.writer, told.command, told.clock_ns, told.utc_ns, events.take_missed())
                 until_s = _deadline(timeout_s)

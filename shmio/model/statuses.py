@@ -209,15 +209,15 @@ class StatusArea:
             raise ValueError(f"{layout.name}: the layout has no status area")
         self.codes_offset = layout.status_offset
         """Offset of the status codes in an image, in bytes."""
-        self.times_offset = layout.size - _TIME_BYTES * len(layout.registers)
+        self.times_offset = layout.size - _TIME_BYTES * len(layout.own)
         """Offset of the source times in an image, in bytes."""
         order = ">" if layout.byte_order == "big" else "<"
         self._code, self._time = struct.Struct(f"{order}I"), struct.Struct(f"{order}q")
         self._severity_at = 0 if layout.byte_order == "big" else 3  # the byte of a code that has its severity
-        self._first_bits = [8 * register.offset + (register.bit or 0) for register in layout.registers]
+        self._first_bits = [8 * register.offset + (register.bit or 0) for register in layout.own]
 
     def index(self, register: Register) -> int:
-        """Return the index of the layout's register that contains this register, element or part."""
+        """Return the index of the layout's own register that contains this register, element or part."""
         return bisect_right(self._first_bits, 8 * register.offset + (register.bit or 0)) - 1
 
     def indices(self, registers: Iterable[Register]) -> list[int]:
@@ -271,7 +271,7 @@ def status_registers(layout: Layout, registers: Iterable[Register], *, times: bo
         return []
     found = []
     for index in dict.fromkeys(area.indices(registers)):
-        path = layout.registers[index].path
+        path = layout.own[index].path
         offset, size = area.code_range(index)
         found.append(Register(f"{path}#status", "DWORD", (), offset, None, size, 1))
         if times:

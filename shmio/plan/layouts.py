@@ -120,7 +120,7 @@ def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
 
     Raises:
         ConfigError: A file cannot be read; the message begins with ``key``.
-        LayoutError: A tag table is invalid, or given with other files.
+        LayoutError: A tag table is invalid.
 
     """
     return compiler.Program([_read(path, key) for path in paths])

@@ -21,7 +21,7 @@ def source_load(source: Source, layout: Layout) -> Load | None:
     connector = registry.load(source.connector)
     if not issubclass(connector, Connector):
         return None
-    made = connector.for_layout(layout)(registry.convert_options(source.connector, source.options), layout)
+    made = connector.for_layout(layout)(registry.convert_options(source.connector, source.options), layout.base)
     try:
         return made.load()
     finally:

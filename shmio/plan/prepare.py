@@ -214,6 +214,7 @@ def _check_emulator(index: int, emulator: Emulator, config: Config, files: Layou
         layouts = files.all(key, emulator)
     else:
         layouts = (files.get(key, emulator, emulator.dbNumber),)
+    layouts = tuple(layout.base for layout in layouts)
     blocks = [layout for layout in layouts if not is_table(layout)]
     if emulator.dbNumber is None:
         _check_numbers(key, blocks)

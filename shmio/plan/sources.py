@@ -96,6 +96,8 @@ def _check_source(
             source.options |= {name: str(config.path(source.options[name])) for name in paths}
             options = msgspec.convert(source.options, connector.Options)
     found.layouts[source.name] = layout
+    if issubclass(connector, Connector):
+        layout = layout.base  # names over the block are no registers of the device
     if options is None:  # its faults have been added, with those that the connector found
         options = _filled(connector.Options, source)
         if options is None:

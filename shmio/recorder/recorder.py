@@ -25,7 +25,7 @@ from shmio.recorder.instance_follower import (
     StartPositions,
 )
 from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, Reason
-from shmio.recording.writer import JSON, TEXT, TOML, Channels, Writer
+from shmio.recording.writer import JSON, TEXT, TOML, Channels, Writer, layout_files
 from shmio.segment import Event, Frame
 from shmio.version import __version__
 
@@ -375,7 +375,7 @@ class Recorder:
         layout = follower.part.layout
         if layout.hash not in self._attached:
             self._attached.add(layout.hash)
-            self._attach([AttachedFile(f"layouts/{layout.hash.hex()}.json", JSON, layout.to_json())])
+            self._attach([AttachedFile(name, JSON, data) for name, data in layout_files(layout)])
         if not follower.over:  # otherwise the files on disk are those of a newer block
             self._attach(self._attachments(block.source, follower.number))
         return followed

@@ -11,7 +11,7 @@ from typing import IO, Final
 
 from shmio.errors import RecordingError
 from shmio.layout.model import Register
-from shmio.layout.topic import holder
+from shmio.layout.overlay import needed
 from shmio.recording.dump import Dump
 from shmio.recording.format.encoding import Gap, ProcessChange, Reason, StepMark
 from shmio.recording.reading.part import MAX_NS, DumpBlock, Entry
@@ -114,8 +114,7 @@ class Rewriter:
             track.last = {what: min(number, block.after.get(what, number)) for what, number in after.items()}
         if block.layout.hash not in self._layouts:
             self._layouts.add(block.layout.hash)
-            name = f"layouts/{block.layout.hash.hex()}.json"
-            self._writer.attach(name, JSON, block.layout.to_json(), waiting[0].time_ns)
+            self._writer.attach_layout(block.layout, waiting[0].time_ns)
         track.number = len([one for one in self._tracks.values() if one.channels]) + 1
         track.channels = self._writer.open_block(
             block, track.number, track.last["frames"], track.last["events"], of=block.of
@@ -284,7 +283,7 @@ class _Parts:
 
 def _reduced(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, RecordedRegisters]:
     """Return a block, reduced to these registers, and an object that reduces its frames."""
-    paths = {holder(block.layout, register) for register in registers}
+    paths = {path for register in registers for path in needed(block.layout, register)}
     whole = tuple(register for register in block.layout.registers if register.path in paths)
     part = RecordedRegisters(block.layout, whole)
     layout = part.layout

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
-from shmio.layout.topic import holder, near, parse_topic
+from shmio.layout.overlay import needed
+from shmio.layout.topic import near, parse_topic
 from shmio.layout.values.write import chosen, covering
 from shmio.model.statuses import StatusArea
 from shmio.segment import Block, Frame
@@ -58,7 +59,7 @@ def _with_statuses(
     old, new = StatusArea(whole), StatusArea(part)
     kept, taken = np.zeros(part.size, np.uint8), np.zeros(part.size, np.intp)
     kept[: len(mask)], taken[: len(mask)] = mask, np.arange(len(mask))
-    for index, register in enumerate(part.registers):
+    for index, register in enumerate(part.own):
         for of in (StatusArea.code_range, StatusArea.time_range):
             (start, size), (to, _) = of(old, old.index(register)), of(new, index)
             kept[to : to + size], taken[to : to + size] = 0xFF, np.arange(start, start + size)
@@ -69,7 +70,8 @@ class Selection:
     """The sources and registers to record.
 
     ``sources`` are the names of the sources; None for all. ``registers`` are patterns as for
-    ``shmio get``; empty for all. A pattern that names an element selects its whole array.
+    ``shmio get``; empty for all. A pattern that names an element selects its whole array. One that
+    names a register of a tag table over the block also selects the register that it lies over.
     """
 
     def __init__(self, sources: Collection[str] | None = None, registers: Sequence[str] = ()) -> None:
@@ -128,6 +130,6 @@ def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) 
         topic = parse_topic(pattern, sources, next(iter(sources)) if len(sources) == 1 else None)
         if topic.source != source or topic.direction == "in":
             return set()
-        return {holder(layout, register) for register in chosen(layout, topic.path or "**")}
+        return set().union(*(needed(layout, register) for register in chosen(layout, topic.path or "**")))
     except PathError:
         return set()

@@ -5,7 +5,7 @@ The file has channels for the frames and events of each block, for gaps, steps a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import IO, Final, Protocol, cast
 
@@ -46,6 +46,17 @@ CHUNK_BYTES: Final = 1 << 20
 JSON: Final = "application/json"
 TOML: Final = "application/toml"
 TEXT: Final = "text/plain"
+
+
+def layout_files(layout: Layout) -> Iterator[tuple[str, bytes]]:
+    """Yield name and data of the attachments with a layout.
+
+    A layout with tag tables over the block is attached without them, too: readers before version
+    0.2 refuse registers that overlap, but find the block's own ones.
+    """
+    for one in dict.fromkeys((layout.base.hash, layout.hash)):
+        data = (layout if one == layout.hash else layout.base).to_json()
+        yield f"layouts/{one.hex()}.json", data
 
 
 class Output(Protocol):
@@ -91,6 +102,11 @@ class Writer:
         """Attach a file. ``changed_ns`` is the time of the file's last change, UTC; 0: unknown."""
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
+    def attach_layout(self, layout: Layout, now_ns: int) -> None:
+        """Attach a layout; see :func:`layout_files`."""
+        for name, data in layout_files(layout):
+            self.attach(name, JSON, data, now_ns)
+
     def open_block(
         self,
         block: Block | DumpBlock,
@@ -116,12 +132,14 @@ class Writer:
             "source": block.source,
             "block": str(number),
             "section": str(block.section),
-            "layout": layout.hash.hex(),
+            "layout": layout.base.hash.hex(),
             "period_ns": str(block.period_ns),
             "stale_ns": str(block.stale_ns),
         }
         if of or layout.hash != block.layout.hash:
             about["of"] = of or block.layout.hash.hex()
+        if layout.hash != layout.base.hash:
+            about["names"] = layout.hash.hex()
         frames, events = about | {"after": str(after_frame)}, about | {"after": str(after_event)}
         return Channels(
             self._mcap.register_channel(

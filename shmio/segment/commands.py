@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple, TypedDict
 
-from shmio.layout.model import Layout
+from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find_each
 from shmio.layout.values.codec import Value, codec
-from shmio.layout.values.write import Write, paths_of
+from shmio.layout.values.write import Write, bits_of, merge, paths_of
 from shmio.layout.values.write import apply as write_to
 from shmio.segment import _atomics
 from shmio.segment.events import DONE, ENDS, Event, EventKind
@@ -327,10 +327,28 @@ def apply(image: bytearray, writes: Iterable[Write]) -> None:
             write_to(write, image)
 
 
-def decode_writes(layout: Layout, image: bytes, writes: Iterable[Write]) -> dict[str, Value]:
+def decode_writes(
+    layout: Layout, image: bytes, writes: Iterable[Write], names: Sequence[Register] = ()
+) -> dict[str, Value]:
     """Decode the values that writes set in an image, by path.
 
-    If a write covers only a part of a register, the paths are those of its elements or bits.
+    If a write covers only a part of a register, the paths are those of its elements or bits. Bits
+    of ``names``, registers over the block, have their paths.
     """
-    named = (part for path in paths_of(layout, writes) for part in find_each(layout, path))
-    return {part.path: codec(part, layout.byte_order).decode(image) for part in named}
+    found: dict[str, Value] = {}
+    if names:
+        mask = bytearray(layout.size)
+        for write in writes:
+            for at in range(write.offset, write.offset + len(write.data)):
+                mask[at] |= write.mask or 0xFF
+        named = bytearray(layout.size)
+        for register in names:
+            bits = bits_of(register)
+            if any(mask[at] & own for at, own in enumerate(bits, register.offset)):
+                found[register.path] = codec(register, layout.byte_order).decode(image)
+                for at, own in enumerate(bits, register.offset):
+                    named[at] |= own
+        rest = bytes(there & ~taken for there, taken in zip(mask, named, strict=True))
+        writes = merge(image, rest, [(0, layout.size)])
+    parts = (part for path in paths_of(layout, writes) for part in find_each(layout, path))
+    return found | {part.path: codec(part, layout.byte_order).decode(image) for part in parts}

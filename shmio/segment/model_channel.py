@@ -90,10 +90,13 @@ class ModelAnswer(NamedTuple):
 def model_ports(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -> ModelPorts:
     """Find a model's inputs and outputs. All registers that are not in ``outputs`` are inputs.
 
+    Registers of tag tables over the block have no values of their own, and are none of them.
+
     Raises:
         ConfigError: A pattern names no register, or ``outputs`` and ``inouts`` name the same one.
             The message starts with the key.
     """
+    layout = layout.base
     computed, both = (_named(layout, *item) for item in (("outputs", outputs), ("inouts", inouts)))
     if twice := sorted(computed & both):
         path = layout.registers[twice[0]].path

@@ -145,11 +145,14 @@ class Shape(NamedTuple):
 def shape(layout: Layout, topic: Topic) -> Shape:
     """Return the registers that a topic names in a layout.
 
+    A structure of the data block has the block's members only, whatever a tag table puts below it:
+    old clients know its message by them.
+
     Raises:
         PathError: There is no such register or structure.
 
     """
-    below = layout.members(topic.path)
+    below = layout.base.members(topic.path) or layout.members(topic.path)
     if below:
         return Shape(topic.path, tuple(layout.registers[index] for index in below), whole=False)
     return Shape(topic.path, (look_up(layout, topic),), whole=True)

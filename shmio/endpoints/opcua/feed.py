@@ -296,6 +296,6 @@ def _scan(block: Block) -> ChangeScan:
         return ChangeScan(block.layout.registers)
     parts = []
     for index, register in enumerate(block.layout.registers):
-        code = Register("", "DWORD", (), area.code_range(index)[0], None, 4, 1)
+        code = Register("", "DWORD", (), area.code_range(area.index(register))[0], None, 4, 1)
         parts.append(entries([register, code], index))
     return ChangeScan.joined(parts)

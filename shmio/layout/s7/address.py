@@ -95,6 +95,11 @@ def is_of_cpu(text: str) -> bool:
     return text.strip().lower().startswith(CPU)
 
 
+def is_address(text: str) -> bool:
+    """Return whether a text has the form of an address."""
+    return _ADDRESS.fullmatch(text.strip()) is not None
+
+
 def parse(register: Register) -> Address:
     """Return the address of a register.
 

@@ -92,7 +92,7 @@ def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
     """
     named = (register for pattern in patterns for register in chosen(layout, pattern))
     mask = bytearray(covering(named, layout.size))
-    for register in layout.registers:
+    for register in layout.own:
         if register.type == "BOOL" and register.dims:
             _fill_rows(mask, register)
     return bytes(mask)
@@ -195,14 +195,14 @@ def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -
         for at in range(offset, stop):
             bits[at] |= mask or 0xFF
         touched.update(_overlapping(layout, offset, stop))
-    paths = (path for index in sorted(touched) for path in _register_paths(layout, layout.registers[index], bits))
+    paths = (path for index in sorted(touched) for path in _register_paths(layout, layout.own[index], bits))
     return list(islice(paths, most))
 
 
 def path_at(layout: Layout, offset: int) -> str:
     """Return the path of the register or array element at a byte, or an empty string."""
     for index in _overlapping(layout, offset, offset + 1):
-        register = layout.registers[index]
+        register = layout.own[index]
         if not register.dims or register.bit is not None:
             return register.path
         place = index_at(register.dims, (offset - register.offset) // register.element.stride)
@@ -211,9 +211,9 @@ def path_at(layout: Layout, offset: int) -> str:
 
 
 def _overlapping(layout: Layout, start: int, stop: int) -> range:
-    """Return the indices of the registers that have a byte in a range of bytes."""
-    first = bisect_right(layout.registers, start, key=lambda register: register.offset + register.size)
-    return range(first, bisect_left(layout.registers, stop, key=lambda register: register.offset))
+    """Return the indices of the registers in :attr:`Layout.own` that have a byte in a range of bytes."""
+    first = bisect_right(layout.own, start, key=lambda register: register.offset + register.size)
+    return range(first, bisect_left(layout.own, stop, key=lambda register: register.offset))
 
 
 def _register_paths(layout: Layout, register: Register, bits: bytearray) -> Iterator[str]:

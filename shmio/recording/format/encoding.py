@@ -317,8 +317,9 @@ def decode_position(text: str) -> BlockPosition:
 class Channel:
     """A channel with a block's frames or events, or with gaps, steps or process changes.
 
-    ``layout`` is the hash of the block's layout in hexadecimal digits. ``encoding`` is FRAME for
-    both versions of frames. It is empty if another program wrote the channel's messages.
+    ``layout`` is the hash of the block's layout in hexadecimal digits, with the tag tables over the
+    block. ``encoding`` is FRAME for both versions of frames. It is empty if another program wrote
+    the channel's messages.
     """
 
     number: int
@@ -349,7 +350,7 @@ def decode_channel(content: memoryview) -> Channel:
     if found.message_encoding in (FRAME, FRAME_V2, EVENT):
         block, section, after = (int(about[name]) for name in ("block", "section", "after"))
         period_ns, stale_ns = (int(about[name]) for name in ("period_ns", "stale_ns"))
-        source, layout = about["source"], about["layout"]
+        source, layout = about["source"], about.get("names", about["layout"])
         encoding = EVENT if found.message_encoding == EVENT else FRAME
         return Channel(
             found.id, encoding, found.topic, source, block, section, after, layout, period_ns, stale_ns,

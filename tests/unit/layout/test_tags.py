@@ -135,9 +135,9 @@ def test_file_that_is_not_utf8_is_refused() -> None:
     assert "cell.toml:2:1: error: it is not in UTF-8" in refusal(b"[registers]\n\xff = 'INT'")
 
 
-def test_tag_table_cannot_be_combined_with_other_files() -> None:
-    with pytest.raises(LayoutError, match="cannot be combined with other files"):
-        compile_sources([Source("a.toml", b"[registers]"), Source("b.udt", b"")])
+def test_a_tag_table_needs_no_source_beside_it_but_that_of_a_data_block() -> None:
+    with pytest.raises(LayoutError, match="expected a DATA_BLOCK, found none"):
+        compile_sources([Source("a.toml", b"[registers]\na = 'INT'"), Source("b.udt", b"")])
 
 
 @given(st.text(max_size=200) | st.binary(max_size=200))

@@ -577,7 +577,7 @@ class Selection:
     def _status_columns(self, area: StatusArea, frame: Frame) -> tuple[Array, Array]:
         """Return the status codes and source times of the table's registers."""
         layout = self.block.layout
-        order, count = ">" if layout.byte_order == "big" else "<", len(layout.registers)
+        order, count = ">" if layout.byte_order == "big" else "<", len(layout.own)
         if self._status_indices is None:
             self._status_indices = np.array(area.indices(self.registers), np.intp)
         return (

@@ -1,0 +1,222 @@
+"""Compile tag tables that lie over a data block: names for its bits, parts, slices and views.
+
+Such a table is given beside the block's source: ``layout = "db201.db"``, ``tags = "names.toml"``. It has the
+same forms as every tag table (``tags.py``), but addresses are paths of the block, and types may be
+left out. In TOML::
+
+    block = "DB201"               # needed if the sources hold several blocks
+    [registers]
+    DoorClosed = "Inputs/8.%X0"
+    "door/Speed" = { address = "Inputs/10", type = "REAL", unit = "mm/s" }
+    Release = { address = "Outputs/13.%X0", writable = true, comment = "releases the robot" }
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
+
+from shmio.config.faults import explain, meant
+from shmio.errors import Diagnostic, PathError
+from shmio.layout import tag_sheets
+from shmio.layout.model import MAX_ELEMENTS, MAX_REGISTERS, Layout, Register
+from shmio.layout.overlay import overlay_register
+from shmio.layout.report import Report, TooManyErrors
+from shmio.layout.s7.address import is_address
+from shmio.layout.spelling import block_path
+from shmio.layout.tags import Lines, parse_type, read_sheet, read_toml
+from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
+from shmio.logs import printable
+
+_NEEDED: Final = ("path", "address")
+
+
+class _Entry(msgspec.Struct, forbid_unknown_fields=True):
+    address: Annotated[str, msgspec.Meta(max_length=4096)] = ""
+    type: str = ""
+    comment: Annotated[str, msgspec.Meta(max_length=1000)] = ""
+    unit: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    writable: bool = False
+    initial: Any = None
+    scale: Any = None
+    deadband: Any = None
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    registers: Annotated[dict[str, object], msgspec.Meta(min_length=1, max_length=MAX_REGISTERS)]
+    block: Annotated[str, msgspec.Meta(max_length=128)] = ""
+
+
+class OverlayTable:
+    """A table over a data block, as read from its file."""
+
+    def __init__(self, file: str, data: bytes) -> None:
+        """Read the file; LayoutError: it is no table."""
+        self.file = file
+        report = Report([file])
+        if file.lower().endswith(tag_sheets.SUFFIXES):
+            sheet = read_sheet(file, data, report, _NEEDED)
+            self.block = ""
+            self._registers: Mapping[str, object] = sheet.registers
+            self.line_of: Callable[[str], int] = lambda path: sheet.rows.get(path, 1)
+        else:
+            table = read_toml(file, data, report, _File)
+            self.block = table.block
+            self._registers, self.line_of = table.registers, Lines(data.decode()).line_of
+
+    def lay(self, layout: Layout, report: Report) -> Layout:
+        """Return the layout with the table's registers behind those that it has; report errors."""
+        placer = _Placer(self, layout, report)
+        with suppress(TooManyErrors):
+            for key, given in self._registers.items():
+                placer.place(key, given)
+            placer.check_names()
+        return placer.layout()
+
+
+class _Placer:
+    def __init__(self, table: OverlayTable, layout: Layout, report: Report) -> None:
+        self._table, self._layout, self._report = table, layout, report
+        self._found: dict[str, Register] = {}
+        self._keys: dict[str, str] = {}
+        self._elements = sum(register.count for register in layout.registers)
+
+    def place(self, key: str, given: object) -> None:
+        """Add a register, or report why it cannot be added."""
+        try:
+            register = self._register(key, _entry(given))
+        except (PathError, ValueError) as error:
+            self._complain(key, str(error))
+            return
+        self._found[register.path] = register
+        self._keys[register.path] = key
+        self._elements += register.count
+        if self._elements > MAX_ELEMENTS or len(self._layout.registers) + len(self._found) > MAX_REGISTERS:
+            self._complain(key, f"expected at most {MAX_REGISTERS} registers and {MAX_ELEMENTS} elements, found more")
+            raise TooManyErrors
+
+    def check_names(self) -> None:
+        """Report paths that begin with the path of a register, or differ from others only in case."""
+        names = {register.path for register in self._layout.registers} | self._found.keys()
+        in_lower_case = {register.path.lower(): register.path for register in self._layout.registers}
+        for path, key in self._keys.items():
+            first = in_lower_case.setdefault(path.lower(), path)
+            if first != path:
+                self._complain(key, f"differs only in case from {shorten(first)}", "warning")
+            head = path.rpartition("/")[0]
+            while head:
+                if head in names:
+                    self._complain(key, f"{shorten(head)} is already a register; choose another path")
+                head = head.rpartition("/")[0]
+
+    def layout(self) -> Layout:
+        """Return the layout with the registers that were found."""
+        return replace(self._layout, registers=(*self._layout.registers, *self._found.values()))
+
+    def _register(self, key: str, entry: _Entry) -> Register:
+        layout = self._layout
+        if key.rpartition("/")[2] in ("in", "out"):
+            raise PathError("the path ends in a direction; leave that out: each register has both")
+        path = canonical_path(key)
+        if len(path) > MAX_TOPIC:
+            raise PathError(f"a path is at most {MAX_TOPIC} characters long")
+        if path in self._found:
+            raise PathError("given twice")
+        if path in layout.by_path:
+            held = layout.registers[layout.by_path[path]].over
+            what = "another table has this register" if held else f"{layout.name} has a register of this path"
+            raise PathError(f"{what}; choose another path")
+        if layout.members(path):
+            raise PathError(f"{layout.name} has a structure of this path; choose another one")
+        _refuse_conversions(entry, layout)
+        if not entry.address:
+            raise ValueError(
+                f"address: needed: the register of {layout.name} that it names, such as {_example(layout)}"
+            )
+        over = self._over(entry.address)
+        register = overlay_register(layout.base, path, over, parse_type(entry.type) if entry.type else None)
+        return msgspec.structs.replace(register, comment=entry.comment, unit=entry.unit, writable=entry.writable)
+
+    def _over(self, address: str) -> str:
+        """Return an address as a canonical path of the block; PathError."""
+        base = self._layout.base
+        text = block_path(address.strip(), base)
+        if is_address(text) and text not in base.by_path:
+            raise PathError(
+                f"address: {shorten(text)} is an address in the controller; a table over {base.name} names its "
+                f"registers, such as {_example(base)}; a table of addresses is a layout of its own, without {base.name}"
+            )
+        return canonical_path(text, parts=True)
+
+    def _complain(self, key: str, problem: str, severity: Literal["error", "warning"] = "error") -> None:
+        message = f"{shorten(printable(key))}: {problem}"
+        self._report.add(Diagnostic(self._table.file, self._table.line_of(key), 1, message, severity))
+
+
+def _entry(given: object) -> _Entry:
+    """Return the entry of one register; ValueError if it is wrong."""
+    if isinstance(given, str):
+        return _Entry(given)
+    known = _Entry.__struct_fields__
+    if isinstance(given, dict) and (others := given.keys() - set(known)):
+        other = min(others)
+        hint = meant(other, known) or "; write a path with a dot in quotes"
+        raise ValueError(f"there is no {shorten(printable(other))!r} here, only {', '.join(known)}{hint}")
+    try:
+        return msgspec.convert(given, _Entry)
+    except msgspec.ValidationError as error:
+        raise ValueError(explain(error)) from None
+
+
+def _refuse_conversions(entry: _Entry, layout: Layout) -> None:
+    """Raise ValueError if the entry has a column of registers that have bytes of their own."""
+    if entry.initial is not None:
+        raise ValueError(f"initial: the initial values are those of {layout.name}; leave it out")
+    for name in ("scale", "deadband"):
+        if getattr(entry, name):
+            raise ValueError(
+                f"{name}: a name over a data block shows the bytes of {layout.name} as they are; leave it out, and say "
+                "in unit or comment what the number means"
+            )
+
+
+def _example(layout: Layout) -> str:
+    """Return a path of the block as an example."""
+    for register in layout.own:
+        if register.type == "BYTE":
+            return f"{'/'.join((register.path, *(str(low) for low, _ in register.dims)))}.%X0"
+    return layout.own[0].path if layout.own else "Inputs/8.%X0"
+
+
+def lay_tables(
+    tables: list[OverlayTable], layouts: list[Layout], blocks: list[str], report: Report, *, chosen: bool
+) -> list[Layout]:
+    """Return layouts with the tables that lie over them; report errors.
+
+    Args:
+        tables: The tables.
+        layouts: The layouts that were compiled.
+        blocks: Names of all data blocks of the sources.
+        report: Where errors go.
+        chosen: Whether the caller has named the blocks that it wants.
+
+    """
+    for table in tables:
+        if table.block and table.block.lower() not in {name.lower() for name in blocks}:
+            held = ", ".join(blocks)
+            report.add(Diagnostic(table.file, 1, 1, f"block: no data block {table.block!r}; there are: {held}"))
+            continue
+        if not table.block and len(layouts) > 1 and not chosen:
+            held = ", ".join(blocks)
+            what = f'the sources hold several data blocks ({held}): say by block = "NAME" which one the table lies over'
+            report.add(Diagnostic(table.file, 1, 1, what))
+            continue
+        layouts = [
+            table.lay(layout, report) if table.block.lower() in ("", layout.name.lower()) else layout
+            for layout in layouts
+        ]
+    return layouts
