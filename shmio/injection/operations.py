@@ -186,7 +186,7 @@ class Operation(ABC):
 
 
 class Fixed(Operation):
-    """``set``: replaces the values by fixed ones."""
+    """``set``: replaces the values by fixed values."""
 
     def __init__(self, values: Bytes) -> None:
         self._values = values
@@ -294,7 +294,7 @@ class Freeze(Operation):
 class Drop(Operation):
     """``drop`` over ``/out``: drops the values of a cycle, so that readers see the previous ones.
 
-    The caller calls :meth:`apply` for the cycles to drop, and :meth:`passed` for all others.
+    The caller calls :meth:`apply` for the cycles to drop, and :meth:`passed` for all other cycles.
     """
 
     def __init__(self) -> None:
@@ -304,7 +304,7 @@ class Drop(Operation):
     def begin(self) -> None:
         """Forget all values.
 
-        Readers see the next values in any case, because there are no earlier ones.
+        Readers see the next values in any case, because there are no earlier values.
         """
         self._held = self._passing = None
 

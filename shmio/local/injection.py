@@ -443,7 +443,11 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
 
 
 def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, object]:
-    """Replace the paths in ``values`` by those of the topics. ValueRangeError: two are the same."""
+    """Return values by the paths of their topics, instead of the paths that the caller gave.
+
+    Raises:
+        ValueRangeError: Two topics have the same path.
+    """
     found: dict[str, object] = {}
     for topic, (path, value) in zip(topics, values.items(), strict=True):
         if topic.path in found:

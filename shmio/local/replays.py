@@ -50,7 +50,8 @@ class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
         change: Path of a register: play until its next change, and pause there.
         event: Kind of event: play until the next event of this kind, and pause there.
         jump: With ``change`` or ``event``: go to that position at once instead of playing.
-        sources: Only these sources, and others that replay the same recording; empty: all.
+        sources: Names of sources. All sources that replay the same recordings are included. Empty:
+            all replays.
     """
 
     paused: bool | None = None
@@ -92,7 +93,8 @@ class Replays:
         """Return the status of each replay.
 
         Args:
-            sources: Only these sources, and others that replay the same recording; empty: all.
+            sources: Names of sources. All sources that replay the same recordings are included. Empty:
+            all replays.
 
         Raises:
             CommandError: The instance replays no recording.

@@ -27,7 +27,7 @@ from shmio.segment.doorbell import Relay
 from shmio.segment.segment import Segment
 
 TURN_S: Final = 0.2
-"""Interval at which a waiting iterator checks that the instance runs, and that nobody closed it."""
+"""Interval at which a waiting iterator checks whether it was closed or the instance has stopped."""
 
 Item = TypeVar("Item")
 
@@ -235,7 +235,10 @@ def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) ->
 
 
 class _Follower:
-    """Follows the registers of one block, and compares each frame with that of the last update."""
+    """Follows the registers of one block.
+
+    It compares each frame with the frame of the last update.
+    """
 
     def __init__(self, block: Block, registers: Sequence[Register], *, every_frame: bool, interval_s: float) -> None:
         self.block = block

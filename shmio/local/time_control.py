@@ -285,7 +285,11 @@ class Coordinator:
             state = self.read()
             if rest_ns <= 0 or state.playing:
                 name = self._segment.instance
-                how = ", which is playing it; stop that first" if state.playing else "; wait until that program ends"
+                how = (
+                    ", which is playing it: stop that program first"
+                    if state.playing
+                    else ": wait until that program ends"
+                )
                 raise TimeError(f"the time of instance {name!r} is moved by {self._owner(state.owner)}{how}")
             bell.wait(seen, min(rest_ns, _TURN_NS))
 
@@ -301,7 +305,7 @@ class Coordinator:
 
     @staticmethod
     def _cycle(block: Block, state: Clock, now_ns: int) -> int:
-        """Return the present cycle of a block in wall time; at least that of its newest frame.
+        """Return the present cycle of a block in wall time, but at least that of its newest frame.
 
         For a block that replays a recording, return 0: the recording's cycles are not steps.
         """

@@ -403,5 +403,5 @@ class SourceWriter:
         if self.block.incarnation != ticket.incarnation:
             return RESTARTED
         if ticket.events.missed:
-            return f"{ticket.events.missed} events were missed, the answer may be among them"
+            return f"{ticket.events.missed} events were lost, and the source's answer may be among them"
         return SILENT

@@ -64,7 +64,7 @@ def _elsewhere(before: Report, directory: Path) -> str:
     name = before.note.removeprefix(NOTE)
     if before.note in (name, WAITS) or (directory / name).exists():
         return ""
-    return f"; the previous recorder's {name} is not in this folder: only that file has what the rings have lost"
+    return f"; the previous recorder's file {name} is not in this folder: only that file has the older entries"
 
 
 def _record(worker: Worker, series: RotatingRecorder | TriggeredRecorder) -> None:

@@ -215,7 +215,7 @@ class Output:
             after._thread.join(WAIT_S)
         if after is None or after.whole:
             return True
-        self.error = f"{after.path}, the file before it, was not written completely"
+        self.error = f"the previous file, {after.path}, was not written completely"
         return False
 
     def _put(self, piece: bytes) -> bool:
@@ -249,7 +249,7 @@ class Output:
             os.fsync(self._fd)
         except OSError as error:
             reason = error.strerror or str(error)
-            self.doubt = self.doubt or f"fsync: {reason}: what was written after byte {self.synced} may be lost"
+            self.doubt = self.doubt or f"fsync failed ({reason}): the data after byte {self.synced} may be lost"
         else:
             if not self.doubt:
                 self.synced = self.written

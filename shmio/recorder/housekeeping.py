@@ -155,9 +155,9 @@ class Housekeeper:
         for file in oldest:
             age_days = (time.time() - file.changed_ns / 1e9) / DAY_S
             if settings.keep_days and age_days > settings.keep_days:
-                why = f"it is {age_days:.1f} days old, recorder.keep_days is {settings.keep_days:g}"
+                why = f"it is {age_days:.1f} days old, but recorder.keep_days is {settings.keep_days:g}"
             elif settings.keep_mb and left > settings.keep_mb * 1e6:
-                why = f"there are {left / 1e6:.1f} MB of recordings, recorder.keep_mb is {settings.keep_mb:g}"
+                why = f"there are {left / 1e6:.1f} MB of recordings, but recorder.keep_mb is {settings.keep_mb:g}"
             else:
                 continue
             if self._remove(file, why):

@@ -250,7 +250,7 @@ class InstanceFollower:
         self.followers: list[BlockFollower] = []
         """Followers of the present blocks, and of retired blocks that have unread entries."""
         self.done = 0
-        """Number of the last step of virtual time of which all frames have been read."""
+        """Number of the last step of virtual time whose frames have all been read."""
         self._selection = selection or Selection()
         self._watched: set[str] = set()
         self._watching: list[BlockFollower] = []
@@ -344,7 +344,7 @@ class InstanceFollower:
         )
 
     def _step(self, state: Clock) -> list[InstanceEntry]:
-        """Return the mark for the end of a step of which all frames have been read."""
+        """Return the mark for the end of a step whose frames have all been read."""
         self.done = state.done
         if state.done != state.step or not state.dt_ns:  # the length of that step is unknown
             return []

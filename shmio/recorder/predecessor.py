@@ -41,8 +41,8 @@ def own_files(directory: Path, instance: str) -> list[Path]:
             with suppress(OSError):  # it was removed meanwhile
                 (found if is_own(file.lstat()) else strange).append(file)
     if strange:
-        more = f", and {len(strange) - 1} others," if len(strange) > 1 else ""
-        log.warning("%s%s ignored: not a regular file of this user", strange[0], more)
+        more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
+        log.warning("ignoring %s%s: not a regular file of this user", strange[0], more)
     return found
 
 

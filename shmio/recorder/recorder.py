@@ -85,7 +85,7 @@ class ConfigFiles:
         try:
             config = load(self._file)
         except ConfigError as error:
-            self._tell(f"the layout's sources of {source} are not attached: {error}")
+            self._tell(f"the layout files of source {source} are not attached to the recording: {error}")
             return []
         layouts = [section.layout for section in config.source if section.name == source and section.layout]
         names = [name for layout in layouts for name in ([layout] if isinstance(layout, str) else layout)]
@@ -99,10 +99,10 @@ class ConfigFiles:
                     data = stream.read(MAX_FILE_BYTES + 1)
                 changed_ns = file.stat().st_mtime_ns
             except OSError as error:
-                self._tell(f"{file} is not attached: {error.strerror}")
+                self._tell(f"{file} is not attached to the recording: {error.strerror}")
                 continue
             if len(data) > MAX_FILE_BYTES:
-                self._tell(f"{file} is not attached: larger than {MAX_FILE_BYTES} bytes")
+                self._tell(f"{file} is not attached to the recording: it is larger than {MAX_FILE_BYTES} bytes")
                 continue
             found.append(AttachedFile(f"{folder}/{file.name}", media_type, data, max(0, changed_ns)))
         return found
@@ -455,8 +455,8 @@ class RotatingRecorder:
 
     No entry is lost between two files. It also starts a new file after a failed fsync, because part
     of the old file may be lost. The new file begins at the last position that an fsync has
-    confirmed. It has the entries after this position that are still in the rings, and gaps for the
-    others.
+    confirmed. It has the entries after this position that are still in the rings, and gaps for all
+    other entries.
     """
 
     def __init__(

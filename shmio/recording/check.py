@@ -202,6 +202,6 @@ class _Numbers:
 
     def _broken(self, key: tuple[str, int, str], last: int, number: int) -> None:
         source, block, what = key
-        missing = f"{what} {last + 1} to {number - 1} are missing without a gap"
-        again = f"{what}: {number} comes after {last}"
+        missing = f"{what} {last + 1} to {number - 1} are missing, but no gap is recorded for them"
+        again = f"{what}: number {number} comes after number {last}"
         self._problem(f"{source}, block {block}: {missing if number > last else again}")

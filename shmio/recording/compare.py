@@ -23,7 +23,7 @@ from shmio.segment.playhead import OWN_WORDS
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
 """The fields of an event that are equal if the same happens in two runs."""
 MAX_EVENTS: Final = 4096
-"""Largest number of events that are held in memory to match those of one cycle.
+"""Largest number of events of one cycle that are in memory at once, to match them.
 
 While time is paused, one cycle may have any number of events.
 """

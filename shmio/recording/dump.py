@@ -127,7 +127,7 @@ class Dump:
 
     @property
     def readers(self) -> tuple[Reader, ...]:
-        """The readers of the files, with which you can read attachments."""
+        """The readers of the files. Use them to read attachments."""
         return tuple(part.reader for part in self._parts)
 
     @property

@@ -348,7 +348,7 @@ def export_mcap(
 ) -> int:
     """Write an MCAP file with a JSON message for each frame and each event.
 
-    The topic of frames is ``/<source>``, and that of events ``/<source>/events``.
+    The topic of frames is ``/<source>``. The topic of events is ``/<source>/events``.
 
     Args:
         dump: The recording.

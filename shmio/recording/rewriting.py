@@ -183,7 +183,7 @@ def rewrite(
         dump: The recording, whose attachments and metadata are copied.
         path: The new file.
         made: Name of the command that makes the file, for its metadata.
-        entries: The entries in order: ``dump.items()``, or those of :func:`part`.
+        entries: The entries in order: from ``dump.items()``, or from :func:`part`.
         whole: True: if entries are missing at the beginning of a block, write a gap. False: they
             were not selected.
         progress: Called with the length in ns of the part that is done.
@@ -255,7 +255,7 @@ def _part(
 
 
 class _Parts:
-    """Reduces the entries of a recording to some registers. The bytes of others become zero."""
+    """Reduces the entries of a recording to some registers. All other bytes become zero."""
 
     def __init__(self, dump: Dump, paths: Sequence[str]) -> None:
         """Find the registers. An element selects its whole array.

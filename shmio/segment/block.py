@@ -86,7 +86,7 @@ class Frame(NamedTuple):
         if self.quality is not Quality.BAD:
             age_ns = self.age_ns(now_ns)
             if age_ns > stale_ns:
-                return Quality.BAD, f"stale: no newer frame, this one is {age_ns / 1e9:.1f} s old"
+                return Quality.BAD, f"stale: no newer frame, and this frame is {age_ns / 1e9:.1f} s old"
         return self.quality, self.reason
 
 
@@ -332,10 +332,10 @@ class Block:
         return self.ring.stale_ns
 
     def now_ns(self) -> int:
-        """Return the present time in ns on the clock by which frames age.
+        """Return the present time in ns on the clock that determines the age of frames.
 
-        A replay uses the clock of its playhead. Another source that uses the instance clock uses
-        that, and all others use CLOCK_MONOTONIC.
+        For a replay, this is the clock of its playhead. For any other source that uses the instance
+        clock, it is that clock. For all other sources, it is CLOCK_MONOTONIC.
         """
         if self.playhead is not None:
             return self.playhead.now_ns()
@@ -568,8 +568,8 @@ class FrameFollower(Cursor[Frame]):
         Args:
             block: The block.
             catch_up_s: If the unread frames cover more than this time, or more than half the ring,
-                :meth:`read` skips to the newest frame and counts the skipped ones as missed. None:
-                it never skips.
+                :meth:`read` skips to the newest frame and counts the skipped frames as missed.
+                None: it never skips.
             notice_gaps: Whether :meth:`take` reports :attr:`QualityChange.GAP`.
         """
         super().__init__(block.ring, decode_frame, max(0, block.ring.head() - 1), lambda: block.retired)

@@ -161,7 +161,7 @@ class ClockPage:
             self.bell.ring()
 
     def now_ns(self) -> int:
-        """Return the present time in ns by which frames of sources on the instance clock age.
+        """Return the present time in ns that determines the age of frames on the instance clock.
 
         It equals CLOCK_MONOTONIC until a program takes control of time for the first time. From
         then on, it follows the instance's clock.

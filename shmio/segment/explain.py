@@ -22,7 +22,7 @@ from shmio.segment.events import EVENT_DATA_SIZE, NO_WRITER, Event, EventKind
 from shmio.segment.processes import GUEST_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096
-"""Maximum number of unfinished commands that an explainer remembers; also that of injections."""
+"""An explainer remembers at most this many unfinished commands and this many injections."""
 MAX_LAID_BYTES: Final = 1 << 16
 
 _INWARD: Final = frozenset(

@@ -232,7 +232,10 @@ class Playhead:
         )  # fmt: skip
 
     def now_ns(self) -> int:
-        """Return the present time by which frames age: the publish time of the present position."""
+        """Return the present time that determines the age of frames.
+
+        It is the publish time of the present position.
+        """
         play = self.read()
         return time.monotonic_ns() if play is None else play.base_ns + play.at_ns(self._clock.present_ns())
 

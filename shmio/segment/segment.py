@@ -428,7 +428,7 @@ class Segment:
         """
         if header.has_config(self.memory, file.resolve()):
             return
-        used = "an unknown file, by a version of shmio that does not say which" if self.config is None else self.config
+        used = "an unknown file (its version of shmio does not record the file)" if self.config is None else self.config
         raise WrongInstanceError(
             f"the running instance {self.instance!r} was started from {used}, not from {file.resolve()}: "
             f"to use that instance anyway, add --instance {self.instance}"
@@ -525,7 +525,7 @@ class Segment:
         return at
 
     def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
-        """Add blocks, then retire others. Only the supervisor may call this.
+        """Add blocks, then retire blocks. Only the supervisor may call this.
 
         Readers see the changes in this order. If a source is in both ``add`` and ``retire``, the
         new block replaces the old one.

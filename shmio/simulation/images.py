@@ -75,7 +75,7 @@ class Images:
         offset, mask, data = write
         stop = offset + len(data)
         if stop > len(self.commanded):
-            return f"it is outside the block of {len(self.commanded)} bytes"
+            return f"the write is outside the block of {len(self.commanded)} bytes"
         if self._computed[offset] & mask if mask else any(self._computed[offset:stop]):
             hit = [r.path for r in self._outputs if r.offset < stop and offset < r.offset + r.size]
             return f"the model computes {hit[0]}: outputs cannot be written; shmio inject can show another value"

@@ -1,8 +1,8 @@
 """TCP proxy with faults on demand between a program and its peer, for tests and benchmarks.
 
-It has one thread and uses ``select``, whose time-outs have a resolution of microseconds, unlike
-those of ``epoll``. A method that changes the behaviour returns when the change is in effect, so
-that tests need not wait.
+It has one thread and uses ``select``, because its time-outs have a resolution of microseconds, and
+``epoll`` has only milliseconds. A method that changes the behaviour returns when the change is in
+effect, so that tests need not wait.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ class Records:
                 self.damage = "" if self.closed else f"it ends within its footer at byte {at}"
                 return
         if self._peek(at, 1) == b"\0":
-            self.damage = f"no record at byte {at}"
+            self.damage = f"there is no valid record at byte {at}"
         else:
             self.damage = (
                 f"it ends within a record at byte {at} of {self.size}" if at < self.size else "it has no footer"

@@ -52,7 +52,7 @@ _TOLD: Final = np.dtype(
 _HEAD_SIZE: Final = 9
 _LOG_AT: Final = 15
 _WORTH: Final = 4
-"""Smallest number of messages in a run for which reading by runs is faster.
+"""If runs have fewer messages than this, reading by runs is not faster.
 
 After ``_MAX_TRIES`` shorter runs, the rest of the chunk is read message by message.
 """

@@ -96,7 +96,7 @@ def test_a_failed_fsync_is_not_forgotten(tmp_path: Path, monkeypatch: pytest.Mon
         output.flush()
         calls.put(good)
         assert done.acquire(timeout=30)
-    doubt = f"{output.path}: fsync: Input/output error: what was written after byte 10 may be lost"
+    doubt = f"{output.path}: fsync failed (Input/output error): the data after byte 10 may be lost"
     calls.put(True)
     assert not output.close(30)
     assert (output.problem, output.written, output.synced) == (doubt, 30, 10)

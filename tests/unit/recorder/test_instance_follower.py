@@ -146,7 +146,9 @@ def test_the_largest_file_is_attached_and_a_larger_one_is_not(
     file.write_bytes(bytes(11))
     for _ in range(2):
         assert files(None, 0) == []
-    assert [record.getMessage() for record in caplog.records] == [f"{file} is not attached: larger than 10 bytes"]
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{file} is not attached to the recording: it is larger than 10 bytes"
+    ]
 
 
 def test_a_configuration_that_became_invalid_is_named_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -155,7 +157,7 @@ def test_a_configuration_that_became_invalid_is_named_once(tmp_path: Path, caplo
     files = recorder_module.ConfigFiles(file)
     assert files("cell", 1) == files("cell", 1) == []
     (line,) = caplog.messages
-    assert line.startswith("the layout's sources of cell are not attached: ")
+    assert line.startswith("the layout files of source cell are not attached to the recording: ")
     assert str(file) in line
 
 

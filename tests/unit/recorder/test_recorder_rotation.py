@@ -200,7 +200,7 @@ def test_a_file_stays_empty_if_the_previous_one_could_not_be_written(
         outputs[-1].write(b"data")
     assert not outputs[0].close(30)
     assert not outputs[1].close(30)
-    assert "one, the file before it, was not written completely" in outputs[1].problem
+    assert "one, was not written completely" in outputs[1].problem
     assert (tmp_path / "two").read_bytes() == b""
 
 
@@ -263,7 +263,7 @@ def test_retention_by_age(segment: Segment, tmp_path: Path, caplog: pytest.LogCa
     caplog.set_level("INFO")
     old, young, present = (recorded(segment, tmp_path, days) for days in (8, 6, 9))
     assert keep(segment, tmp_path, present, keep_days=7) == {young, present}
-    assert f"deleted {old}: it is 8.0 days old, recorder.keep_days is 7" in caplog.text
+    assert f"deleted {old}: it is 8.0 days old, but recorder.keep_days is 7" in caplog.text
 
 
 def test_retention_by_size_deletes_the_oldest_first(segment: Segment, tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_the_place_of_each_damaged_chunk_is_reported_and_the_rest_is_read(file: 
         numbers = [message.item.number for message in chunks[turn] if isinstance(message.item, Frame)]
         if numbers and turn + 1 < len(chunks):
             gap = 11 if turn == 2 else numbers[0]
-            lost = f"cell, block 1: frames {gap} to {numbers[-1]} are missing without a gap"
+            lost = f"cell, block 1: frames {gap} to {numbers[-1]} are missing, but no gap is recorded for them"
             assert lost in found.problems
 
 
@@ -224,7 +224,9 @@ def test_missing_numbers_outside_of_gaps_are_reported(
         work.turn()
     publish(writer, 2)
     assert work.close()
-    assert found_in(work.output.path).problems == ["cell, block 1: frames 6 to 8 are missing without a gap"]
+    assert found_in(work.output.path).problems == [
+        "cell, block 1: frames 6 to 8 are missing, but no gap is recorded for them"
+    ]
 
 
 def _dropped(side: instance_follower._Stream[Frame]) -> list[instance_follower.BlockEntry]:

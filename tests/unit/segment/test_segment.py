@@ -225,7 +225,7 @@ def test_a_damaged_layout_is_refused_only_when_it_is_needed(instance: str) -> No
 def test_a_section_count_beyond_the_table_is_refused(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         segment.memory[GENERATION_OFFSET + 4 : GENERATION_OFFSET + 8] = (60_000).to_bytes(4, "little")
-        with pytest.raises(FormatError, match="more sections"):
+        with pytest.raises(FormatError, match="the header counts 60000 sections"):
             Segment.open(instance)
         segment.unlink()
 
@@ -329,7 +329,7 @@ def test_an_old_frame_is_never_good(instance: str) -> None:
         assert frame.assess(500_000_000, frame.publish_ns + 500_000_000) == (Quality.GOOD, "")
         assert frame.assess(500_000_000, frame.publish_ns + 2_500_000_001) == (
             Quality.BAD,
-            "stale: no newer frame, this one is 2.5 s old",
+            "stale: no newer frame, and this frame is 2.5 s old",
         )
         segment.unlink()
 

@@ -100,7 +100,7 @@ def test_outputs_are_not_written() -> None:
     whole = runner.write([Write(0, 0, bytes(runner.layout.size)), Write(runner.layout.size - 1, 0, b"ab")])
     assert [said.partition(":")[0] for said in whole] == [
         "the model computes position",
-        f"it is outside the block of {runner.layout.size} bytes",
+        f"the write is outside the block of {runner.layout.size} bytes",
     ]
     assert value(runner, "position", step(runner)) == pytest.approx(0.025)
 

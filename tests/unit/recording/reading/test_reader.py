@@ -117,7 +117,7 @@ def test_zeros_at_the_end_are_reported(recording: bytes, tmp_path: Path) -> None
     file.write_bytes(recording[: ends[-1]] + bytes(5000))
     with Reader(file) as reader:
         after = list(reader.messages())
-        assert (reader.records.closed, reader.records.damage) == (False, f"no record at byte {ends[-1]}")
+        assert (reader.records.closed, reader.records.damage) == (False, f"there is no valid record at byte {ends[-1]}")
     assert after == before
 
 
