@@ -230,7 +230,7 @@ class Noise(Operation):
 
 
 class RandomRange(Operation):
-    """``random`` with a range: replaces each number by a random one.
+    """``random`` with a range: replaces each number by a random number.
 
     Integers may be equal to either end of the range.
     """
@@ -254,7 +254,7 @@ class RandomRange(Operation):
 
 
 class RandomChoice(Operation):
-    """``random`` with a list: replaces each value by a random one of the list."""
+    """``random`` with a list: replaces each value by a random value of the list."""
 
     def __init__(self, tables: Sequence[tuple[ValueGroup, Bytes]], draw: SeededRandom) -> None:
         """Create the operation.

@@ -16,7 +16,7 @@ from shmio.segment.processes import Phase, ProcessSlot
 from shmio.segment.segment import Segment, running_instances
 
 SILENT_S = 5.0
-"""A supervisor without a heartbeat for this time is reported as not responding."""
+"""Time in s. A supervisor without a heartbeat for this time is reported as not responding."""
 
 
 class ProcessStatus(msgspec.Struct, kw_only=True):

@@ -144,7 +144,7 @@ class Coordinator:
         """Return to real time. The clock continues from the present virtual time, without an owner.
 
         Args:
-            patience_s: Time to wait, in s, until an owner that does not play gives it up.
+            patience_s: Time to wait, in s, until an owner that does not play gives up time.
 
         Raises:
             TimeError: Another living process owns time, or time was virtual from the start.

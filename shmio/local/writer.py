@@ -113,7 +113,10 @@ class CommandSender:
 
 @dataclass(slots=True)
 class PendingCommand:
-    """A command whose outcome is not known yet. ``events`` is the cursor with which to find it."""
+    """A command whose outcome is not known yet.
+
+    ``events`` is the cursor that will read the outcome.
+    """
 
     number: int
     paths: tuple[str, ...]

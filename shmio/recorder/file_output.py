@@ -131,7 +131,7 @@ class Output:
     def full(self) -> bool:
         """True if too many bytes wait for the disk.
 
-        It stays True until at most half the limit wait.
+        It stays True until at most half of ``limit_bytes`` wait.
         """
         self._full = self.waiting > (self._limit // 2 if self._full else self._limit)
         return self._full

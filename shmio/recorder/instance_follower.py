@@ -14,7 +14,10 @@ from shmio.segment.events import EVENT_SIZE
 from shmio.segment.processes import Phase, ProcessSlot
 
 TURN_S: Final = 0.1
-"""Longest pause between two turns of the recorder, in s. It reads all new entries in a turn."""
+"""Longest pause between two turns of the recorder, in s.
+
+In a turn, the recorder reads the entries that are new since the last turn.
+"""
 LIVELY: Final = 256
 """If one block has more entries than this in a turn, the next turn comes sooner.
 

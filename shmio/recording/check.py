@@ -15,7 +15,7 @@ from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
 
 MAX_TOLD: Final = 1000
-"""Largest number of damaged places, and of problems, that the result lists. It counts all."""
+"""Largest number of damaged places, and of problems, that a result lists. It counts all of them."""
 
 
 @dataclass(slots=True)

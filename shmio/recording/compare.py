@@ -550,7 +550,7 @@ def _joined(
 
 
 class _InOrder:
-    """Pairs the frames of two groups, which have the same key, in their order.
+    """Pairs the frames of two groups in order: the first with the first, and so on.
 
     If ``shifted`` is True, one recording may lack the first frames of its first group. For these
     groups, an offset is chosen for which most pairs have the same content.

@@ -51,8 +51,8 @@ TEXT: Final = "text/plain"
 def layout_files(layout: Layout) -> Iterator[tuple[str, bytes]]:
     """Yield name and data of the attachments with a layout.
 
-    A layout with tag tables over the block is attached without them, too: readers before version
-    0.2 refuse registers that overlap, but find the block's own ones.
+    If the layout has tag tables over the block, a second attachment is the layout without them.
+    Readers before version 0.2 refuse a layout whose registers overlap, and use this one.
     """
     for one in dict.fromkeys((layout.base.hash, layout.hash)):
         data = (layout if one == layout.hash else layout.base).to_json()

@@ -577,7 +577,7 @@ class FrameFollower(Cursor[Frame]):
         self.frame: Frame | None = None
         """The last frame taken; None before the first."""
         self.quality = Quality.BAD
-        """Quality at the last call of :meth:`take`, or since the last frame became stale."""
+        """Present quality, as of the last call of :meth:`take` or :meth:`became_stale`."""
         self.reason = "no data yet"
         """Reason why the quality is not good; empty if it is."""
         self._notice_gaps = notice_gaps

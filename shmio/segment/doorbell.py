@@ -1,4 +1,4 @@
-"""Doorbells in shared memory, which processes wait on, and their relay to event loops."""
+"""Doorbells in shared memory: processes wait on them, and a relay passes them on to event loops."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def port_of(path: str, registers: Mapping[str, Register], byte_order: ByteOrder,
 
 
 class RegisterPort:
-    """Access to the value of a register or an array."""
+    """Reads and writes the value of a register or an array."""
 
     def __init__(self, register: Register, byte_order: ByteOrder, image: bytearray) -> None:
         self._path = register.path
@@ -148,7 +148,7 @@ class RegisterPort:
     def read(self) -> Any:
         """Return the value.
 
-        An array is returned as tuples: a list would suggest that its change also changes the image.
+        An array is returned as tuples, which nobody can change: changes would not reach the image.
         """
         if self._is_row:
             return bytes(self._image[self._start : self._stop])
@@ -173,7 +173,7 @@ class RegisterPort:
 
 
 class _StructurePort:
-    """Access to the values of a structure's registers."""
+    """Reads and writes the values of a structure's registers."""
 
     def __init__(
         self, path: str, ports: Mapping[str, RegisterPort], bulk: _StructureCodec | None, image: bytearray

@@ -156,7 +156,7 @@ class ConnectorConformance:
         run.good()
 
     def test_cut_in_the_middle_of_an_answer(self, run: Run, rig: Rig) -> None:
-        """Half an answer never becomes a frame."""
+        """The source never makes a frame from an incomplete answer."""
         run.good()
         rig.proxy.cut_after(30)
         run.bad()

@@ -392,7 +392,8 @@ class _IndexSurvey:
     def _track(self, number: int, chunk: Record, index: int) -> None:
         """Add the track of a channel.
 
-        ``chunk`` is its first chunk; ``index`` is the offset of its index.
+        ``chunk`` is the channel's first chunk, and ``index`` is the offset of the channel's index
+        there.
 
         Raises:
             RecordingError, ValueError: The message index is invalid.
