@@ -360,8 +360,8 @@ class SourceLoop:
         self.counters.failures += 1
         self._connected_ns = None
         self._under_way.clear()
+        self._disconnected(cycle, reason)  # first, because it may take time to close the connection
         self._connector.close()
-        self._disconnected(cycle, reason)
         stop = self._clock.wait_ns(round(RECONNECT.wait_s(self._retries) * 1e9))
         self._retries += 1
         self._schedule.restart()

@@ -1,9 +1,7 @@
-"""An emulated controller: a cyclic program, and a server that gives clients access to its memory."""
+"""An emulated S7 controller: a cyclic program, and a server that gives clients access to its memory."""
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
@@ -12,6 +10,7 @@ from snap7.server import CPUState
 
 from shmio.config.address import Address
 from shmio.emulators.areas import AREAS, Place, TableMemory, is_table, place_name
+from shmio.emulators.cycle import Cycle
 from shmio.emulators.programs import Idle, program
 from shmio.emulators.s7 import S7Server, Traits
 from shmio.errors import ConfigError
@@ -23,9 +22,8 @@ from shmio.layout.s7.address import Area
 class Emulator:
     """Runs a program on a data block or tag table, and serves it and others over S7. Start it once.
 
-    The program's cycles follow an absolute schedule, so they do not drift; late cycles are skipped
-    and counted. Clients read and write between cycles, never within one. A client that stops the
-    emulated CPU stops the program and its time, but not the server, as with a real controller.
+    Clients read and write between cycles, never within one. A client that stops the emulated CPU
+    stops the program and its time, but not the server, as with a real controller.
     """
 
     def __init__(
@@ -56,7 +54,6 @@ class Emulator:
 
         """
         self._program = program(program_name, layout)
-        self._period_s = self._program.period_ms / 1000
         self._server = S7Server(listen, max_clients=max_clients, traits=traits)
         self._memory: dict[Place, bytearray] = {}
         self._table = TableMemory(layout) if is_table(layout) else None
@@ -66,31 +63,17 @@ class Emulator:
                 self._serve(other)
         tables = [TableMemory(one) for one in others if is_table(one)]
         self._serve_tables([self._table, *tables] if self._table else tables)
-        self._thread = threading.Thread(target=self._run, name=f"program-{program_name}", daemon=True)
-        self._stopping = threading.Event()
-        self._failure: Exception | None = None
-        self._cycles = 0
-        self._overruns = 0
+        self.cycle = Cycle(
+            self._program.period_ms / 1000,
+            self._step,
+            f"program-{program_name}",
+            lambda: bool(self._server.cpu_state == CPUState.RUN),
+        )
 
     @property
     def address(self) -> Address:
         """Address on which the server listens; raises ShmioError before the start."""
         return self._server.address
-
-    @property
-    def cycles(self) -> int:
-        """Number of cycles that have run."""
-        return self._cycles
-
-    @property
-    def overruns(self) -> int:
-        """Number of cycles skipped because the previous one took too long."""
-        return self._overruns
-
-    @property
-    def failure(self) -> Exception | None:
-        """Error that ended the program, or None; the emulator's process checks it regularly."""
-        return self._failure
 
     def start(self) -> None:
         """Run the first cycle, listen, and continue in threads.
@@ -99,16 +82,14 @@ class Emulator:
             EndpointError: The address is not available.
 
         """
-        self._step(0)
+        self.cycle.first()
         self._server.start()
-        self._thread.start()
+        self.cycle.start()
 
     def stop(self) -> None:
         """Stop the server and the program; return when all threads have ended."""
-        self._stopping.set()
         self._server.stop()
-        if self._thread.ident is not None:
-            self._thread.join()
+        self.cycle.stop()
 
     def __enter__(self) -> Self:
         self.start()
@@ -152,30 +133,12 @@ class Emulator:
         for table in tables:
             table.fill(self._memory, present)
 
-    def _step(self, cycle: int) -> None:
+    def _step(self, time_s: float) -> None:
         with self._server.lock:
             if self._table is None:
-                self._program.step(cycle * self._period_s, self._frame)
+                self._program.step(time_s, self._frame)
             elif not isinstance(self._program, Idle):
                 self._table.load(self._frame, self._memory)
                 before = bytes(self._frame)
-                self._program.step(cycle * self._period_s, self._frame)
+                self._program.step(time_s, self._frame)
                 self._table.store(before, self._frame, self._memory)
-        self._cycles += 1
-
-    def _run(self) -> None:
-        begun_s = time.monotonic()
-        tick = cycle = 0
-        try:
-            while True:
-                elapsed = int((time.monotonic() - begun_s) / self._period_s)
-                missed = max(0, elapsed - tick - 1)
-                tick += missed + 1
-                if self._stopping.wait(begun_s + tick * self._period_s - time.monotonic()):
-                    return
-                if self._server.cpu_state == CPUState.RUN:
-                    self._overruns += missed
-                    cycle += missed + 1
-                    self._step(cycle)
-        except Exception as error:  # noqa: BLE001 - a program's defect is its runner's to report
-            self._failure = error

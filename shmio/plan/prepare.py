@@ -16,7 +16,8 @@ from shmio.config.credentials import read_accounts
 from shmio.config.faults import Faults, meant
 from shmio.config.read import examine
 from shmio.emulators.areas import TableMemory, is_table, place_name
-from shmio.emulators.emulator import Emulator as Emulated
+from shmio.emulators.device import Served
+from shmio.emulators.kinds import KINDS, S7, create
 from shmio.emulators.programs import IDLE
 from shmio.errors import ConfigError, PathError
 from shmio.injection.program import compile_condition
@@ -35,7 +36,8 @@ from shmio.plan.replay import Recordings, replayed
 from shmio.plan.sources import check_sources, note_options
 from shmio.recording.selection import Selection
 
-EMULATOR_KINDS = ("s7",)
+DEVICE_KEYS = ("nodes", "unit", "word_order", "byte_order")
+"""Keys of a source that say how its device names or stores values."""
 NONFINITE = ("REAL", "LREAL")
 """Types whose values can be NaN or infinite."""
 
@@ -48,8 +50,8 @@ class Prepared:
     plan: Plan
     layouts: dict[str, Layout]
     """The layout of each source, by source name."""
-    emulated: dict[str, tuple[Layout, ...]]
-    """All blocks of each emulator, by emulator name."""
+    emulated: dict[str, tuple[Served, ...]]
+    """All blocks and tag tables of each emulator, by emulator name."""
     injections: tuple[str, ...]
     """Lines about the declared injections."""
     notes: tuple[str, ...] = ()
@@ -93,7 +95,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     for index, own in broken.items():
         note_options(index, *own, faults)
     faults.places = places
-    emulated: dict[str, tuple[Layout, ...]] = {}
+    emulated: dict[str, tuple[Served, ...]] = {}
     for index, emulator in enumerate(config.emulator):
         with faults.catching():
             if emulator.layout is not None or not faults:  # else it is not known which sources read it
@@ -200,60 +202,81 @@ def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
         raise ConfigError(f"recorder.trigger.{error}") from None
 
 
-def _check_emulator(index: int, emulator: Emulator, config: Config, files: LayoutFiles) -> tuple[Layout, ...]:
+def _check_emulator(index: int, emulator: Emulator, config: Config, files: LayoutFiles) -> tuple[Served, ...]:
     """Return the blocks and tag tables that an emulator serves, that of its program first."""
     key = f"emulator[{index}]"
-    if emulator.kind not in EMULATOR_KINDS:
+    if emulator.kind not in KINDS:
         raise ConfigError(
-            f"{key}.kind: {emulator.kind!r} is unknown; valid: {', '.join(EMULATOR_KINDS)}"
-            + meant(emulator.kind, EMULATOR_KINDS)
+            f"{key}.kind: {emulator.kind!r} is unknown; valid: {', '.join(KINDS)}{meant(emulator.kind, KINDS)}"
         )
     if emulator.layout is None:
-        layouts = _read_from(key, emulator, config, files)
-    elif emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
+        return _check_served(key, emulator, _read_from(key, emulator, config, files))
+    if emulator.kind != S7 and emulator.dbNumber is not None:
+        raise ConfigError(f"{key}.dbNumber: only an emulator of S7 has numbers of blocks")
+    if emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
         layouts = files.all(key, emulator)
     else:
         layouts = (files.get(key, emulator, emulator.dbNumber),)
-    layouts = tuple(layout.base for layout in layouts)
-    blocks = [layout for layout in layouts if not is_table(layout)]
-    if emulator.dbNumber is None:
+    return _check_served(key, emulator, [Served(layout) for layout in layouts])
+
+
+def _check_served(key: str, emulator: Emulator, served: Sequence[Served]) -> tuple[Served, ...]:
+    """Check that an emulator can serve these layouts; return them."""
+    served = [one._replace(layout=one.layout.base) for one in served]
+    blocks = [one.layout for one in served if not is_table(one.layout)] if emulator.kind == S7 else []
+    if emulator.kind != S7:
+        pass
+    elif emulator.dbNumber is None:
         _check_numbers(key, blocks)
     elif not blocks:
         raise ConfigError(f"{key}.dbNumber: leave it out: each address of a tag table names its block")
     try:
-        Emulated(layouts[0], emulator.program, Address("", 0), db_number=emulator.dbNumber, others=layouts[1:])
+        create(emulator.kind, served, emulator.program, Address("", 0), db_number=emulator.dbNumber)
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
-    return layouts
+    return tuple(served)
 
 
-def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles) -> tuple[Layout, ...]:
+def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles) -> list[Served]:
     """Return the blocks and tag tables of the sources that read an emulator without a layout of its own."""
     for name in ("block", "dbNumber", "type_bytes"):
         if getattr(emulator, name):
             raise ConfigError(f"{key}.{name}: needs a layout beside it")
-    listen = str(Address.parse(emulator.listen))
     blocks: dict[int | None, Layout] = {}
-    tables: dict[bytes, Layout] = {}
+    tables: list[Served] = []
     for index, source in enumerate(config.source):
-        if source.connector != "s7" or peer(source) != listen:
+        if not _reads(source, emulator):
             continue
         number = source.options.get("dbNumber")
-        layout = files.get(f"source[{index}]", source, number)
-        if is_table(layout):
-            tables[layout.hash] = layout
+        layout = files.get(f"source[{index}]", source, number, optimized=emulator.kind != S7)
+        if emulator.kind != S7 or is_table(layout):
+            served = Served(layout, {name: source.options[name] for name in DEVICE_KEYS if name in source.options})
+            if served not in tables:
+                tables.append(served)
             continue
         layout = dataclasses.replace(layout, number=number or layout.number)
         known = blocks.get(layout.number)
         if known is None or known.size < layout.size:
             blocks[layout.number] = layout
-    layouts = *blocks.values(), *tables.values()
-    if not layouts:
-        raise ConfigError(f'{key}.layout: this key is needed, because no source with connector = "s7" reads {listen}')
-    if emulator.program != IDLE and len(layouts) > 1:
-        held = ", ".join(layout.name for layout in layouts)
+    found = [*(Served(layout) for layout in blocks.values()), *tables]
+    if not found:
+        listen = Address.parse(emulator.listen)
+        raise ConfigError(
+            f'{key}.layout: this key is needed, because no source with connector = "{emulator.kind}" reads {listen}'
+        )
+    if emulator.program != IDLE and len(found) > 1:
+        held = ", ".join(one.layout.name for one in found)
         raise ConfigError(f"{key}.layout: this key is needed: program {emulator.program} runs on one of {held}")
-    return layouts
+    return found
+
+
+def _reads(source: Source, emulator: Emulator) -> bool:
+    """Return whether a source reads an emulator: by its protocol, at its address."""
+    listen = Address.parse(emulator.listen)
+    device = peer(source)
+    if "://" in device:
+        device = device.partition("://")[2].partition("/")[0]
+    return source.connector == emulator.kind and device == str(listen)
 
 
 def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
@@ -368,7 +391,7 @@ def _near(pattern: str, layout: Layout) -> str:
     return f"; did you mean {' or '.join(names)}?" if names else ""
 
 
-def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
+def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:
     """Yield warnings about sources whose emulator in this file does not serve what they read."""
     for index, source in enumerate(config.source):
         layout = layouts[source.name]
@@ -377,7 +400,7 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
         if source.connector == "s7" and is_table(layout):
             wanted = [place_name(place) for place in TableMemory(layout).needs]
         for emulator in config.emulator:
-            if not wanted or peer(source) != str(Address.parse(emulator.listen)):
+            if not wanted or emulator.kind != S7 or not _reads(source, emulator):
                 continue
             served = _served(emulator, emulated[emulator.name])
             if missing := [name for name in wanted if name not in served]:
@@ -387,10 +410,10 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
                 )
 
 
-def _served(emulator: Emulator, layouts: Sequence[Layout]) -> dict[str, None]:
+def _served(emulator: Emulator, served: Sequence[Served]) -> dict[str, None]:
     """Return the names of the blocks and areas that an emulator serves, in order."""
     names: dict[str, None] = {}
-    for layout in layouts:
+    for layout in (one.layout for one in served):
         if is_table(layout):
             names |= {place_name(place): None for place in sorted(TableMemory(layout).needs)}
         else:
@@ -410,10 +433,10 @@ def _not_emulated(config: Config) -> Iterator[str]:
             yield f"source[{index}]: it reads {device}, where no [[emulator]] of this file listens: {places}"
 
 
-def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
+def _unread(emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:
     """Yield warnings about initial values that an emulator cannot read."""
-    for name, layouts in emulated.items():
-        for text in (text for layout in layouts for text in initial_value_warnings(layout)):
+    for name, served in emulated.items():
+        for text in (text for one in served for text in initial_value_warnings(one.layout)):
             yield f"emulator {name!r}: {text}"
 
 

@@ -138,7 +138,7 @@ class Plan:
 def make_plan(
     config: Config,
     layouts: Mapping[str, Layout],
-    emulated: Mapping[str, Sequence[Layout]],
+    emulated: Mapping[str, Sequence[tuple[Layout, Mapping[str, Any]]]],
     *,
     config_file: Path,
     mode: str = "live",
@@ -154,7 +154,8 @@ def make_plan(
     Args:
         config: The checked configuration.
         layouts: The layout of each source, by source name.
-        emulated: All blocks of each emulator, by emulator name.
+        emulated: All blocks and tag tables of each emulator, with the keys of the sources that read
+            them, by emulator name.
         config_file: Path of the configuration file.
         mode: ``live``, ``log`` or ``replay``.
         declared: The encoded injections for each source's process, by source name.
@@ -192,8 +193,11 @@ def make_plan(
     )
     sections: list[tuple[str, str, dict[str, Any]]] = []
     for emulator in config.emulator:
-        served = [layout.to_json().decode() for layout in emulated[emulator.name]]
-        sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | {"layouts": served}))
+        more: dict[str, Any] = {"layouts": [], "options": []}
+        for layout, options in emulated[emulator.name]:
+            more["layouts"].append(layout.to_json().decode())
+            more["options"].append(dict(options))
+        sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | more))
     sections += [(source.name, "source", msgspec.to_builtins(source)) for source in config.source]
     if config.grpc and mode != "log":
         place = {"group": config.instance.group, "config_file": str(config_file.resolve())}

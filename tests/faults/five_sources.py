@@ -159,8 +159,8 @@ class Example:
 
         self.peers = [
             Peer("press-plc", "press", limit("press", "timeout")),
-            *([Peer("furnace-server", "furnace", limit("furnace", "timeout"))] if "furnace" in by_name else []),
-            *([Peer("conveyor-device", "conveyor", limit("conveyor", "timeout"))] if "conveyor" in by_name else []),
+            Peer("furnace-server", "furnace", limit("furnace", "timeout")),
+            Peer("conveyor-device", "conveyor", limit("conveyor", "timeout")),
             Peer("broker", "sensors", limit("sensors", "timeout")),
             Peer("sensors", "sensors", limit("sensors", "max_age_ms")),
             Peer("arm", "arm", limit("arm", "max_age")),
@@ -207,7 +207,6 @@ class Example:
     def inflict(self, peer: Peer, fault: str, result: Result) -> None:
         """Inflict one fault, end it, and wait until the source has recovered."""
         self.calm()
-        print(fault, peer.name, flush=True)
         own, pid = self.watchers[peer.source], self._pid(peer)
         begin_ns = time.monotonic_ns()
         kill(pid, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)

@@ -450,7 +450,8 @@ class _Link(threading.Thread):
             raise self._failure
         for one in self.sessions:
             if reason := one.check():
-                raise ConnectorError(reason)
+                self._failure = ConnectorError(reason)  # no goodbye to a server that does not answer
+                raise self._failure
 
     def call(self, work: Callable[[], Coroutine[Any, Any, _Result]], deadline_ns: int | None = None) -> _Result:
         """Run a coroutine in the loop, and wait for its result.

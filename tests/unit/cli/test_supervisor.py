@@ -208,7 +208,7 @@ def test_init_with_an_emulated_controller_is_complete(
     [source], [emulator] = prepared.config.source, prepared.config.emulator
     assert (source.options["dbNumber"], emulator.dbNumber, emulator.program) == (number, number, "idle")
     assert emulator.listen == f"127.0.0.1:{source.options['port']}"
-    assert prepared.emulated["plc"] == (prepared.layouts["cell"],)
+    assert [one.layout for one in prepared.emulated["plc"]] == [prepared.layouts["cell"]]
     assert source.writable == ["**"]
 
 
@@ -226,9 +226,9 @@ def test_an_idle_emulator_plays_all_blocks_of_its_files(example: Edit, capsys: p
     Path("two.db").write_text(block("DB7", "Int") + Path("db201.db").read_text())
     example('layout = "db201.db"\nprogram = "a50"', 'layout = "two.db"')
     assert main(["check"]) == 0
-    assert [layout.number for layout in prepare(Path("supervisor.toml")).emulated["plc"]] == [7, 201]
+    assert [layout.number for layout, _ in prepare(Path("supervisor.toml")).emulated["plc"]] == [7, 201]
     example('layout = "two.db"', 'layout = "two.db"\ndbNumber = 201')
-    assert [layout.number for layout in prepare(Path("supervisor.toml")).emulated["plc"]] == [201]
+    assert [layout.number for layout, _ in prepare(Path("supervisor.toml")).emulated["plc"]] == [201]
     example("dbNumber = 201", 'dbNumber = 201\nprogram = "a50"')
     assert main(["check"]) == 0
     example("dbNumber = 201\n", "")

@@ -115,6 +115,25 @@ def test_outage_is_one_bad_frame_with_the_last_bytes_and_the_loop_recovers(segme
     assert (loop.counters.failures, loop.counters.overruns) == (3, 0)
 
 
+def test_a_loss_is_published_before_the_connection_is_closed(segment: Segment) -> None:
+    """To close it may take time, in which the last values must not be shown as good."""
+    seen = []
+
+    def lost_in_read_3(hook: str, reads: int) -> None:
+        if hook == "read" and reads == 3:
+            raise ConnectorError("cable out")
+
+    class Slow(Device):
+        def close(self) -> None:
+            frame = segment.blocks["cell"].latest()
+            assert frame is not None
+            seen.append((frame.quality, frame.reason))
+            super().close()
+
+    SourceLoop(Slow(lost_in_read_3), segment.writer("cell"), Schedule(0, PERIOD_NS), VirtualClock(6 * PERIOD_NS)).run()
+    assert seen[0] == (Quality.BAD, "cable out")
+
+
 def test_cycle_numbers_do_not_go_back_after_a_restart_within_a_period(segment: Segment) -> None:
     class Punctual(VirtualClock):
         def wait_ns(self, duration_ns: int) -> bool:

@@ -28,7 +28,7 @@ def counter(db201: Layout) -> Iterator[Emulator]:
     with Emulator(db201, "counter", LOOPBACK) as emulator:
         yield emulator
     assert threading.active_count() == before
-    assert emulator.failure is None
+    assert emulator.cycle.failure is None
 
 
 def client_of(emulator: Emulator, size: int = 2180, number: int = 201) -> S7Client:
@@ -64,7 +64,7 @@ def test_program_follows_its_schedule(counter: Emulator) -> None:
         client.connect()
         while (generation := generations(client.read())[-1]) < 50:
             pass
-    assert counter.cycles + counter.overruns >= generation
+    assert counter.cycle.cycles + counter.cycle.overruns >= generation
 
 
 def test_stopping_the_cpu_stops_the_program_and_not_the_server(counter: Emulator) -> None:
@@ -96,8 +96,8 @@ def test_clients_can_write_registers_that_the_program_does_not_drive(db201: Layo
         peer = snap7.Client()
         peer.connect(emulator.address.host, 0, 1, emulator.address.port)
         peer.db_write(201, 1050, bytearray(b"command"))
-        cycles = emulator.cycles
-        while emulator.cycles < cycles + 2:
+        cycles = emulator.cycle.cycles
+        while emulator.cycle.cycles < cycles + 2:
             assert client.read()[1050:1057] == b"command"
         peer.disconnect()
         peer.destroy()
@@ -143,7 +143,7 @@ def test_a_failing_program_is_reported(db201: Layout, monkeypatch: pytest.Monkey
     monkeypatch.setattr("shmio.emulators.programs.PROGRAMS", {"failing": Failing})
     with Emulator(db201, "failing", LOOPBACK) as emulator:
         assert failed.wait(10)
-    assert isinstance(emulator.failure, ZeroDivisionError)
+    assert isinstance(emulator.cycle.failure, ZeroDivisionError)
 
 
 def test_traits_reach_the_client_and_commands_reach_the_program(db201: Layout) -> None:
@@ -158,8 +158,8 @@ def test_traits_reach_the_client_and_commands_reach_the_program(db201: Layout) -
         while not client.read()[1001] & 8:
             pass
         stands = client.read()[2100:]
-        cycles = emulator.cycles
-        while emulator.cycles < cycles + 20:
+        cycles = emulator.cycle.cycles
+        while emulator.cycle.cycles < cycles + 20:
             assert client.read()[2100:] == stands
         assert client.write([Write(1013, 1, b"\0")]) == [""]
         while client.read()[2100:] == stands:

@@ -52,7 +52,7 @@ def prepared(folder: Path, *parts: str) -> Prepared:
 
 
 def served(found: Prepared) -> list[tuple[str, int | None]]:
-    return [(layout.name, layout.number) for layout in found.emulated["plc"]]
+    return [(layout.name, layout.number) for layout, _ in found.emulated["plc"]]
 
 
 def test_an_emulator_without_a_layout_serves_what_its_sources_read(folder: Path) -> None:
@@ -66,7 +66,7 @@ def test_an_emulator_without_a_layout_serves_what_its_sources_read(folder: Path)
         EMULATOR,
     )
     assert served(found) == [("Cell", 7), ("press", None), ("line", None)]
-    assert all(layout.status_offset is None for layout in found.emulated["plc"])
+    assert all(layout.status_offset is None for layout, _ in found.emulated["plc"])
     assert len([text for text in found.plan.warnings if "emulator" in text]) == 1, found.plan.warnings
     assert "it reads 127.0.0.1:1103, where no [[emulator]]" in found.plan.warnings[0]
 

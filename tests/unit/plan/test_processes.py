@@ -17,7 +17,7 @@ from shmio.plan.processes import MAX_PROCESSES, MODES, MODULES, RANKS, Job, make
 from shmio.segment import Segment
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
-PLAYED = {"plc": [LAYOUT]}
+PLAYED: dict[str, list[tuple[Layout, dict[str, object]]]] = {"plc": [(LAYOUT, {})]}
 
 
 def config(folder: Path, sources: int = 1) -> Config:

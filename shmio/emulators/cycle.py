@@ -1,0 +1,70 @@
+"""The cycle of an emulated device's program: an absolute schedule in a thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+
+class Cycle:
+    """Runs a program's step in each period. Start it once.
+
+    The schedule is absolute, so the cycles do not drift; late cycles are skipped and counted.
+    """
+
+    def __init__(
+        self, period_s: float, step: Callable[[float], object], name: str, active: Callable[[], bool] = lambda: True
+    ) -> None:
+        """Prepare the cycle.
+
+        Args:
+            period_s: Time between two cycles, in s.
+            step: Runs one cycle, given the program's time in s.
+            name: Name of the thread.
+            active: Returns whether the device runs its program. While it does not, the program's
+                time stands still.
+
+        """
+        self._period_s, self._step, self._active = period_s, step, active
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._stopping = threading.Event()
+        self.failure: Exception | None = None
+        """Error that ended the program, or None; the emulator's process checks it regularly."""
+        self.cycles = 0
+        """Number of cycles that have run."""
+        self.overruns = 0
+        """Number of cycles skipped because the previous one took too long."""
+
+    def first(self) -> None:
+        """Run the first cycle, before anybody can see the device."""
+        self._step(0)
+        self.cycles += 1
+
+    def start(self) -> None:
+        """Continue in a thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Return when the thread has ended."""
+        self._stopping.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        begun_s = time.monotonic()
+        tick = cycle = 0
+        try:
+            while True:
+                elapsed = int((time.monotonic() - begun_s) / self._period_s)
+                missed = max(0, elapsed - tick - 1)
+                tick += missed + 1
+                if self._stopping.wait(begun_s + tick * self._period_s - time.monotonic()):
+                    return
+                if self._active():
+                    self.overruns += missed
+                    cycle += missed + 1
+                    self._step(cycle * self._period_s)
+                    self.cycles += 1
+        except Exception as error:  # noqa: BLE001 - a program's defect is its runner's to report
+            self.failure = error

@@ -1,0 +1,32 @@
+"""What an emulator serves, and what its process needs of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
+
+from shmio.emulators.cycle import Cycle
+from shmio.layout.model import Layout
+
+
+class Served(NamedTuple):
+    """A layout that an emulator serves."""
+
+    layout: Layout
+    options: Mapping[str, Any] = MappingProxyType({})
+    """The keys of the source that reads it, such as ``unit`` or ``nodes``."""
+
+
+class Device(Protocol):
+    """An emulated device."""
+
+    @property
+    def cycle(self) -> Cycle:
+        """The cycle of the device's program."""
+
+    def start(self) -> None:
+        """Listen, and run the program; raise EndpointError if the address is not available."""
+
+    def stop(self) -> None:
+        """Stop both; return when all threads have ended."""

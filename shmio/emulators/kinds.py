@@ -1,0 +1,47 @@
+"""The kinds of emulators: how each is made, and what it needs."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from typing import Final
+
+from shmio.config.address import Address
+from shmio.emulators import modbus, opcua
+from shmio.emulators.device import Device, Served
+from shmio.emulators.emulator import Emulator
+from shmio.emulators.modbus import ModbusEmulator
+from shmio.emulators.opcua import OpcUaEmulator
+from shmio.errors import ConfigError
+
+S7: Final = "s7"
+KINDS: Final = (S7, "modbus", "opcua")
+"""The kinds; the name of each is that of the connector that reads it."""
+_LIBRARIES: Final = {"modbus": ("pymodbus", modbus.EXTRA), "opcua": ("asyncua", opcua.EXTRA)}
+
+
+def create(
+    kind: str, served: Sequence[Served], program: str, listen: Address, *, db_number: int | None = None
+) -> Device:
+    """Make an emulator; it does nothing until it is started.
+
+    Args:
+        kind: One of ``KINDS``.
+        served: What it serves, at least one; the program runs on the first.
+        program: The program to run.
+        listen: The address to listen on.
+        db_number: Number of the first block, for S7; default: the layout's own.
+
+    Raises:
+        ConfigError: The library is missing, there is no such program, or a layout does not suit it.
+
+    """
+    if kind == S7:
+        layouts = [one.layout for one in served]
+        return Emulator(layouts[0], program, listen, db_number=db_number, others=layouts[1:])
+    library, remedy = _LIBRARIES[kind]
+    if importlib.util.find_spec(library) is None:
+        raise ConfigError(remedy)
+    if kind == "modbus":
+        return ModbusEmulator(served, program, listen)
+    return OpcUaEmulator(served, program, listen)

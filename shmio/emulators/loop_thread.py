@@ -1,0 +1,41 @@
+"""A thread with an event loop, in which an emulator runs a server of an asynchronous library."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
+
+_Result = TypeVar("_Result")
+
+
+class LoopThread:
+    """An event loop in a thread of its own. Start it once."""
+
+    def __init__(self, name: str) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name=name, daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Cancel what still runs in the loop; return when the thread has ended."""
+        if self._thread.is_alive():
+            self.run(_cancel_others)
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+        self._loop.close()
+
+    def run(self, function: Callable[..., Coroutine[Any, Any, _Result]], *arguments: Any) -> _Result:
+        """Run a coroutine function in the loop; return its result. Call it from other threads only."""
+        return asyncio.run_coroutine_threadsafe(function(*arguments), self._loop).result()
+
+
+async def _cancel_others() -> None:
+    others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)

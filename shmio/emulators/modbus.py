@@ -1,0 +1,251 @@
+"""An emulated Modbus device, with pymodbus's server.
+
+pymodbus decodes requests and makes the answers. The tables are ours: those of the library are meant
+for values that nobody else changes.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+from shmio.config.address import Address
+from shmio.emulators.cycle import Cycle
+from shmio.emulators.device import Served
+from shmio.emulators.loop_thread import LoopThread
+from shmio.emulators.programs import Idle, program
+from shmio.errors import ConfigError, EndpointError, ValueRangeError
+from shmio.layout.addresses.modbus import MAX_ADDRESS, Order, Table, WordCodec, parse
+from shmio.layout.addresses.modbus import Address as Place
+from shmio.layout.image import initial_frame
+from shmio.layout.model import Layout, Register
+from shmio.layout.values.codec import codec, flatten, nest
+
+if TYPE_CHECKING:
+    from pymodbus.server import ModbusTcpServer
+
+EXTRA: Final = "kind: the emulator modbus needs another library: pip install 'shmio[modbus]'"
+MAX_CLIENTS: Final = 16
+LEAST: Final = 100
+"""Number of entries that each table of a unit has at least."""
+_ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS = 1, 2
+_READS: Final = {1: Table.COIL, 2: Table.DISCRETE, 3: Table.HOLDING, 4: Table.INPUT}
+_TABLES: Final = _READS | {5: Table.COIL, 15: Table.COIL} | dict.fromkeys((6, 16, 22, 23), Table.HOLDING)
+"""The table of each function, for reading and for writing."""
+
+Words = dict[tuple[int, Table], list[int]]
+"""The entries of each unit's tables: bits as 0 and 1, and words."""
+
+
+class _Place:
+    """A register of a tag table, and its entries in the device."""
+
+    def __init__(self, register: Register, address: Place, unit: int, orders: tuple[Order, Order]) -> None:
+        self.register, self.address = register, address
+        self.where = (unit if address.unit is None else address.unit, address.table)
+        self._words = None
+        if not address.table.of_bits and address.bit is None:
+            self._words = WordCodec(address, register, *orders)
+
+    @property
+    def stop(self) -> int:
+        """Number of the entry behind the last one of the register."""
+        return self.address.number + self.register.count * self.address.width
+
+    def read(self, entries: Sequence[int]) -> Any:
+        """Return the register's value."""
+        address, width = self.address, self.address.width
+        flat: list[Any] = []
+        for at in range(address.number, self.stop, width):
+            if self._words is None:
+                flat.append(bool(entries[at] >> (address.bit or 0) & 1))
+            else:
+                flat.append(self._words.decode(b"".join(word.to_bytes(2, "big") for word in entries[at : at + width])))
+        return nest(flat, self.register.shape) if self.register.dims else flat[0]
+
+    def write(self, entries: list[int], value: Any) -> None:
+        """Store a value of the register; ValueError: the device's type cannot hold it."""
+        address, width, register = self.address, self.address.width, self.register
+        flat = list(flatten(value, register.shape, register.path)) if register.dims else [value]
+        for at, one in zip(range(address.number, self.stop, width), flat, strict=True):
+            if self._words is None:
+                mask = 1 << (address.bit or 0)
+                entries[at] = entries[at] & ~mask | (mask if one else 0)
+            else:
+                data = self._words.encode(one)  # type: ignore[arg-type]
+                entries[at : at + width] = [int.from_bytes(data[i : i + 2], "big") for i in range(0, len(data), 2)]
+
+
+class _TableImage:
+    """The registers of a tag table in the device's tables."""
+
+    def __init__(self, served: Served) -> None:
+        """Find the place of each register.
+
+        Raises:
+            ConfigError: An address is wrong.
+
+        """
+        self.layout = layout = served.layout
+        options = served.options
+        unit, orders = options.get("unit", 1), (options.get("word_order", "big"), options.get("byte_order", "big"))
+        self.places: list[_Place] = []
+        for register in layout.registers:
+            try:
+                self.places.append(_Place(register, parse(register), unit, orders))
+            except ValueError as error:
+                raise ConfigError(f"layout: {register.path}: {error}") from None
+        self._codecs = [codec(register, layout.byte_order) for register in layout.registers]
+
+    def fill(self, words: Words) -> None:
+        """Store the initial values; those that the table gives last."""
+        frame, _ = initial_frame(self.layout)
+        for given in (False, True):
+            self._store(words, frame, [place.register.initial is not None for place in self.places], given)
+
+    def load(self, frame: bytearray, words: Words) -> None:
+        """Put the values of the device into an image."""
+        for place, own in zip(self.places, self._codecs, strict=True):
+            with suppress(ValueRangeError):
+                own.encode_into(place.read(words[place.where]), frame)
+
+    def store(self, before: bytes, frame: bytearray, words: Words) -> None:
+        """Put the values of an image that have changed into the device."""
+        spans = [(one.offset, one.offset + one.size) for one in self.layout.registers]
+        self._store(words, frame, [before[start:stop] != frame[start:stop] for start, stop in spans])
+
+    def _store(self, words: Words, frame: bytearray, chosen: Sequence[bool], wanted: bool = True) -> None:
+        for place, own, one in zip(self.places, self._codecs, chosen, strict=True):
+            if one is wanted:
+                with suppress(ValueError, ValueRangeError):  # such as 0 with a scale that cannot give it
+                    place.write(words[place.where], own.decode(frame))
+
+
+class ModbusEmulator:
+    """Runs a program on a tag table, and serves the table's addresses, and those of others. Start it once."""
+
+    def __init__(self, served: Sequence[Served], program_name: str, listen: Address) -> None:
+        """Prepare the emulator.
+
+        Args:
+            served: The tag tables; the program runs on the first.
+            program_name: The program to run.
+            listen: The address to listen on.
+
+        Raises:
+            ConfigError: There is no such program, the table does not suit it, or an address is wrong.
+
+        """
+        self.address = listen
+        self._images = [_TableImage(one) for one in served]
+        self._layout: Layout = served[0].layout
+        self._program = program(program_name, self._layout)
+        self._words: Words = {}
+        for image in self._images:
+            for place in image.places:
+                entries = self._words.setdefault(place.where, [0] * LEAST)
+                entries += [0] * (place.stop - len(entries))
+        for image in self._images:
+            image.fill(self._words)
+        self._frame = bytearray(self._layout.size)
+        self._lock = threading.Lock()
+        self._loop = LoopThread("modbus-server")
+        self._server: ModbusTcpServer | None = None
+        self.cycle = Cycle(self._program.period_ms / 1000, self._step, f"program-{program_name}")
+
+    def start(self) -> None:
+        """Run the first cycle, listen, and continue in threads.
+
+        Raises:
+            EndpointError: The address is not available.
+
+        """
+        self.cycle.first()
+        self._loop.start()
+        self._loop.run(self._serve)
+        self.cycle.start()
+
+    def stop(self) -> None:
+        """Stop the server and the program; return when all threads have ended."""
+        self.cycle.stop()
+        if self._server is not None:
+            self._loop.run(self._server.shutdown)
+        self._loop.stop()
+
+    async def _serve(self) -> None:
+        from pymodbus.server import ModbusTcpServer  # noqa: PLC0415  it needs the extra
+        from pymodbus.simulator import DataType, SimData, SimDevice  # noqa: PLC0415
+
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # it logs what clients do wrong
+        nothing = SimDevice(0, simdata=[SimData(0, datatype=DataType.REGISTERS)])
+        server: Any = ModbusTcpServer(nothing, address=(self.address.host, self.address.port))
+        server.context = _Store(self._words, self._lock)
+        connected = server.callback_new_connection
+
+        def connect() -> Any:
+            handler = connected()
+            if len(server.active_connections) >= MAX_CLIENTS:
+                server.loop.call_soon(server.loop.call_soon, handler.close)  # as soon as it has its connection
+            return handler
+
+        server.callback_new_connection = connect
+        if not await server.listen():
+            raise EndpointError(f"cannot listen on {self.address}: the address is in use, or not one of this host")
+        self._server = server
+
+    def _step(self, time_s: float) -> None:
+        if isinstance(self._program, Idle):
+            return
+        with self._lock:
+            self._images[0].load(self._frame, self._words)
+            before = bytes(self._frame)
+            self._program.step(time_s, self._frame)
+            self._images[0].store(before, self._frame, self._words)
+
+
+class _Store:
+    """What pymodbus's server asks for the values of its tables; zero-based numbers."""
+
+    def __init__(self, words: Mapping[tuple[int, Table], list[int]], lock: threading.Lock) -> None:
+        self._words, self._lock = words, lock
+        self._units = {unit for unit, _ in words}
+
+    def device_ids(self) -> list[int]:
+        """Return the unit ids."""
+        return sorted(self._units)
+
+    async def async_getValues(  # noqa: N802
+        self, unit: int, function: int, address: int, count: int = 1
+    ) -> list[int] | list[bool] | Any:
+        """Return entries of a function's table, or the code of an exception."""
+        entries = self._entries(unit, function, address, count)
+        if not isinstance(entries, list):
+            return entries
+        with self._lock:
+            found = entries[address : address + count]
+        return [bool(one) for one in found] if _TABLES[function].of_bits else found
+
+    async def async_setValues(self, unit: int, function: int, address: int, values: Sequence[int]) -> Any:  # noqa: N802
+        """Store entries of a function's table; return the code of an exception, or None."""
+        entries = self._entries(unit, function, address, len(values))
+        if not isinstance(entries, list):
+            return entries
+        with self._lock:
+            entries[address : address + len(values)] = [int(one) for one in values]
+        return None
+
+    def _entries(self, unit: int, function: int, address: int, count: int) -> list[int] | Any:
+        from pymodbus.constants import ExcCodes  # noqa: PLC0415  it needs the extra
+        from pymodbus.exceptions import NoSuchIdException  # noqa: PLC0415
+
+        if unit not in self._units:
+            raise NoSuchIdException(f"no unit {unit}")
+        if function not in _TABLES:
+            return ExcCodes(_ILLEGAL_FUNCTION)
+        entries = self._words.get((unit, _TABLES[function]), ())
+        if count < 1 or address < 0 or address + count > min(len(entries), MAX_ADDRESS + 1):
+            return ExcCodes(_ILLEGAL_ADDRESS)
+        return entries

@@ -1,0 +1,257 @@
+"""An emulated OPC UA server, with asyncua's: the nodes that a tag table or the data block of an S7-1500 names."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any, Final
+
+from shmio.config.address import Address
+from shmio.emulators.cycle import Cycle
+from shmio.emulators.device import Served
+from shmio.emulators.loop_thread import LoopThread
+from shmio.emulators.programs import Idle, program
+from shmio.errors import ConfigError, EndpointError, ValueRangeError
+from shmio.layout.addresses import siemens
+from shmio.layout.addresses.opcua import BrowsePath, NodeAddress, parse
+from shmio.layout.image import initial_frame
+from shmio.layout.model import NUMBERS, Register
+from shmio.layout.values import calendar
+from shmio.layout.values.codec import codec, flatten, nest
+
+if TYPE_CHECKING:
+    from asyncua import Server, ua
+
+EXTRA: Final = "kind: the emulator opcua needs another library: pip install 'shmio[opcua]'"
+MAX_CLIENTS: Final = 16
+MAX_NAMESPACE: Final = 100
+"""Highest number of a namespace that the emulator makes."""
+_TYPES: Final[Mapping[str, str]] = {
+    "BOOL": "Boolean", "BYTE": "Byte", "USINT": "Byte", "SINT": "SByte", "WORD": "UInt16", "UINT": "UInt16",
+    "INT": "Int16", "DWORD": "UInt32", "UDINT": "UInt32", "DINT": "Int32", "LWORD": "UInt64", "ULINT": "UInt64",
+    "LINT": "Int64", "REAL": "Float", "LREAL": "Double", "TIME": "Int32", "S5TIME": "UInt32", "LTIME": "Int64",
+    "TIME_OF_DAY": "UInt32", "LTOD": "UInt64", "STRING": "String", "WSTRING": "String", "CHAR": "String",
+    "WCHAR": "String", "DATE": "DateTime", "DATE_AND_TIME": "DateTime", "LDT": "DateTime", "DTL": "DateTime",
+}  # fmt: skip
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_DIGITS: Final = {"DATE_AND_TIME": 3, "LDT": 9, "DTL": 9}
+
+
+class _Variable:
+    """A register, and the values of its node."""
+
+    def __init__(self, register: Register, address: NodeAddress | BrowsePath, byte_order: Any) -> None:
+        """Choose the type of the node; ValueError: there is none for the register."""
+        base = register.element.base
+        if base not in _TYPES:
+            raise ValueError(f"the emulator has no nodes for a {register.type}")
+        self.register, self.address = register, address
+        self._scale = register.scale if base in NUMBERS else None
+        self.kind = "Double" if self._scale is not None else _TYPES[base]
+        self._base = base
+        self.codec = codec(register, byte_order)
+        self.node: Any = None
+
+    def there(self, frame: bytearray) -> Any:
+        """Return the register's value in an image as the node has it."""
+        register, value = self.register, self.codec.decode(frame)
+        if not register.dims:
+            return self._element(value)
+        return nest([self._element(one) for one in flatten(value, register.shape, register.path)], register.shape)
+
+    def here(self, value: Any, frame: bytearray) -> None:
+        """Put a value of the node into an image; ValueRangeError: the register cannot hold it."""
+        register = self.register
+        if not register.dims:
+            self.codec.encode_into(self._back(value), frame)
+            return
+        flat = [self._back(one) for one in flatten(value, register.shape, register.path)]
+        self.codec.encode_into(nest(flat, register.shape), frame)
+
+    def _element(self, value: Any) -> Any:
+        if self._scale is not None:
+            return (float(value) - self._scale[1]) / self._scale[0]
+        if self.kind == "DateTime":
+            ns = calendar.parse_moment(str(value)) or 0
+            return _EPOCH + timedelta(microseconds=ns // 1000)
+        return value
+
+    def _back(self, value: Any) -> Any:
+        if self._scale is not None:
+            number = float(value) * self._scale[0] + self._scale[1]
+            return number if self._base in ("REAL", "LREAL") else round(number)
+        if self.kind == "DateTime":
+            ns = (value.replace(tzinfo=UTC) - _EPOCH) // timedelta(microseconds=1) * 1000
+            if self._base == "DATE":
+                return calendar.format_day(ns // calendar.NS_PER_DAY)
+            return calendar.format_moment(ns, _DIGITS[self._base])
+        return value
+
+
+class OpcUaEmulator:
+    """Runs a program on a layout, and serves its nodes, and those of others. Start it once.
+
+    Clients may write all nodes.
+    """
+
+    def __init__(self, served: Sequence[Served], program_name: str, listen: Address) -> None:
+        """Prepare the emulator.
+
+        Args:
+            served: Tag tables, and data blocks with ``nodes = "siemens"``; the program runs on the
+                first.
+            program_name: The program to run.
+            listen: The address to listen on.
+
+        Raises:
+            ConfigError: There is no such program, the layout does not suit it, or an address is
+                wrong.
+
+        """
+        self.address = listen
+        self._program = program(program_name, served[0].layout)
+        self._tables = [list(_variables(one)) for one in served]
+        self._frames = [bytearray(initial_frame(one.layout)[0]) for one in served]
+        self._loop = LoopThread("opcua-server")
+        self._server: Server | None = None
+        self.cycle = Cycle(self._program.period_ms / 1000, self._step, f"program-{program_name}")
+
+    def start(self) -> None:
+        """Run the first cycle, listen, and continue in threads. It takes some seconds.
+
+        Raises:
+            EndpointError: The address is not available.
+
+        """
+        self._program.step(0, self._frames[0])
+        self._loop.start()
+        self._loop.run(self._serve)
+        self.cycle.start()
+
+    def stop(self) -> None:
+        """Stop the server and the program; return when all threads have ended."""
+        self.cycle.stop()
+        if self._server is not None:
+            self._loop.run(self._server.stop)
+        self._loop.stop()
+
+    async def _serve(self) -> None:
+        from asyncua import Server, ua  # noqa: PLC0415  it needs the extra
+
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs what clients do wrong
+        server = Server()
+        await server.init()
+        host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
+        server.set_endpoint(f"opc.tcp://{host}:{self.address.port}/")
+        server.set_server_name("shmio emulator")
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        server.iserver.max_connections = MAX_CLIENTS
+        makers = _Nodes(server)
+        for variables, frame in zip(self._tables, self._frames, strict=True):
+            for variable in variables:
+                value = ua.Variant(variable.there(frame), getattr(ua.VariantType, variable.kind))
+                variable.node = await makers.variable(variable, value)
+        try:
+            await server.start()
+        except OSError as error:
+            await server.stop()
+            raise EndpointError(f"cannot listen on {self.address}: {error.strerror}") from None
+        self._server = server
+
+    def _step(self, time_s: float) -> None:
+        if not isinstance(self._program, Idle):
+            self._loop.run(self._in_loop, time_s)
+
+    async def _in_loop(self, time_s: float) -> None:
+        """Read the nodes, run a cycle, and write what has changed; clients do nothing meanwhile."""
+        from asyncua import ua  # noqa: PLC0415  it needs the extra
+
+        frame, variables = self._frames[0], self._tables[0]
+        for variable in variables:
+            with suppress(ValueRangeError):
+                variable.here(await variable.node.read_value(), frame)
+        before = bytes(frame)
+        self._program.step(time_s, frame)
+        now = datetime.now(UTC)
+        for variable in variables:
+            span = slice(variable.register.offset, variable.register.offset + variable.register.size)
+            if before[span] != frame[span]:
+                value = ua.Variant(variable.there(frame), getattr(ua.VariantType, variable.kind))
+                await variable.node.write_value(ua.DataValue(value, SourceTimestamp=now, ServerTimestamp=now))
+
+
+class _Nodes:
+    """Makes the nodes of registers, and the objects and namespaces that they need."""
+
+    def __init__(self, server: Server) -> None:
+        self._server = server
+        self._objects: dict[tuple[tuple[int, str], ...], Any] = {}
+        self._known: dict[NodeAddress | BrowsePath, Any] = {}
+
+    async def variable(self, variable: _Variable, value: ua.Variant) -> Any:
+        """Return the node of a register; registers with the same address share it."""
+        from asyncua import ua  # noqa: PLC0415  it needs the extra
+
+        address = variable.address
+        if address in self._known:
+            return self._known[address]
+        if isinstance(address, BrowsePath):
+            *steps, (number, name) = address.steps
+            await self._namespace(number)
+            parent = await self._object(tuple(steps))
+            node = await parent.add_variable(ua.NodeId(NamespaceIndex=number), ua.QualifiedName(name, number), value)
+        else:
+            number = await self._namespace(address.namespace)
+            name = ua.QualifiedName(str(variable.register.path), number)
+            objects = self._server.nodes.objects
+            node = await objects.add_variable(ua.NodeId(address.identifier, number), name, value)
+        await node.set_writable()
+        now = datetime.now(UTC)
+        await node.write_value(ua.DataValue(value, SourceTimestamp=now, ServerTimestamp=now))
+        self._known[address] = node
+        return node
+
+    async def _object(self, steps: tuple[tuple[int, str], ...]) -> Any:
+        """Return the object at a browse path, and make what is missing."""
+        from asyncua import ua  # noqa: PLC0415  it needs the extra
+
+        if not steps:
+            return self._server.nodes.root
+        if steps not in self._objects:
+            parent, (number, name) = await self._object(steps[:-1]), steps[-1]
+            await self._namespace(number)
+            try:
+                found = await parent.get_child([ua.QualifiedName(name, number)])
+            except ua.uaerrors.BadNoMatch:
+                found = await parent.add_object(ua.NodeId(NamespaceIndex=number), ua.QualifiedName(name, number))
+            self._objects[steps] = found
+        return self._objects[steps]
+
+    async def _namespace(self, wanted: int | str) -> int:
+        """Return the number of a namespace, and make it if it is missing."""
+        if isinstance(wanted, str):
+            return int(await self._server.register_namespace(wanted))
+        known = await self._server.get_namespace_array()
+        for number in range(len(known), wanted + 1):
+            await self._server.register_namespace(f"urn:shmio:emulator:{number}")
+        return wanted
+
+
+def _variables(served: Served) -> Iterator[_Variable]:
+    layout = served.layout
+    for register in layout.registers:
+        try:
+            if served.options.get("nodes") == "siemens" and not register.address:
+                address: NodeAddress | BrowsePath = siemens.node_address(layout, register)
+            else:
+                address = parse(register.address)
+            if isinstance(address, NodeAddress) and isinstance(address.namespace, int):
+                if address.namespace == 0:
+                    raise ValueError(f"{register.address!r}: namespace 0 has the nodes of the standard alone")
+                if address.namespace > MAX_NAMESPACE:
+                    raise ValueError(f"{register.address!r}: the emulator has namespaces up to {MAX_NAMESPACE}")
+            yield _Variable(register, address, layout.byte_order)
+        except ValueError as error:
+            raise ConfigError(f"layout: {register.path}: {error}") from None
