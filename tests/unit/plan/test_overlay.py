@@ -48,7 +48,7 @@ def test_each_connector_that_takes_a_block_takes_names_over_it(folder: Path, con
     assert (block.layout.status_offset is None) == (connector != "opcua")
     assert block.attributes.writable == ("door/Speed",)
     assert found.plan.warnings == ()
-    for (layout,) in found.emulated.values():
+    for ((layout, _),) in found.emulated.values():
         assert [register.path for register in layout.registers] == ["Inputs", "Level"]
 
 
