@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "types",
         metavar="SOURCE",
         nargs="*",
-        help="further sources, with the PLC data types, function blocks and constants it uses",
+        help="further sources, with the PLC data types, function blocks and constants it uses, and tag tables over it",
     )
     parser.add_argument("--block", metavar="NAME", help="only this data block; ignore errors in others")
     parser.add_argument(

@@ -83,9 +83,9 @@ class BlockLayout(Layout):
         if not register.dims:
             return bool(image[register.offset] >> (register.bit or 0) & 1)
         *rows, length = register.shape
-        if register.bit:  # a row that begins within a byte, of a tag table over the block
+        if register.partial:  # a row that may begin within a byte, of a tag table over the block
             bits = np.frombuffer(image, np.uint8, register.size, register.offset)
-            return np.unpackbits(bits, bitorder="little")[register.bit : register.bit + length].astype(bool)
+            return np.unpackbits(bits, bitorder="little")[(register.bit or 0) :][:length].astype(bool)
         packed = np.frombuffer(image, np.uint8, register.size, register.offset).reshape(*rows, -(-length // 8))
         return np.unpackbits(packed, axis=-1, count=length, bitorder="little").astype(bool)
 

@@ -132,7 +132,9 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
                 found.count,
                 found.comment,
                 found.initial if found.HasField("initial") else None,
+                partial=bool(found.over) and found.HasField("bit") and len(found.dims) == 1,
                 unit=found.unit,
+                over=found.over,
                 column=Column(found.column),
                 slot=found.slot,
             )

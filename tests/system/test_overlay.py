@@ -14,6 +14,7 @@ from asyncua.sync import Client
 import shmio
 from shmio.client import connect
 from shmio.config import Address
+from shmio.layout.values.frame_codec import FrameCodec
 from shmio.local.attach import Attachment
 from shmio.recording.dump import open_dump
 from shmio.testing.cell import CONFIG, PATIENCE_S, Cell, until
@@ -135,7 +136,9 @@ def test_old_clients_find_names_but_their_structures_are_those_of_the_block(cell
 def test_shmio_v1_reads_subscribes_and_decodes_names(cell: Cell, local: Attachment) -> None:
     with connect(str(cell.grpc)) as remote:
         (layout,) = remote.layouts().values()
-        assert layout.registers[layout.places["door/Speed"]].unit == "mm/s"
+        speed = layout.registers[layout.places["door/Speed"]]
+        assert (speed.unit, speed.over) == ("mm/s", "Outputs/120")
+        assert len(layout.own) == len(layout.registers) - 6
         with remote.subscribe("cell/Robot_800/Ready", "cell/Outputs/140") as updates:
             assert not next(updates)["cell/Robot_800/Ready"]
             assert [one.kind for one in remote.write({"cell/Outputs/140": 0x80})] == ["written"]
@@ -146,6 +149,17 @@ def test_shmio_v1_reads_subscribes_and_decodes_names(cell: Cell, local: Attachme
         image = local.frame("cell").frame.image
         assert layout.value(image, "lamps").tolist() == [False, True, True, False]
         assert layout.value(image, "Robot_800/Ready") is True
+        (row,) = FrameCodec(layout).decode(image)
+        assert row["lamps"].tolist() == [False, True, True, False]
+
+
+def test_shmio_v1_injects_under_the_name(cell: Cell, local: Attachment) -> None:
+    assert local.write({"cell/Outputs/110": 0})[0].done
+    until(lambda: local["cell/door/Closed"] is False, "the written byte")
+    with connect(str(cell.grpc)) as remote, remote.inject("cell/door/Closed") as shadow:
+        shadow.set({"cell/door/Closed": True})
+        until(lambda: local["cell/Outputs/110"] == 1, "the injected bit in its byte")
+    until(lambda: local["cell/door/Closed"] is False, "the controller's value")
 
 
 def test_mqtt_and_opc_ua_have_the_names(cell: Cell, addresses: tuple[Address, Address], local: Attachment) -> None:
@@ -172,3 +186,14 @@ def test_a_recording_has_the_names(cell: Cell, local: Attachment) -> None:
     cell.output("shmio-dump", "cut", str(file), "-o", "part.mem", "--only", "cell/Release")
     with closing(open_dump(cell.folder / "part.mem")) as dump:
         assert [one.path for one in dump.blocks[0].layout.registers] == ["Outputs", "Release"]
+
+
+def test_a_reload_changes_the_names_only(cell: Cell, local: Attachment) -> None:
+    before = cell.processes()
+    (cell.folder / "names.toml").write_text(NAMES.replace('Beat = "Outputs/0"', 'Pulse = "Outputs/0.%X0"'))
+    cell.output("shmio-supervisor", "reload")
+    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
+    found = json.loads(cell.output("shmio", "get", "--json", "Pulse", "Release"))
+    assert sorted(found) == ["cell/Pulse", "cell/Release"]
+    assert cell.run("shmio", "get", "Beat").returncode == 1
+    assert cell.processes()["plc"]["pid"] == before["plc"]["pid"], "the emulator does not know the names"

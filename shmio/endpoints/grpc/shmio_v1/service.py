@@ -170,7 +170,7 @@ def _layout_parts(block: Block) -> Iterator[wire.LayoutPart]:
         for register in layout.registers[first : first + PART_REGISTERS]:
             found = part.registers.add()
             describe(register, found)
-            found.comment = register.comment
+            found.comment, found.over = register.comment, register.over
             if register.initial is not None:
                 found.initial = register.initial
         yield part
