@@ -114,7 +114,7 @@ class Shadow:
         self._names = names
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Give values: to consumers, or, for a shadow over ``/in``, to the device.
+        """Give values to consumers. A shadow over ``/in`` gives them to the device instead.
 
         Args:
             values: Values by path, with or without the source.

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """A copy of a frame, with the layout to decode it. It never changes.
+    """A copy of a frame, with the layout that decodes it. A view never changes.
 
-    ``missed`` is the number of frames lost between the previous frame of the stream and this one.
+    ``missed`` is the number of frames lost between the previous frame of the stream and this frame.
     """
 
     block: Block

@@ -74,9 +74,9 @@ class StepWait(NamedTuple):
 class Coordinator:
     """Moves the time of one instance. Several threads may use it; one program at a time owns time.
 
-    A step begins when the coordinator writes its number to the clock page. Each source that uses
-    the instance clock then publishes a frame for the step, and the step is ``done``. Finally, this
-    process and others deliver the frames of the step to remote programs and recordings.
+    A step begins when the coordinator writes the step's number to the clock page. Each source that
+    uses the instance clock then publishes a frame for the step, and the step is ``done``. Finally,
+    this process and others deliver the frames of the step to remote programs and recordings.
     """
 
     def __init__(
@@ -305,7 +305,7 @@ class Coordinator:
 
     @staticmethod
     def _cycle(block: Block, state: Clock, now_ns: int) -> int:
-        """Return the present cycle of a block in wall time, but at least that of its newest frame.
+        """Return the present cycle of a block in wall time, but at least its newest frame's cycle.
 
         For a block that replays a recording, return 0: the recording's cycles are not steps.
         """
@@ -357,7 +357,7 @@ class Coordinator:
     def _await_delivery(self, number: int) -> Generator[StepWait, None, str]:
         """Wait until other processes have delivered a step.
 
-        Return a text about those that have not.
+        Return a text about the processes that have not; empty: all have.
         """
         clock, begun_ns = self._segment.clock, time.monotonic_ns()
         rung = warned = False
@@ -393,13 +393,14 @@ class Coordinator:
 
 
 class Timekeeper:
-    """Steps or plays an instance's time, which it owns from the first step until it is closed.
+    """Steps or plays an instance's time.
 
-    Use it from one thread. Playing runs in another thread.
+    It owns time from the first step until :meth:`close`. Use it from one thread. It plays in
+    another thread.
     """
 
     def __init__(self, segment: Segment) -> None:
-        """Take the segment, which must be writable."""
+        """Create the timekeeper. ``segment`` must be writable."""
         self._segment = segment
         self._coordinator = Coordinator(segment)
         self._paused = threading.Event()

@@ -127,7 +127,7 @@ class PendingCommand:
 
     @property
     def values(self) -> list[tuple[str, range]]:
-        """Path and items of each value."""
+        """Path of each value, and the range of its items."""
         values, first = [], 0
         for path, group in groupby(self.paths):
             stop = first + len(list(group))

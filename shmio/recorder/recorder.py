@@ -108,7 +108,7 @@ class ConfigFiles:
         return found
 
     def _tell(self, why: str) -> None:
-        """Log each message only once, although the files are read repeatedly."""
+        """Log a message, unless it was logged before: the files are read again and again."""
         if why not in self._told:
             self._told.add(why)
             log.warning("%s", why)

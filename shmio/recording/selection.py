@@ -70,8 +70,9 @@ class Selection:
     """The sources and registers to record.
 
     ``sources`` are the names of the sources; None for all. ``registers`` are patterns as for
-    ``shmio get``; empty for all. A pattern that names an element selects its whole array. One that
-    names a register of a tag table over the block also selects the register that it lies over.
+    ``shmio get``; empty for all. A pattern that names an element selects its whole array. A pattern
+    that names a register of a tag table over the block also selects the block's own register with
+    the same bytes.
     """
 
     def __init__(self, sources: Collection[str] | None = None, registers: Sequence[str] = ()) -> None:

@@ -52,7 +52,8 @@ def layout_files(layout: Layout) -> Iterator[tuple[str, bytes]]:
     """Yield name and data of the attachments with a layout.
 
     If the layout has tag tables over the block, a second attachment is the layout without them.
-    Readers before version 0.2 refuse a layout whose registers overlap, and use this one.
+    Readers before version 0.2 refuse a layout whose registers overlap, and use the second
+    attachment.
     """
     for one in dict.fromkeys((layout.base.hash, layout.hash)):
         data = (layout if one == layout.hash else layout.base).to_json()

@@ -276,7 +276,7 @@ class Block:
         self.section = section
         """Index of the section with the block's layout.
 
-        No two blocks of an instance's run have the same.
+        No other block of this run of the instance has the same index.
         """
         self._load_layout = load_layout
         self.ring = ring

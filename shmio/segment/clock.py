@@ -81,7 +81,10 @@ class DoubleBuffer:
 
 
 class ClockPage:
-    """The clock page of a segment. Several threads may use it; only the owner of time writes it."""
+    """The clock page of a segment. Several threads may use it.
+
+    Only the owner of time may call :meth:`write`.
+    """
 
     def __init__(self, memory: memoryview, offset: int, size: int, head: Header, owned: Callable[[], bool]) -> None:
         """Open the page.

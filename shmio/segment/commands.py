@@ -332,8 +332,9 @@ def decode_writes(
 ) -> dict[str, Value]:
     """Decode the values that writes set in an image, by path.
 
-    If a write covers only a part of a register, the paths are those of its elements or bits. Bits
-    of ``names``, registers over the block, have their paths.
+    If a write covers only a part of a register, the paths are those of its elements or bits.
+    ``names`` are registers of tag tables over the block. If writes set bits of such a register, the
+    result has the register's path and value, and leaves these bits out of all other paths.
     """
     found: dict[str, Value] = {}
     if names:

@@ -90,7 +90,7 @@ PROCESS_SCHEMA: Final = b"""{"type": "object", "properties": {"name": {"type": "
 
 
 class Reason(StrEnum):
-    """The reason of a gap."""
+    """The reason why frames or events are missing."""
 
     OVERTAKEN = "overtaken"
     """The source overwrote the entries before the recorder read them."""
