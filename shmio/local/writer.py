@@ -103,7 +103,7 @@ class CommandSender:
                     f"{source}: the command has {len(record)} bytes, but at most {most} are allowed: write fewer values"
                 )
             if self._pid != os.getpid():
-                raise CommandError("this process was forked from the one that attached: attach again in this process")
+                raise CommandError("this process was forked after it had attached: attach again in this process")
             if not queues.push(self.writer, record):
                 raise CommandError(
                     f"{source}: its command queue is full: the source is not reading commands, or too many are queued"

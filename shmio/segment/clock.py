@@ -101,7 +101,7 @@ class ClockPage:
         """
         slots = head.process_capacity
         if size < page_size(slots) or _word(memory, offset + _SLOTS_AT) != slots:
-            raise ValueError("the clock page is too short, or does not have a place for each process")
+            raise ValueError("the clock page is too short, or has not as many slots as the process table")
         self._memory = memory
         self._offset = offset
         self._state = _cell(memory, offset)

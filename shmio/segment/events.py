@@ -59,7 +59,7 @@ class EventKind(IntEnum):
     If a command lifted it, the event ends the command.
     """
     SHADOWED = 14
-    """A client gave these values to an injection. The previous frame is the first that has them."""
+    """A client gave these values to an injection. The frame before is the first that has them."""
     ACTIVATED = 15
     """A declared injection became active.
 

@@ -113,7 +113,7 @@ class Header:
         if abi != ABI_VERSION:
             raise FormatError(
                 f"{name} has segment ABI {abi} (written by shmio {text(version)}), this shmio {__version__} knows "
-                f"ABI {ABI_VERSION}: use one version for both"
+                f"ABI {ABI_VERSION}: use the same version of shmio as the instance"
             )
         sound = (
             header_size == HEADER_SIZE

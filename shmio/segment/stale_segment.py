@@ -165,7 +165,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
 
 
 def _stop_mapping(shared: SharedObject, instance: str) -> list[str]:
-    """End this user's workers that have mapped the segment writable. Its format is unknown."""
+    """End this user's workers that have mapped a segment of unknown format writable."""
     with _opened(_workers(shared)) as found:
         end(instance, found)
         return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]

@@ -283,7 +283,7 @@ class A50Cell(Model):
     def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  everything depends only on the time
         """Compute axes, inputs and outputs.
 
-        The bytes after those that it computes keep their values.
+        The model leaves all bytes after these as clients wrote them.
         """
         inputs, outputs = self.inputs.commanded, self.outputs.commanded
         hold, opened, closed = _ORDERS.unpack_from(outputs, _OUTPUTS.size)
