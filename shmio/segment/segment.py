@@ -304,7 +304,7 @@ def _read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEnt
             except ValueError as error:
                 raise FormatError(f"{shared.name}: {error}") from None
     raise FormatError(
-        f"{shared.name} has no clock page, because shmio {head.version} made it: use the same version of shmio"
+        f"{shared.name} has no clock page: shmio {head.version}, an older version, made it; use the same version"
     )
 
 
