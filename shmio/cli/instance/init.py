@@ -240,7 +240,8 @@ def _refuse_table(path: Path, file: Path) -> None:
 
 
 def _in_source(file: Path, table: str) -> str:
-    return f'write layout = "{table}" and the connector of your device into a [[source]] of {file}'
+    what = f'write layout = "{table}" and the connector of your device into a [[source]] of {file}'
+    return f'{what} (over a data block: tags = "{table}" beside its layout)'
 
 
 def _refuse_foreign(path: Path) -> None:
