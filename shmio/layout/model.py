@@ -189,7 +189,7 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
     scale: tuple[float, float] | None = None
     deadband: _Deadband = 0.0
     writable: bool = False
-    over: _Address = ""
+    over: Annotated[str, msgspec.Meta(max_length=MAX_PATH)] = ""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -290,7 +290,10 @@ class Layout:
             raise PathError(f"{register.path}: index {list(index)} is outside [{bounds}]")
         if not index:
             return register
-        byte, bit = element_position(register.element, register.shape, flat_index(register.dims, index))
+        flat = flat_index(register.dims, index)
+        byte, bit = element_position(register.element, register.shape, flat)
+        if register.partial:
+            byte, bit = divmod((register.bit or 0) + flat, 8)
         return Register(
             path=f"{register.path}/{'/'.join(map(str, index))}",
             type=register.type,

@@ -32,6 +32,7 @@ Release = { address = "Outputs/100.%X2", writable = true, comment = "releases th
 "door/Speed" = { address = "Outputs/120", type = "REAL", unit = "mm/s", writable = true }
 lamps = { address = "Outputs/130.%X6", type = "ARRAY[1..4] OF BOOL", writable = true }
 "Robot_800/Ready" = "Outputs/140.%X7"
+neighbours = { address = "Outputs/110.%X1", type = "ARRAY[1..4] OF BOOL" }
 Beat = "Outputs/0"
 """
 SOURCE = 'connector = "s7"\nlayout = "db201.db"\ntags = "names.toml"\nwritable = ["Outputs"]\narmed = true\n'
@@ -121,7 +122,7 @@ def test_an_injection_on_in_has_the_name(local: Attachment) -> None:
         assert next(shadow.diverted(PATIENCE_S)).values == {"Outputs/100.%X2": True}
 
 
-def test_old_clients_find_names_but_their_structures_are_those_of_the_block(cell: Cell) -> None:
+def test_old_clients_find_names_but_their_structures_are_those_of_the_block(cell: Cell, local: Attachment) -> None:
     with grpc.insecure_channel(str(cell.grpc)) as channel:
         first, second = SimlogAPIStub(channel), SimlogV2Stub(channel)  # type: ignore[no-untyped-call]
         topic = v1.TopicDescriptor(path="cell/door/Closed")
@@ -131,6 +132,11 @@ def test_old_clients_find_names_but_their_structures_are_those_of_the_block(cell
         assert sorted(robot.value.struct_value) == [f"Axs{axis}_Pos" for axis in range(1, 7)]
         assert sorted(door.value.struct_value) == ["Closed", "Speed"]
         assert release.type == v2.BOOL
+        stream = first.Subscribe(v1.TopicDescriptor(path="cell/Release/in"), timeout=PATIENCE_S)
+        stream.initial_metadata()
+        assert local.write({"cell/Outputs/100": 4})[0].done
+        assert next(stream).value == "true"
+        stream.cancel()
 
 
 def test_shmio_v1_reads_subscribes_and_decodes_names(cell: Cell, local: Attachment) -> None:
@@ -138,7 +144,7 @@ def test_shmio_v1_reads_subscribes_and_decodes_names(cell: Cell, local: Attachme
         (layout,) = remote.layouts().values()
         speed = layout.registers[layout.places["door/Speed"]]
         assert (speed.unit, speed.over) == ("mm/s", "Outputs/120")
-        assert len(layout.own) == len(layout.registers) - 6
+        assert len(layout.own) == len(layout.registers) - 7
         with remote.subscribe("cell/Robot_800/Ready", "cell/Outputs/140") as updates:
             assert not next(updates)["cell/Robot_800/Ready"]
             assert [one.kind for one in remote.write({"cell/Outputs/140": 0x80})] == ["written"]
@@ -159,6 +165,8 @@ def test_shmio_v1_injects_under_the_name(cell: Cell, local: Attachment) -> None:
     with connect(str(cell.grpc)) as remote, remote.inject("cell/door/Closed") as shadow:
         shadow.set({"cell/door/Closed": True})
         until(lambda: local["cell/Outputs/110"] == 1, "the injected bit in its byte")
+        provenances = {one.path: str(one.provenance) for one in remote.get("cell/door/Closed", "cell/neighbours")}
+        assert provenances == {"cell/door/Closed": "injected", "cell/neighbours": "live"}
     until(lambda: local["cell/door/Closed"] is False, "the controller's value")
 
 

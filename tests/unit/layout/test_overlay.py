@@ -18,7 +18,7 @@ from shmio.layout.model import INTEGERS, Layout, Register, element_type
 from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
 from shmio.layout.values.frame_codec import FrameCodec
-from shmio.layout.values.write import apply, bits_of, cover, encode, paths_of
+from shmio.layout.values.write import apply, bits_of, cover, elements, encode, paths_of
 from shmio.model.statuses import GOOD, RegisterStatus, StatusArea
 
 ROOT = Path(__file__).parents[3]
@@ -210,6 +210,18 @@ def test_writes_are_named_by_the_block() -> None:
     assert paths_of(layout, encode(find(layout, "Release"), True)) == ["Outputs/13.%X6"]
 
 
+def test_elements_and_slices_of_a_row_that_begins_within_a_byte() -> None:
+    layout = laid(NAMES)
+    places = [(one.offset, one.bit) for one in elements(layout, find(layout, "lamps"))]
+    assert places == [(1020, bit) for bit in range(2, 8)] + [(1021, bit) for bit in range(3)]
+    part = find(layout, "lamps/6..8")
+    image = bytearray(layout.size)
+    for write in encode(part, [True, False, True]):
+        apply(write, image)
+    assert image[1020:1022] == b"\x80\x02"
+    assert codec(find(layout, "lamps")).decode(image) == [False] * 5 + [True, False, True, False]
+
+
 def test_patterns_cover_the_bits_of_a_row_and_no_others() -> None:
     layout = laid('[registers]\nrow = { address = "Inputs/3.%X2", type = "ARRAY[0..2] OF BOOL" }', SMALL)
     assert cover(layout, ["row"]) == bytes([0, 0, 0, 0b11100]).ljust(layout.size, b"\0")
@@ -256,6 +268,16 @@ _ADDRESS = st.from_regex(
     fullmatch=True,
 )
 _KIND = st.from_regex(r"(ARRAY\[[0-3]\.\.[0-9]\] OF )?(BOOL|BYTE|INT|REAL|LREAL|STRING\[3\]|DTL|DATE)", fullmatch=True)
+
+
+@given(st.text(max_size=200))
+def test_any_table_is_laid_or_refused(text: str) -> None:
+    for body in (text, f"[registers]\n{text}", f"[registers]\na = '{text}'", f"[registers]\n'{text}' = 'Level'"):
+        try:
+            layout = laid(body, SMALL)
+        except LayoutError:
+            continue
+        assert load_layout(layout.to_json()) == layout
 
 
 @given(_ADDRESS, _KIND | st.just(""))

@@ -20,7 +20,7 @@ from shmio.endpoints.grpc.commands.write_subscriptions import PendingImage, ones
 from shmio.endpoints.grpc.encoding import field, number
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values.codec import Buffer, Scalar, scalar_codec
-from shmio.layout.values.write import covering
+from shmio.layout.values.write import bits_of, covering
 from shmio.model.statuses import StatusArea
 from shmio.model.values import Column
 from shmio.segment import Block, Event, Frame
@@ -611,7 +611,16 @@ class Selection:
         starts, stops, masks = self._extents
         covered = np.concatenate(([0], np.cumsum(cover != 0)))
         hit = np.where(masks, cover[starts] & masks, covered[stops] - covered[starts])
+        for place in self._rows:
+            row = self.registers[place]
+            own = np.frombuffer(bits_of(row), np.uint8)
+            hit[place] = (cover[row.offset : row.offset + row.size] & own).any()
         return np.flatnonzero(hit).astype("<u4")
+
+    @cached_property
+    def _rows(self) -> list[int]:
+        """The indices of rows of bits that share bytes with other registers."""
+        return [place for place, register in enumerate(self.registers) if register.partial]
 
     @cached_property
     def _extents(self) -> tuple[Array, ...]:
