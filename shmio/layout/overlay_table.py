@@ -215,6 +215,9 @@ def lay_tables(
             what = f'the sources hold several data blocks ({held}): say by block = "NAME" which one the table lies over'
             report.add(Diagnostic(table.file, 1, 1, what))
             continue
+        if table.block and layouts and table.block.lower() not in {layout.name.lower() for layout in layouts}:
+            what = f"the table lies over {table.block}, but {layouts[0].name} is read: its names are left out"
+            report.add(Diagnostic(table.file, 1, 1, what, "warning"))
         layouts = [
             table.lay(layout, report) if table.block.lower() in ("", layout.name.lower()) else layout
             for layout in layouts

@@ -192,6 +192,10 @@ def test_of_several_blocks_a_table_names_its_own() -> None:
     assert ("a" in first.by_path, "a" in second.by_path) == (False, True)
     sources = [Source("cell.db", blocks), Source("names.toml", b'[registers]\na = "Inputs/1"')]
     assert "a" in compile_sources(sources, blocks=["cell"]).layouts[0].by_path
+    sources[1] = Source("names.toml", b'block = "other"\n' + sources[1].text)
+    left_out = compile_sources(sources, blocks=["cell"])
+    assert "a" not in left_out.layouts[0].by_path
+    assert "the table lies over other, but cell is read: its names are left out" in str(left_out.warnings[0])
 
 
 def test_a_path_that_differs_only_in_case_gets_a_warning() -> None:
