@@ -1,4 +1,4 @@
-"""Listening addresses: ``host:port``, IPv6 in brackets; and UNIX sockets, ``unix:PATH``."""
+"""Addresses to listen on: ``host:port`` with IPv6 in brackets, or UNIX sockets as ``unix:PATH``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shmio.errors import ConfigError
 
 UNIX: Final = "unix:"
 MAX_PATH_BYTES: Final = 107
-"""Maximum length of a UNIX socket's path: sun_path has 108 bytes with the final zero, unix(7)."""
+"""Maximum length of a UNIX socket's path in bytes: sun_path has 108, with the final zero (unix(7))."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,12 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Parse ``127.0.0.1:8089``, ``localhost:0`` or ``[::1]:8089``, or raise ConfigError."""
+        """Parse ``127.0.0.1:8089``, ``localhost:0`` or ``[::1]:8089``.
+
+        Raises:
+            ConfigError: The text is not an address.
+
+        """
         host, colon, port = text.rpartition(":")
         if host.startswith("[") and host.endswith("]"):
             host = host[1:-1]
@@ -38,7 +43,10 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """True if only this host can reach the address; the only such name is ``localhost``."""
+        """True if only this host can reach the address.
+
+        The only name for which this holds is ``localhost``.
+        """
         if self.host == "localhost":
             return True
         try:
@@ -55,7 +63,12 @@ class UnixAddress:
 
     @classmethod
     def parse(cls, text: str) -> UnixAddress:
-        """Parse ``unix:PATH``, or ``unix:///PATH`` as gRPC writes it, or raise ConfigError."""
+        """Parse ``unix:PATH``, or ``unix:///PATH`` as gRPC writes it.
+
+        Raises:
+            ConfigError: The text is not a UNIX socket's address, or the path is too long.
+
+        """
         path = text.removeprefix(UNIX)
         if path.startswith("//"):
             path = path[2:]
@@ -70,10 +83,15 @@ class UnixAddress:
 
     @property
     def loopback(self) -> bool:
-        """Always True: only this host can reach a UNIX socket."""
+        """True, because only this host can reach a UNIX socket."""
         return True
 
 
 def parse_address(text: str) -> Address | UnixAddress:
-    """Parse ``host:port`` or ``unix:PATH``, or raise ConfigError."""
+    """Parse ``host:port`` or ``unix:PATH``.
+
+    Raises:
+        ConfigError: The text is not an address.
+
+    """
     return UnixAddress.parse(text) if text.startswith(UNIX) else Address.parse(text)

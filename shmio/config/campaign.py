@@ -40,7 +40,7 @@ def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
 
     """
     if isinstance(tables.get("injection"), dict):
-        raise ConfigError("injection: write [[injection]], in two brackets: there can be several")
+        raise ConfigError("injection: write [[injection]] with double brackets, because there can be several")
     check_text(tables, "")
     campaign = convert(tables, Campaign)
     check_declarations(campaign.injection)

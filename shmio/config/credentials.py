@@ -1,6 +1,6 @@
 """Credentials: the gRPC endpoint's bearer tokens, and MQTT passwords.
 
-Their files must be accessible to their owner alone. Messages never quote a secret.
+Only the owner of their files may have access to them. Messages never quote a secret.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ MIN_TOKEN_BYTES: Final = 20
 MAX_TOKEN_BYTES: Final = 1024
 MAX_PASSWORDS_BYTES: Final = 1 << 20
 ROUNDS: Final = 101
-"""PBKDF2 rounds, as mosquitto up to 2.0 uses; a password is checked once per connection."""
+"""Number of PBKDF2 rounds, as mosquitto up to 2.0 uses.
+
+A password is checked once per connection.
+"""
 _KEY: Final = "mqtt.password_file"
 _HASH: Final = re.compile(r"\$[0-9a-z-]{1,16}\$")
 """Matches the beginning of a hash of any kind."""
@@ -29,9 +32,10 @@ _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
 class Secret(NamedTuple):
-    """A bearer token's name, roles and SHA-256 digest; the token itself is not kept.
+    """A bearer token's name, roles and SHA-256 digest; the token itself is not stored.
 
-    The digest has no salt, because a token is random, and one round, because checks must be fast.
+    The digest has no salt, because tokens are random. It has only one round, because checks must be
+    fast.
     """
 
     name: str
@@ -40,11 +44,11 @@ class Secret(NamedTuple):
 
 
 def read_tokens(tokens: Sequence[Token], section: str = "grpc.token") -> tuple[Secret, ...]:
-    """Read all tokens.
+    """Read the tokens that the configuration names.
 
     Args:
         tokens: The sections of the tokens.
-        section: Name of these sections, for messages.
+        section: The name of these sections, for messages.
 
     Raises:
         ConfigError: A token is invalid; the message names its key and never quotes the token.
@@ -55,7 +59,9 @@ def read_tokens(tokens: Sequence[Token], section: str = "grpc.token") -> tuple[S
         key = f"{section}[{index}]"
         digest = bytes.fromhex(token.sha256) if token.sha256 is not None else _read_token(key, str(token.token_file))
         if digest in found:
-            raise ConfigError(f"{key}: the same token as that of {found[digest].name!r}; give each one of its own")
+            raise ConfigError(
+                f"{key}: this is the same token as that of {found[digest].name!r}; give each section its own token"
+            )
         found[digest] = Secret(token.name, frozenset(token.roles), digest)
     return tuple(found.values())
 
@@ -71,20 +77,21 @@ def _read_token(key: str, name: str) -> bytes:
     if not MIN_TOKEN_BYTES <= len(text) <= MAX_TOKEN_BYTES or not all(0x21 <= byte <= 0x7E for byte in text):
         raise ConfigError(
             f"{key}: expected one token of {MIN_TOKEN_BYTES} to {MAX_TOKEN_BYTES} letters, digits and signs, and "
-            "nothing else: openssl rand -hex 32 makes one"
+            "nothing else: create one by openssl rand -hex 32"
         )
     return digest(text)
 
 
 def read_password(name: str, key: str = _KEY) -> str:
-    """Return shmio's password at an external broker or server: the file's first line.
+    """Return shmio's password at an external broker or server: the first line of a file.
 
     Args:
         name: Path of the file.
-        key: The key that names it, for messages.
+        key: The configuration key that has this path, for messages.
 
     Raises:
-        ConfigError: The file is unusable or its first line is empty; the message never quotes it.
+        ConfigError: The file cannot be used, or its first line is empty; the message never quotes
+            it.
 
     """
     password = _read_passwords(name, key).split("\n", 1)[0].rstrip("\r")
@@ -97,12 +104,13 @@ def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str
     """Return the password hashes of the accounts of shmio's own broker, by account name.
 
     Args:
-        name: Path of the file. Each line is ``name:password``, or ``name:hash`` as
-            mosquitto_passwd writes it.
+        name: Path of the file. Each line is ``name:password``, or ``name:hash`` as mosquitto_passwd
+            writes it.
         roles: Accounts that must have a line.
 
     Raises:
-        ConfigError: A line is invalid or missing; the message has its number and never quotes it.
+        ConfigError: A line is invalid or missing. The message names its number, and never quotes
+            it.
 
     """
     accounts: dict[str, str] = {}
@@ -116,7 +124,8 @@ def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str
             raise ConfigError(f"{_KEY}: {name}: line {number}: this name is given twice")
         if user != user.strip() or secret != secret.strip():
             raise ConfigError(
-                f"{_KEY}: {name}: line {number}: a blank next to the colon, or at an end, would be a part of it"
+                f"{_KEY}: {name}: line {number}: a blank next to the colon, or at an end, would belong to the name "
+                "or the password: remove it"
             )
         known = _is_hash(secret)
         if not known and _HASH.match(secret):
@@ -166,16 +175,17 @@ def _read_passwords(name: str, key: str = _KEY) -> str:
 
 
 def _read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes:
-    """Return the first ``most_bytes`` bytes of a secret's file.
+    """Return the beginning of a file that contains a secret, at most ``most_bytes`` bytes.
 
     Args:
-        key: Configuration key at the beginning of messages.
+        key: The configuration key at the beginning of messages.
         name: Path of the file.
         most_bytes: Maximum number of bytes to read.
-        instead: What to do if others could have read the secret, for the message.
+        instead: How to replace a secret that others could have read, for the message.
 
     Raises:
-        ConfigError: The file cannot be read, or others may access it; the message never quotes it.
+        ConfigError: The file cannot be read, or others have access to it; the message never quotes
+            it.
 
     """
     try:

@@ -1,4 +1,4 @@
-"""Rules for declared injections that need no layout, whichever file declares them."""
+"""Rules for declared injections that need no layout. They apply to all files with declarations."""
 
 from __future__ import annotations
 
@@ -52,15 +52,20 @@ _OPERANDS: Final = tuple(dict.fromkeys(key for keys in KEYS.values() for key in 
 
 
 def check_declarations(declarations: Sequence[Declaration]) -> None:
-    """Raise ConfigError, beginning with the key, for the first fault found without a layout."""
+    """Check declarations, as far as possible without a layout.
+
+    Raises:
+        ConfigError: The first fault; the message begins with the key.
+
+    """
     for fault in declaration_faults(declarations):
         raise ConfigError(fault)
 
 
 def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
-    """Yield each fault that can be found without a layout, with its key."""
+    """Yield each fault that can be found without a layout; each begins with its key."""
     if len(declarations) > MAX_DECLARATIONS:
-        yield f"injection: {len(declarations)} of them; at most {MAX_DECLARATIONS}"
+        yield f"injection: there are {len(declarations)} injections, but at most {MAX_DECLARATIONS} are allowed"
         return
     seen: dict[str, int] = {}
     for index, declaration in enumerate(declarations):
@@ -72,13 +77,13 @@ def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
 
 
 def contradictions(declaration: Declaration) -> Iterator[str]:
-    """Yield a message about each contradiction within a declaration; it begins with the key."""
+    """Yield a message about each contradiction within a declaration; each begins with the key."""
     operation = declaration.operation
     keys = KEYS[operation]
     given = {key for key in _OPERANDS if getattr(declaration, key) is not None}
     for key in sorted(given - keys.known):
         takers = ", ".join(name for name, other in KEYS.items() if key in other.known)
-        yield f"{key}: operation {operation!r} has no such key; it is for {takers}"
+        yield f"{key}: operation {operation!r} has no such key; the key is for {takers}"
     for key in keys.needed:
         if key not in given:
             yield f"{key}: this key is needed for operation {operation!r}"
@@ -100,15 +105,15 @@ def contradictions(declaration: Declaration) -> Iterator[str]:
 
 
 def _fault(value: Any, depth: int = 0) -> str:
-    """Return why a value cannot be sent or compared, or "" if it can."""
+    """Return why a value cannot be written to a register or compared with one; "" if it can."""
     if isinstance(value, list):
         if depth > MAX_DIMENSIONS:
-            return f"lists within more than {MAX_DIMENSIONS} others"
+            return f"lists are nested in more than {MAX_DIMENSIONS} others"
         return next((fault for item in value if (fault := _fault(item, depth + 1))), "")
     if isinstance(value, bool | str):
         return ""
     if isinstance(value, float) and not math.isfinite(value):
         return f'{value} is not a number; for a REAL write it as text, "NaN" or "Infinity"'
     if isinstance(value, int) and not -(2**63) <= value < 2**64:
-        return "a number of more than 64 bits"
+        return "the number has more than 64 bits"
     return "" if isinstance(value, int | float) else "expected numbers, text, true or false, or lists of them"

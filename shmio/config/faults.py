@@ -1,4 +1,4 @@
-"""Collect the faults of a configuration, up to a limit, as messages with their lines."""
+"""Collects the faults of a configuration, up to a limit, as messages with their lines."""
 
 from __future__ import annotations
 
@@ -33,10 +33,13 @@ MAX_PARTS: Final = 64
 """Maximum number of dotted parts of a key, because the parser's time grows with their square."""
 MAX_LINE: Final = 80
 MAX_HINTED: Final = 100
-"""Longest word, in characters, for which a similar one is suggested."""
+"""Length in characters up to which a similar word is suggested for an unknown one."""
 MAX_SHOWN: Final = 1_000
 MAX_CHARACTERS: Final = 500
-"""Maximum number of characters of a message, which may quote a text as long as the file."""
+"""Maximum number of characters of a message.
+
+A message may quote text that is as long as the file.
+"""
 _TOKEN: Final = re.compile(
     r"""\#[^\n]*|\"\"\"(?:\\.|[^\\])*?(?:\"{3,5}|\Z)|'''.*?(?:'{3,5}|\Z)|"(?:\\.|[^"\\\n])*"?|'[^'\n]*'?"""
     r"""|\[\[|\]\]|[\[\]{}=.,\n]|[^\s"'\#\[\]{}=.,]+""",
@@ -58,7 +61,7 @@ _WORDS: Final = {
     "operation": OperationName,
     "payload": PayloadName,
 }
-"""Keys that take one of a few words, with these words."""
+"""The keys whose value must be one of a few words, with the type that lists these words."""
 _TYPES: Final = {
     "int": "a whole number",
     "float": "a number",
@@ -70,16 +73,16 @@ _TYPES: Final = {
 
 
 def too_long(text: str, most: int = MAX_KEY) -> int:
-    """Return the line of the first key with too many characters or parts, or 0."""
+    """Return the line of the first key with too many characters or parts; 0 if there is none."""
     if all(len(line) <= most and line.count(".") < MAX_PARTS for line in text.split("\n")):
         return 0
     return Lines(text, most).too_long
 
 
 class Lines:
-    """Finds the line of each key by its name in messages, such as ``source[0].host``.
+    """Finds the line of each key by the key's name in messages, such as ``source[0].host``.
 
-    One pass over the text finds all keys.
+    It reads the text once, and finds all keys.
     """
 
     def __init__(self, text: str, most: int = MAX_KEY) -> None:
@@ -87,13 +90,16 @@ class Lines:
         self._lines: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self.double: tuple[str, int, int] | None = None
-        """The first duplicate key with the lines of both occurrences; None if there is none."""
+        """The first key that is given twice, with both lines; None if there is none."""
         self.too_long = 0
-        """Line of the first key that is too long, at which reading ends; 0 if none."""
+        """The line of the first key that is too long; reading ends there. 0 if there is none."""
         self._read(text)
 
     def of(self, key: str) -> int:
-        """Return the line of a key, else of the innermost known table around it, else 0."""
+        """Return the line of a key; if unknown, that of the innermost table around it.
+
+        If unknown, 0.
+        """
         while key:
             if key in self._lines:
                 return self._lines[key]
@@ -156,7 +162,10 @@ class Lines:
         return table
 
     def _resolve(self, parts: list[str], table: str, last: str | None = None) -> str:
-        """Return the full key of these parts; a name of several tables means the last one."""
+        """Return the full key of these parts.
+
+        If several tables have the same name, the last one is meant.
+        """
         key = table
         for part in parts:
             key = f"{key}.{part}" if key else part
@@ -179,7 +188,7 @@ def _bare(token: str) -> str:
 
 
 def explain(error: ValidationError, key: str = "") -> str:
-    """Return msgspec's error as ``key: what is wrong``; ``key`` is that of the converted value."""
+    """Return msgspec's error as ``key: what is wrong``; ``key`` is that of the value to convert."""
     text, _, at = str(error).partition(" - at `$")
     path = f"{key}{at.rstrip('`')}".lstrip(".")
     missing = re.search(r"missing required field `([^`]*)`", text)
@@ -202,7 +211,12 @@ def _types(match: re.Match[str]) -> str:
 
 
 def decode(data: bytes, place: str) -> str:
-    """Return the text of the file named ``place``; raise ConfigError if it is not UTF-8."""
+    """Return the text of the file with the name ``place``.
+
+    Raises:
+        ConfigError: The file is not UTF-8.
+
+    """
     try:
         text = data.decode("utf-8-sig")  # some editors write a byte order mark
     except UnicodeDecodeError as error:
@@ -214,26 +228,32 @@ def decode(data: bytes, place: str) -> str:
 
 
 def near(word: str, names: Iterable[str]) -> list[str]:
-    """Return a list with the most similar name, regardless of case, or an empty list."""
+    """Return a list with the most similar name, regardless of case.
+
+    An empty list if none is similar.
+    """
     folded = {name.lower(): name for name in names}
     found = difflib.get_close_matches(word.lower(), folded, 1) if len(word) <= MAX_HINTED else []
     return [folded[found[0]]] if found else []
 
 
 def hint(word: str, names: Iterable[str], otherwise: str) -> str:
-    """Return the suggestion for an unknown word; ``otherwise`` if no name is similar."""
+    """Return "did you mean …?" for an unknown word; ``otherwise`` if no name is similar."""
     return next((f"did you mean {name}?" for name in near(word, names)), otherwise)
 
 
 def meant(word: str, names: Iterable[str]) -> str:
-    """Return the suggestion to append to a message about an unknown word."""
+    """Return "; did you mean …?" to append to a message about an unknown word.
+
+    "" if no name is similar.
+    """
     return "".join(f"; did you mean {name}?" for name in near(word, names))
 
 
 def explain_toml(error: Exception, text: str) -> str:
-    """Return the parser's message with the line and, for frequent mistakes, the correction."""
+    """Return the TOML parser's message with the line. For frequent mistakes, add the correction."""
     if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() refuses so many digits
-        return "a number in it has too many digits"
+        return "a number has too many digits"
     place = _POSITION.search(str(error))
     if place is None:
         return str(error)
@@ -261,7 +281,7 @@ def _slip(message: str, line: str, column: int) -> str:
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:
-    """Append the name of the source, emulator or injection to a message that has its number."""
+    """Add the name of a source, emulator or injection to a message that has only its number."""
     key = re.match(r"(source|emulator|injection)\[(\d+)\](?!\.name:)", message)
     if key is None:
         return message
@@ -285,7 +305,7 @@ class Faults:
         self._layout: LayoutError | None = None
         self.count = 0
         self.places: Mapping[str, Sequence[int]] = {}
-        """Indices in the file of the sections that are kept, by kind of section."""
+        """By kind of section, the index in the file of each section that is still being checked."""
 
     @cached_property
     def _lines(self) -> Lines:
@@ -296,7 +316,7 @@ class Faults:
 
     @property
     def full(self) -> bool:
-        """True if further faults are only counted, so that callers can skip costly checks."""
+        """True if further faults are only counted. Callers can then skip expensive checks."""
         return self.count >= MAX_SHOWN
 
     def add(self, message: str) -> None:
@@ -315,12 +335,19 @@ class Faults:
             self._note(f"{self._file}{f':{line}' if line else ''}: {text}", line)
 
     def lies_in(self, file: str, table: str, lines: Mapping[str, int]) -> None:
-        """Record that these keys of a table are in another file, named relative to this one."""
+        """Record that these keys of a table come from ``file``, so that faults name this file.
+
+        Args:
+            file: The other file, relative to the folder of the configuration.
+            table: The table that has the keys.
+            lines: The line of each key in ``file``.
+
+        """
         for name, line in lines.items():
             self._elsewhere[f"{table}.{name}"] = f"{self._file.parent / file}:{line}"
 
     def _note(self, message: str, line: float) -> None:
-        """Record a fault for this line of the file."""
+        """Record a fault at this line of the file, unless it is already recorded."""
         if message not in self._found:
             self._found[message] = line
             self.count += 1
@@ -335,7 +362,7 @@ class Faults:
 
     @contextmanager
     def catching(self) -> Iterator[None]:
-        """Add the ConfigError or LayoutError raised in the ``with`` block instead of raising it."""
+        """Collect a ConfigError or LayoutError raised in the ``with`` block, instead of raising it."""
         try:
             yield
         except ConfigError as error:
@@ -346,19 +373,25 @@ class Faults:
                 self._note(line, math.inf)  # of another file: shown after those of this one
 
     def raise_any(self) -> None:
-        """Raise ConfigError with a line for each fault and warning, or the layout's LayoutError."""
+        """Raise the collected faults, if there are any.
+
+        Raises:
+            ConfigError: There are faults; the message has a line for each fault and warning.
+            LayoutError: The only fault is that of a layout.
+
+        """
         if not self.count:
             return
         if self._layout is not None and not self._warnings and [*self._found] == str(self._layout).splitlines():
             raise self._layout
         more = self.count - MAX_SHOWN
         ordered = sorted(self._found, key=self._found.__getitem__)
-        rest = [f"{self._file}: {more} more faults"] if more > 0 else []
+        rest = [f"{self._file}: there are {more} more faults"] if more > 0 else []
         raise ConfigError("\n".join([*ordered, *rest, *self._warnings]))
 
 
 def _shortened(message: str) -> str:
-    """Return a message, with its middle cut out if it is too long."""
+    """Return a message; if it is too long, without its middle."""
     if len(message) <= MAX_CHARACTERS:
         return message
     return f"{message[: MAX_CHARACTERS // 2]} … {message[-MAX_CHARACTERS // 2 :]}"

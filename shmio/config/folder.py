@@ -1,6 +1,6 @@
-"""Check by writing whether a folder is writable.
+"""Checks whether a folder is writable, by writing to it.
 
-Permissions alone do not reveal full and read-only disks.
+Permissions alone do not show whether a disk is full or read-only.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _PROBE: Final = bytes(4096)  # an empty file fits even on a full disk
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _NO_UNNAMED: Final = (errno.EOPNOTSUPP, errno.EISDIR)
 _MEANING: Final = {
-    errno.ENOENT: "its file system takes no files: choose another folder",
+    errno.ENOENT: "its file system accepts no files: choose another folder",
     errno.EROFS: "it is mounted read-only: remount it, or choose another folder",
     errno.ENOSPC: "the disk is full: make room, or choose another folder",
     errno.EDQUOT: "the disk quota is used up: make room, or choose another folder",
@@ -37,10 +37,10 @@ class Obstacle:
 
 
 def unwritable(folder: Path) -> Obstacle | None:
-    """Return why no file can be created in a folder, or None if one can.
+    """Return why no file can be created in a folder; None if one can.
 
-    The folder need not exist yet: then its nearest existing parent is tried. No file is left
-    behind. The call may block on a slow file system.
+    If the folder does not exist yet, its nearest existing parent is checked. No file is left
+    behind. The call may take long on a slow file system.
     """
     try:
         place = next(path for path in (folder, *folder.parents) if path.exists())

@@ -17,7 +17,7 @@ _DIGITS: Final = frozenset("0123456789abcdef")
 
 
 def check_listening(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> None:
-    """Check listening addresses, plain-text access, tokens and roles.
+    """Check addresses to listen on, plain-text access, tokens and roles.
 
     ``catching`` returns a context manager that collects a ConfigError instead of raising it.
     """
@@ -33,7 +33,7 @@ def check_listening(config: Config, catching: Callable[[], AbstractContextManage
 
 
 def resolve(grpc: Grpc, config: Config) -> None:
-    """Make the section's paths absolute."""
+    """Make the paths in the section absolute."""
     for token in grpc.token:
         if token.token_file is not None:
             token.token_file = str(config.path(token.token_file))
@@ -47,14 +47,18 @@ def resolve(grpc: Grpc, config: Config) -> None:
 
 
 def encrypted(grpc: Grpc, address: Listening) -> bool:
-    """Return whether an address of :attr:`Grpc.listening` uses TLS; a UNIX socket needs none."""
+    """Return whether an address uses TLS.
+
+    A UNIX socket never does, because it needs no encryption.
+    """
     return grpc.tls is not None and not address.insecure and not address.listen.startswith(UNIX)
 
 
 def takes_tokens(grpc: Grpc, address: Listening) -> bool:
     """Return whether an address accepts tokens.
 
-    It does if nobody else can read them on the way, or if the configuration allows it explicitly.
+    It does if nobody can read them on the network, or if the configuration allows tokens in plain
+    text.
     """
     return encrypted(grpc, address) or parse_address(address.listen).loopback or address.tokens_in_plain_text
 
@@ -95,7 +99,7 @@ def _check_address(key: str, text: str, parse: Callable[[str], Place], *, safe: 
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from None
     if not address.loopback and not safe:
-        raise ConfigError(f"{key}: {text} can be reached from other hosts in plain text; that needs {remedy}")
+        raise ConfigError(f"{key}: {text} can be reached from other hosts in plain text; this requires {remedy}")
 
 
 def _check_tokens(grpc: Grpc) -> None:
@@ -110,7 +114,9 @@ def _check_tokens(grpc: Grpc) -> None:
     for index, client in enumerate(grpc.client):
         _check_roles(f"grpc.client[{index}]", client.roles)
     if grpc.client and (grpc.tls is None or grpc.tls.client_ca is None):
-        raise ConfigError("grpc.client: clients are known by their certificates: that needs client_ca in [grpc.tls]")
+        raise ConfigError(
+            "grpc.client: clients are identified by their certificates, which requires client_ca in [grpc.tls]"
+        )
 
 
 def _check_roles(key: str, roles: Sequence[str]) -> None:

@@ -24,16 +24,16 @@ OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "f
 BrokerName = Literal["embedded", "mosquitto", "external"]
 PayloadName = Literal["text", "json", "structure", "frames"]
 TypeBytes = Annotated[dict[Text, Annotated[int, Meta(ge=1, le=1 << 20)]], Meta(max_length=1000)]
-"""Sizes in bytes of types whose members are unknown, by type name."""
+"""For types whose members are unknown: the size in bytes by type name."""
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
-"""Priority under SCHED_FIFO, sched(7)."""
+"""Priority under the scheduling policy SCHED_FIFO (sched(7))."""
 
 ROLES = ("read", "write", "inject", "control")
 """The permissions that clients of the gRPC endpoint can have."""
 
 
 class Section(Struct, forbid_unknown_fields=True, kw_only=True):
-    """A table of the file; unknown keys are refused."""
+    """Base class of the file's tables; unknown keys are refused."""
 
 
 class Instance(Section):
@@ -49,9 +49,9 @@ class Instance(Section):
 class Source(Section):
     """``[[source]]``: a producer of registers.
 
-    ``options`` are the connector's own keys. ``texts`` are the keys of the ``properties`` file that
-    no key overrides, as text whatever their type. The connector knows the types, and checks both.
-    Once the file is read, ``layout`` also has the files of ``tags``.
+    ``options`` are the connector's own keys. ``texts`` are the keys from the ``properties`` file
+    that the table does not override; their values are text, whatever their type. The connector
+    knows the types, and checks both.
     """
 
     name: Name
@@ -77,7 +77,7 @@ class Source(Section):
 
     @property
     def stale_ns(self) -> int:
-        """Age at which a frame becomes bad, in ns: as configured, or 5 periods, at least 500 ms."""
+        """Age in ns at which a frame becomes bad: as configured, else 5 periods, at least 500 ms."""
         return round(1_000_000 * (self.stale_ms or max(5 * self.period_ms, 500.0)))
 
 
@@ -97,7 +97,10 @@ class Emulator(Section):
 
 
 class Tls(Section):
-    """``[grpc.tls]``: PEM files; with ``client_ca``, clients must present a certificate of it."""
+    """``[grpc.tls]``: PEM files.
+
+    With ``client_ca``, clients must present a certificate issued by it.
+    """
 
     certificate: Text
     key: Text
@@ -105,7 +108,7 @@ class Tls(Section):
 
 
 class Token(Section):
-    """``[[grpc.token]]``: a bearer token, given by its file or its hash, and its holder's roles."""
+    """``[[grpc.token]]``: a bearer token and its roles. A file or a hash defines the token."""
 
     name: Name
     roles: Texts
@@ -121,12 +124,12 @@ class Client(Section):
 
     @property
     def patterns(self) -> list[str]:
-        """Globs over the certificate's common name and its alternative names."""
+        """Globs that the certificate's common name or one of its alternative names must match."""
         return [self.subject] if isinstance(self.subject, str) else self.subject
 
 
 class Listening(Section):
-    """``[[grpc.address]]``: an address with roles for clients without token and certificate."""
+    """``[[grpc.address]]``: an address, and the roles of clients without token or certificate."""
 
     listen: Text
     roles: Texts = field(default_factory=lambda: ["read"])
@@ -153,7 +156,7 @@ class Grpc(Section):
 
     @property
     def listening(self) -> dict[str, Listening]:
-        """All addresses by key; those of ``listen`` with the roles of unauthenticated clients."""
+        """All addresses by key. Those of ``listen`` have the roles of unauthenticated clients."""
         roles = [] if self.guarded else list(ROLES)
         found = {
             f"grpc.listen[{index}]": Listening(
@@ -168,7 +171,7 @@ class Grpc(Section):
 
 
 class Trigger(Section):
-    """``[recorder.trigger]``: record only around the times when a condition is true."""
+    """``[recorder.trigger]``: records only the time around moments at which a condition is true."""
 
     when: Text
     before_s: Annotated[float, Meta(ge=0, le=3600)] = 10.0
@@ -192,7 +195,7 @@ class Recorder(Section):
 
     @property
     def buffer_bytes(self) -> int:
-        """Maximum number of bytes that wait in memory for a slow or full disk."""
+        """Maximum number of bytes that may wait in memory while the disk is slow or full."""
         return round(self.buffer_mb * 1e6)
 
 
@@ -210,9 +213,10 @@ class Replay(Section):
 
 
 class Declaration(Section, omit_defaults=True):
-    """``[[injection]]``: an injection that the source's process runs; docs/reference/injections.md.
+    """``[[injection]]``: an injection that the process of its source runs.
 
-    ``declaration.py`` has the rules for the keys of each operation.
+    docs/reference/injections.md describes the keys. ``declaration.py`` has the rules for the keys
+    of each operation.
     """
 
     name: Name
@@ -240,9 +244,9 @@ class Declaration(Section, omit_defaults=True):
 class MqttTls(Section):
     """``[mqtt.tls]``: PEM files.
 
-    ``ca`` issues the peer's certificates; without it, an external broker's certificate is checked
-    with the host's authorities. ``certificate`` and ``key`` identify shmio to an external broker,
-    or shmio's own broker to its clients.
+    ``ca`` has the authority that issues the peer's certificates. Without it, the host's authorities
+    check the certificate of an external broker. ``certificate`` and ``key`` identify shmio to an
+    external broker, or shmio's own broker to its clients.
     """
 
     ca: Text | None = None
@@ -251,7 +255,10 @@ class MqttTls(Section):
 
 
 class MqttTopic(Section):
-    """``[[mqtt.topic]]``: how matching registers are published; the first matching rule applies."""
+    """``[[mqtt.topic]]``: how matching registers are published.
+
+    The first rule that matches applies.
+    """
 
     match: Text | Texts
     publish: bool = True
@@ -264,12 +271,15 @@ class MqttTopic(Section):
 
     @property
     def patterns(self) -> list[str]:
-        """Globs over paths that begin with their source."""
+        """Globs for paths that begin with the name of the source."""
         return [self.match] if isinstance(self.match, str) else self.match
 
 
 class Sparkplug(Section):
-    """``[mqtt.sparkplug]``: the instance as a Sparkplug B edge node, by default with its name."""
+    """``[mqtt.sparkplug]``: publishes the instance as a Sparkplug B edge node.
+
+    The node has the instance's name, unless ``node`` gives another.
+    """
 
     group: Text
     node: Text | None = None
@@ -281,15 +291,15 @@ class Sparkplug(Section):
 
     @property
     def patterns(self) -> list[str]:
-        """Globs that select the metrics, over paths that begin with their source."""
+        """Globs that select the metrics, for paths that begin with the name of the source."""
         return [self.match] if isinstance(self.match, str) else self.match
 
 
 class MqttAccount(Section):
     """``[[mqtt.account]]``: the roles of an account of shmio's own broker.
 
-    Without ``name`` it applies to clients without an account. ``publish`` has filters of topics
-    to which the role ``write`` may publish besides commands.
+    Without ``name``, it applies to clients without an account. ``publish`` lists filters of topics
+    on which the role ``write`` may publish, in addition to commands.
     """
 
     roles: Texts
@@ -343,7 +353,7 @@ class Metrics(Section):
 
 
 class Config(Section):
-    """The whole configuration, with the folder that its paths are relative to."""
+    """The whole configuration. Its paths are relative to ``folder``."""
 
     instance: Instance
     source: list[Source] = []

@@ -15,13 +15,18 @@ PORT: Final = 1883
 TLS_PORT: Final = 8883
 MAX_PREFIX: Final = 256
 ROLES: Final = ("read", "write")
-"""Roles of accounts of shmio's own broker: ``read`` subscribes, ``write`` publishes commands."""
+"""Roles of accounts of shmio's own broker: ``read`` may subscribe, ``write`` may publish commands."""
 _ELSEWHERE: Final = ("host", "port", "username")
-"""Keys with the address of an external broker, and shmio's user name there."""
+"""Keys for an external broker: its address, and shmio's user name there."""
 
 
 def check_mqtt(config: Config) -> None:
-    """Check addresses, plain-text access and combinations of keys, or raise ConfigError."""
+    """Check addresses, plain-text access and combinations of keys.
+
+    Raises:
+        ConfigError: A rule is broken.
+
+    """
     mqtt = config.mqtt
     if mqtt is None:
         return
@@ -49,7 +54,7 @@ def own_topics(mqtt: Mqtt, instance: str) -> list[str]:
 
 
 def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
-    """Make the section's paths absolute, and set the default prefix."""
+    """Make the paths in the section absolute, and set the default prefix."""
     mqtt.prefix = mqtt.prefix or f"shmio/{config.instance.name}"
     if mqtt.password_file is not None:
         mqtt.password_file = str(config.path(mqtt.password_file))
@@ -60,7 +65,12 @@ def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
 
 
 def brokers(mqtt: Mqtt) -> list[Address]:
-    """Return the external brokers' addresses in the order of attempts, or raise ConfigError."""
+    """Return the addresses of the external brokers, in the order in which to try them.
+
+    Raises:
+        ConfigError: An address is wrong.
+
+    """
     port = mqtt.port or (PORT if mqtt.tls is None else TLS_PORT)
     hosts = [mqtt.host] if isinstance(mqtt.host, str) else mqtt.host or []
     found = []
@@ -80,14 +90,15 @@ def _has_port(host: str) -> bool:
 
 
 def _is_no_text(part: str) -> bool:
-    """Return whether a text has control or non-characters, which brokers refuse (MQTT 5.0, 1.5.4)."""
+    """Return whether a text contains characters that brokers refuse in topics (MQTT 5.0, 1.5.4)."""
     return any(category(one) == "Cc" or 0xFDD0 <= ord(one) <= 0xFDEF or ord(one) & 0xFFFE == 0xFFFE for one in part)
 
 
 def _check_level(key: str, name: str) -> None:
     if len(name) > MAX_PREFIX or set("/+#").intersection(name) or _is_no_text(name):
         raise ConfigError(
-            f"{key}: {name!r} is a part of a topic: at most {MAX_PREFIX} characters, all of them text, and no / + #"
+            f"{key}: {name!r} is a part of a topic: at most {MAX_PREFIX} characters are allowed, no control "
+            "characters, no / + #"
         )
 
 
@@ -95,8 +106,8 @@ def _check_prefix(prefix: str) -> None:
     bad = prefix.startswith("$") or "" in prefix.split("/") or set("+#").intersection(prefix)
     if bad or len(prefix) > MAX_PREFIX or _is_no_text(prefix):
         raise ConfigError(
-            f"mqtt.prefix: {prefix!r} cannot begin a topic: at most {MAX_PREFIX} characters, all of them text, no + "
-            "and #, no $ at its beginning, no / at its ends and no two of them together; such as shmio/a50"
+            f"mqtt.prefix: {prefix!r} cannot begin a topic: at most {MAX_PREFIX} characters are allowed, no control "
+            "characters, no + and #, no $ at the beginning, no / at the ends and no //; an example is shmio/a50"
         )
 
 
@@ -104,31 +115,35 @@ def _check_topic(key: str, rule: MqttTopic) -> None:
     if rule.payload in ("structure", "frames"):
         for name in ("deadband", "elements"):
             if getattr(rule, name):
-                raise ConfigError(f'{key}.{name}: is for single registers, not for payload = "{rule.payload}"')
+                raise ConfigError(
+                    f'{key}.{name}: this key is only for single registers, not for payload = "{rule.payload}"'
+                )
 
 
 def _check_external(mqtt: Mqtt) -> None:
     if mqtt.account:
-        raise ConfigError("mqtt.account: an external broker has accounts of its own; leave it out")
+        raise ConfigError("mqtt.account: an external broker has accounts of its own; remove this section")
     if mqtt.listen is not None:
-        raise ConfigError('mqtt.listen: an external broker listens by itself; leave it out, or broker = "embedded"')
+        raise ConfigError(
+            'mqtt.listen: an external broker listens by itself; remove this key, or set broker = "embedded"'
+        )
     if mqtt.host is None:
         raise ConfigError(
-            'mqtt.host: broker = "external" needs it: the broker\'s host, or host:port, or a list of them'
+            'mqtt.host: this key is needed with broker = "external": the broker\'s host, host:port, or a list of these'
         )
     for address in brokers(mqtt):
         if not (address.loopback or mqtt.tls or mqtt.insecure):
             _refuse_plain_text("mqtt.host", f"{address} would get plain text over the network")
     if mqtt.password_file is not None and mqtt.username is None:
-        raise ConfigError("mqtt.username: set it, because mqtt.password_file holds the password of this user")
+        raise ConfigError("mqtt.username: this key is needed, because mqtt.password_file contains this user's password")
     if mqtt.tls and (mqtt.tls.certificate is None) != (mqtt.tls.key is None):
-        raise ConfigError("mqtt.tls: certificate and key go together")
+        raise ConfigError("mqtt.tls: give both certificate and key, or neither")
 
 
 def _check_own(mqtt: Mqtt) -> None:
     for key in _ELSEWHERE:
         if getattr(mqtt, key) is not None:
-            raise ConfigError(f'mqtt.{key}: is for broker = "external"; with "{mqtt.broker}" there is listen')
+            raise ConfigError(f'mqtt.{key}: this key is only for broker = "external"; with "{mqtt.broker}", use listen')
     if mqtt.listen is None:
         raise ConfigError(f"mqtt.listen: this key is needed, such as 127.0.0.1:{PORT}")
     try:
@@ -146,7 +161,7 @@ def _check_own(mqtt: Mqtt) -> None:
 
 
 def _refuse_plain_text(key: str, why: str) -> None:
-    raise ConfigError(f"{key}: {why}; that needs a [mqtt.tls] table, or insecure = true beside it")
+    raise ConfigError(f"{key}: {why}; this requires a [mqtt.tls] table, or insecure = true beside it")
 
 
 def _check_accounts(mqtt: Mqtt, instance: str) -> None:
@@ -169,7 +184,7 @@ def _check_accounts(mqtt: Mqtt, instance: str) -> None:
             if role not in ROLES:
                 raise ConfigError(f"{key}.roles[{place}]: no role {role!r}; there are: {', '.join(ROLES)}")
         if account.publish and "write" not in account.roles:
-            raise ConfigError(f"{key}.publish: needs the role write")
+            raise ConfigError(f"{key}.publish: this key needs the role write")
         for place, topics in enumerate(account.publish):
             _check_filter(f"{key}.publish[{place}]", topics, own_topics(mqtt, instance))
 
@@ -179,16 +194,16 @@ def _check_filter(key: str, topics: str, own: Sequence[str]) -> None:
     wild = any(set("+#").intersection(level) and level not in ("+", "#") for level in levels)
     if wild or "#" in levels[:-1] or topics.startswith("$") or len(topics) > MAX_PREFIX or _is_no_text(topics):
         raise ConfigError(
-            f"{key}: {topics!r} is not a topic filter: at most {MAX_PREFIX} characters, no $ at its beginning, + and "
-            "# as a whole level each, and # as the last; such as homeassistant/#"
+            f"{key}: {topics!r} is not a topic filter: at most {MAX_PREFIX} characters are allowed, no $ at the "
+            "beginning, + and # only as whole levels, and # only as the last; an example is homeassistant/#"
         )
     for one in own:
         if _overlap(levels, one.split("/")):
-            raise ConfigError(f"{key}: {topics!r} would let others publish on the instance's own topics, {one}")
+            raise ConfigError(f"{key}: {topics!r} would let others publish on the instance's own topics, such as {one}")
 
 
 def _overlap(one: Sequence[str], other: Sequence[str]) -> bool:
-    """Return whether a topic could match both filters."""
+    """Return whether some topic matches both filters."""
     if ["#"] in (list(one[:1]), list(other[:1])):
         return True
     if not one or not other:

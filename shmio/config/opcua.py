@@ -14,7 +14,12 @@ EXTRA: Final = "opcua: the OPC UA endpoint needs another library: pip install 's
 
 
 def check_opcua(config: Config) -> None:
-    """Check the address, plain-text access and combinations of keys, or raise ConfigError."""
+    """Check the address, plain-text access and combinations of keys.
+
+    Raises:
+        ConfigError: A rule is broken.
+
+    """
     opcua = config.opcua
     if opcua is None:
         return
@@ -26,7 +31,8 @@ def check_opcua(config: Config) -> None:
         raise ConfigError(f"opcua.listen: {error}") from None
     if not address.loopback and opcua.certificate is None and not opcua.insecure:
         raise ConfigError(
-            f"opcua.listen: {opcua.listen} can be reached from other hosts in plain text; that needs certificate and "
+            f"opcua.listen: {opcua.listen} can be reached from other hosts in plain text; this requires certificate "
+            "and "
             "key, or insecure = true beside it"
         )
     if opcua.trusted and opcua.certificate is None:
@@ -34,7 +40,9 @@ def check_opcua(config: Config) -> None:
     if opcua.trusted and opcua.insecure:
         raise ConfigError("opcua.trusted: has no effect with insecure = true, which admits clients without certificate")
     if opcua.client and not opcua.trusted:
-        raise ConfigError("opcua.client: clients are known by their certificates: that needs trusted in [opcua]")
+        raise ConfigError(
+            "opcua.client: clients are identified by their certificates, which requires trusted in [opcua]"
+        )
     if opcua.account and opcua.certificate is None and not address.loopback:
         raise ConfigError("opcua.account: beyond loopback, passwords need an encrypted channel: certificate and key")
     _check_roles(opcua)
@@ -64,7 +72,7 @@ def _check_roles(opcua: OpcUa) -> None:
 
 
 def resolve_opcua(opcua: OpcUa, config: Config) -> None:
-    """Make the section's paths absolute."""
+    """Make the paths in the section absolute."""
     for field in ("certificate", "key"):
         if name := getattr(opcua, field):
             setattr(opcua, field, str(config.path(name)))
@@ -75,6 +83,11 @@ def resolve_opcua(opcua: OpcUa, config: Config) -> None:
 
 
 def check_library() -> None:
-    """Raise ConfigError if the library for OPC UA is not installed."""
+    """Check that the library for OPC UA is installed.
+
+    Raises:
+        ConfigError: It is not.
+
+    """
     if importlib.util.find_spec("asyncua") is None:
         raise ConfigError(EXTRA)

@@ -1,4 +1,4 @@
-"""Read ``supervisor.toml`` into a checked :class:`Config`; messages name file, key and remedy."""
+"""Reads ``supervisor.toml`` into a checked :class:`Config`. Messages name file, key and remedy."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ MAX_FILE_BYTES = 1 << 20
 MAX_PROPERTIES_BYTES = 64 << 10
 MAX_DEPTH = 64
 MAX_SECTIONS = 1_000
-"""Maximum number of sections of one name that are checked."""
+"""Maximum number of sections of the same name that are checked."""
 MAX_SOURCES = 200
 """Maximum number of sources of an instance."""
 
@@ -93,11 +93,11 @@ _Table = TypeVar("_Table", bound=Section)
 
 
 def load(file: Path) -> Config:
-    """Read, check and resolve a ``supervisor.toml``.
+    """Read and check a ``supervisor.toml``, and make its paths absolute.
 
     Raises:
-        ConfigError: The file cannot be read or is not TOML, or it has unknown keys, values of a
-            wrong type, or breaks other rules. The message has a line for each fault.
+        ConfigError: The file cannot be read or is not TOML, it has unknown keys or values of a
+            wrong type, or it breaks other rules. The message has a line for each fault.
 
     """
     found = examine(file)
@@ -111,28 +111,44 @@ class Examined(NamedTuple):
     config: Config
     faults: Faults
     broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
-    """Connector, its keys, and those of the properties file, of each faulty source, by index."""
+    """For each faulty source, by index: its connector, its own keys and those of its properties file.
+    """
 
 
 def examine(file: Path) -> Examined:
-    """Read a ``supervisor.toml`` and collect its faults; raise ConfigError if it is not TOML."""
+    """Read a ``supervisor.toml``, and collect its faults.
+
+    Raises:
+        ConfigError: The file cannot be read or is not TOML.
+
+    """
     text = _read_text(file)
     tables = _parse(file, text)
     return _examine(tables, file.resolve().parent, Faults(file, tables, text))
 
 
 def read_tables(file: Path) -> dict[str, Any]:
-    """Parse a TOML file without checking its keys, or raise ConfigError."""
+    """Parse a TOML file without checking its keys.
+
+    Raises:
+        ConfigError: The file cannot be read or is not TOML.
+
+    """
     return _parse(file, _read_text(file))
 
 
 def _read_text(file: Path) -> str:
-    """Return a file's text; raise ConfigError if it is unreadable, too large, or not UTF-8."""
+    """Return the text of a file.
+
+    Raises:
+        ConfigError: The file cannot be read, is too large, or is not UTF-8.
+
+    """
     try:
         with file.open("rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
     except FileNotFoundError as error:
-        raise ConfigError(f"{file}: {error.strerror}; write one with shmio-supervisor init") from None
+        raise ConfigError(f"{file}: {error.strerror}; create it with shmio-supervisor init") from None
     except IsADirectoryError as error:
         raise ConfigError(f"{file}: {error.strerror}; name the file, such as {file / 'supervisor.toml'}") from None
     except OSError as error:
@@ -143,7 +159,12 @@ def _read_text(file: Path) -> str:
 
 
 def _parse(file: Path, text: str) -> dict[str, Any]:
-    """Parse TOML text; raise ConfigError if it is not TOML, has too long keys, or is too deep."""
+    """Parse TOML text.
+
+    Raises:
+        ConfigError: It is not TOML, a key is too long, or tables are nested too deeply.
+
+    """
     if line := too_long(text):
         raise ConfigError(f"{file}:{line}: a key is longer than {MAX_KEY} characters or {MAX_PARTS} parts")
     try:
@@ -158,7 +179,10 @@ def _parse(file: Path, text: str) -> dict[str, Any]:
 
 
 def _depth(value: Any) -> int:
-    """Return the nesting depth of tables and lists. Without recursion, because it is unlimited."""
+    """Return how deeply tables and lists are nested.
+
+    This works without recursion, because there is no limit to the depth.
+    """
     depth, level = 0, [value]
     while level and depth <= MAX_DEPTH:
         depth += 1
@@ -174,12 +198,13 @@ def _depth(value: Any) -> int:
 def read_properties(file: Path, key: str) -> dict[str, tuple[str, int]]:
     """Read the text and line of each key of a properties file, such as ``plc.ini``.
 
-    It has lines ``key=value``. Blank lines, ``[section]`` lines and lines that begin with ``#``,
-    ``;`` or ``!`` are skipped. ``key`` is that of the section with the file's name, for messages.
+    The file has lines ``key=value``. Blank lines, ``[section]`` lines and lines that begin with
+    ``#``, ``;`` or ``!`` are skipped. ``key`` is the configuration key that names the file, for
+    messages.
 
     Raises:
-        ConfigError: The file cannot be read, is too large or not UTF-8, or has an invalid line or
-            a duplicate key.
+        ConfigError: The file cannot be read, is too large or not UTF-8, or has an invalid line or a
+            duplicate key.
 
     """
     place = f"{key}.properties: {file}"
@@ -258,7 +283,7 @@ def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
 
 
 class _Structure:
-    """Checks each key by itself: that it is known, present where needed, and of the right type."""
+    """Checks each key by itself: whether it is known, present where needed, and of the right type."""
 
     def __init__(
         self, faults: Faults, folder: Path, broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
@@ -268,7 +293,10 @@ class _Structure:
         self._broken = broken
 
     def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
-        """Return the faultless sections and, for repeatable ones, their indices in the file."""
+        """Return the sections without faults.
+
+        For those that may repeat, also their indices in the file.
+        """
         sound: dict[str, Any] = {}
         places: dict[str, list[int]] = {}
         hinted = self._unknown(tables, "", Config)
@@ -317,12 +345,12 @@ class _Structure:
 
     def _no_list(self, key: str, value: Any) -> None:
         if isinstance(value, dict):
-            self._faults.add(f"{key}: write [[{key}]], in two brackets: there can be several")
+            self._faults.add(f"{key}: write [[{key}]] with double brackets, because there can be several")
         else:
             self._faults.add(f"{key}: expected tables [[{key}]]")
 
     def table(self, value: Any, key: str, name: str) -> tuple[bool, dict[str, Any]]:
-        """Return whether a table has no faults, and its keys without faults."""
+        """Return whether a table has no faults, and its faultless keys with their values."""
         if not isinstance(value, dict):
             self._faults.add(f"{key}: expected a table [{name}]")
             return False, {}
@@ -350,7 +378,7 @@ class _Structure:
         return [self.table(item, f"{key}[{index}]", name)[1] for index, item in enumerate(self._first(value, key))]
 
     def _first(self, value: list[Any], key: str) -> list[Any]:
-        """Return the sections to check, at most ``MAX_SECTIONS``."""
+        """Return the sections to check, which are at most ``MAX_SECTIONS``."""
         if len(value) > MAX_SECTIONS:
             self._faults.add(f"{key}: there are {len(value)} sections; only the first {MAX_SECTIONS} are checked")
         return value[:MAX_SECTIONS]
@@ -367,7 +395,7 @@ class _Structure:
         return True
 
     def _unknown(self, table: dict[str, Any], key: str, kind: type[Section]) -> set[str]:
-        """Add a fault for each unknown key; return the similar known keys."""
+        """Add a fault for each unknown key; return the known keys that are probably meant."""
         known = [name for name in kind.__struct_fields__ if name not in _DERIVED]
         hinted: set[str] = set()
         for name in table:
@@ -382,7 +410,12 @@ class _Structure:
 
 
 def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
-    """Convert tables to a type; raise ConfigError with the key that is unknown or wrong."""
+    """Convert tables to a type.
+
+    Raises:
+        ConfigError: A key is unknown or its value is wrong; the message begins with the key.
+
+    """
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
@@ -402,23 +435,27 @@ def _unknown(key: str, table: str, whole: type[Section] = Config) -> str:
 
 
 def unknown_option(index: int, key: str, known: list[str]) -> str:
-    """Return the message for a key of ``source[index]`` that even the connector does not know."""
+    """Return the message for a key of ``source[index]`` that the connector does not know either."""
     names = [*known, *(name for name in Source.__struct_fields__ if name not in _DERIVED)]
     remedy = hint(key, names, f"the connector knows: {', '.join(known)}")
     return f"source[{index}].{key}: unknown key; {remedy}"
 
 
 def check_text(value: Any, key: str) -> None:
-    """Raise ConfigError for control characters, which file names and terminals cannot take.
+    """Check that texts contain no control characters, which file names and terminals cannot take.
 
-    A type with a pattern would be simpler, but makes msgspec 0.22 crash at exit.
+    A type with a pattern would be simpler, but makes msgspec 0.22 crash when Python exits.
+
+    Raises:
+        ConfigError: A text contains one.
+
     """
     for fault in text_faults(value, key):
         raise ConfigError(fault)
 
 
 def text_faults(value: Any, key: str) -> Iterator[str]:
-    """Yield a fault for each text with control characters, at any depth."""
+    """Yield a fault for each text with control characters, however deeply it is nested."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
         path = "; a path with backslashes is written in single quotes" if _SLIPPED.search(value) else ""
         yield f"{key}: must not contain control characters{path}"

@@ -1,4 +1,4 @@
-"""The PEM files of ``[grpc.tls]`` and ``[mqtt.tls]``: reads and tests them, and makes TLS contexts."""
+"""The PEM files of the TLS tables: reads and tests them, and makes TLS contexts."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class TlsFiles(NamedTuple):
 
 
 def read_tls(tls: Tls) -> TlsFiles:
-    """Read and test the gRPC endpoint's PEM files; gRPC would report a bad file as a busy port.
+    """Read and test the gRPC endpoint's PEM files. With a bad file, gRPC would report a busy port.
 
     Raises:
-        ConfigError: A file is unusable; the message names its key.
+        ConfigError: A file cannot be used; the message names its key.
 
     """
     found = TlsFiles(
@@ -38,16 +38,20 @@ def read_tls(tls: Tls) -> TlsFiles:
         _load_pair(context, tls.certificate, tls.key, "grpc.tls.key")
     except ssl.SSLError as error:
         other = error.reason == "KEY_VALUES_MISMATCH"
-        why = "not the key of grpc.tls.certificate" if other else f"no usable PEM private key{_detail(error)}"
+        why = "this is not the key of grpc.tls.certificate" if other else f"it has no usable PEM key{_detail(error)}"
         raise ConfigError(f"grpc.tls.key: {tls.key}: {why}") from None
     return found
 
 
 def client_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
-    """Return the TLS context for an external broker, or raise ConfigError.
+    """Return the TLS context for an external broker.
 
-    ``ca`` must have issued the broker's certificate, or one of the host's authorities if there is
-    no ``ca``. ``where`` begins the names of the keys, in messages.
+    ``ca`` must have issued the broker's certificate. Without ``ca``, one of the host's authorities
+    must have issued it. ``where`` is the beginning of the keys' names, for messages.
+
+    Raises:
+        ConfigError: A file cannot be used.
+
     """
     context = ssl.create_default_context()
     if tls.ca is not None:
@@ -60,10 +64,14 @@ def client_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
 
 
 def server_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
-    """Return the TLS context of shmio's own broker or HTTP server, or raise ConfigError.
+    """Return the TLS context of one of shmio's own servers.
 
-    With ``ca``, clients must present a certificate issued by it. ``where`` begins the names of the
-    keys, in messages.
+    With ``ca``, clients must present a certificate issued by it. ``where`` is the beginning of the
+    keys' names, for messages.
+
+    Raises:
+        ConfigError: A file cannot be used.
+
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     _identify(context, tls, where)
@@ -74,7 +82,7 @@ def server_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
 
 
 class _Socket(ssl.SSLSocket):
-    """A TLS socket that closes itself if its handshake fails, when its creator cannot close it."""
+    """A TLS socket that closes itself if the handshake fails, as its creator cannot do it then."""
 
     def do_handshake(self, block: bool = False) -> None:
         try:
@@ -85,7 +93,7 @@ class _Socket(ssl.SSLSocket):
 
 
 def _identify(context: ssl.SSLContext, tls: MqttTls, where: str) -> None:
-    """Load shmio's certificate and key of ``[mqtt.tls]``, or of a source."""
+    """Load certificate and key, with which shmio identifies itself."""
     certificate, key = str(tls.certificate), str(tls.key)
     for field, name in (("certificate", certificate), ("key", key)):
         try:
@@ -111,22 +119,28 @@ def _load_pair(context: ssl.SSLContext, certificate: str, key: str, where: str) 
     """Load a certificate and its key into a context.
 
     Raises:
-        ssl.SSLError: A file is unusable, or the key belongs to another certificate.
-        ConfigError: The key needs a passphrase; the message begins with ``where``, the key's name.
+        ssl.SSLError: A file cannot be used, or the key belongs to another certificate.
+        ConfigError: The key needs a passphrase. The message begins with ``where``, the name of the
+            configuration key.
 
     """
     try:
         context.load_cert_chain(certificate, key, password=_refuse_to_ask)
     except _EncryptedError:
-        raise ConfigError(f"{where}: {key}: needs a passphrase; use a key without one") from None
+        raise ConfigError(f"{where}: {key}: the key needs a passphrase; use a key without one") from None
 
 
 def _load_authority(context: ssl.SSLContext, name: str, key: str) -> None:
-    """Make a context trust the authorities in a file; a ConfigError begins with ``key``."""
+    """Make a context trust the authorities in a file.
+
+    Raises:
+        ConfigError: The file has no usable certificate. The message begins with ``key``.
+
+    """
     try:
         context.load_verify_locations(name)
     except ssl.SSLError as error:
-        raise ConfigError(f"{key}: {name}: no usable PEM certificate{_detail(error)}") from None
+        raise ConfigError(f"{key}: {name}: it has no usable PEM certificate{_detail(error)}") from None
     except OSError as error:
         raise ConfigError(f"{key}: {name}: {error.strerror}") from None
 
@@ -140,5 +154,8 @@ def _refuse_to_ask() -> str:
 
 
 def _detail(error: ssl.SSLError) -> str:
-    """Return the TLS library's reason in brackets, to append to a message, or ""."""
+    """Return the reason of the TLS library in brackets, to append to a message.
+
+    "" if there is none.
+    """
     return f" ({error.reason})" if error.reason else ""

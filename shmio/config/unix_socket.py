@@ -1,4 +1,4 @@
-"""Create and remove the file of a UNIX socket to listen on."""
+"""Creates and removes the files of UNIX sockets to listen on."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def clear(path: str) -> None:
         Path(path).unlink(missing_ok=True)
     except OSError as error:  # another user's file in a shared folder
         raise EndpointError(
-            f"cannot listen on unix:{path}: what another process has left there cannot be removed ({error.strerror}): "
-            "have its owner do it, or choose another path"
+            f"cannot listen on unix:{path}: the socket of an earlier process cannot be removed ({error.strerror}): "
+            "ask its owner to remove it, or choose another path"
         ) from None
 
 
 def obstacle(path: str) -> str | None:
-    """Return why this user's processes cannot listen at a path, or None if they can."""
+    """Return why processes of this user cannot listen at a path; None if they can."""
     folder = Path(path).parent
     if not folder.is_dir():
-        return f"there is no folder {folder}: mkdir -p it, or choose another path"
+        return f"there is no folder {folder}: create it, or choose another path"
     if (found := unwritable(folder)) and not found.full:
         return found.reason
     try:
@@ -53,7 +53,7 @@ def obstacle(path: str) -> str | None:
 
 
 def listened_on(path: str) -> bool:
-    """Return whether a process listens at a path; True also if this user may not connect."""
+    """Return whether a process listens at a path. This works even if this user may not connect."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)  # the listener's backlog may be full
         try:
@@ -66,20 +66,20 @@ def listened_on(path: str) -> bool:
 
 
 class SocketFile:
-    """The file of a socket that this process creates, and removes when it stops listening."""
+    """The file of a socket: this process creates it, and removes it when it stops listening."""
 
     def __init__(self, path: str, gid: int | None) -> None:
-        """Set the path. Only this user, and members of the group ``gid`` if given, may connect."""
+        """Set the path. Only this user may connect, and the members of the group ``gid`` if it is given."""
         self._path = path
         self._gid = gid
         self._inode = 0
 
     @contextmanager
     def binding(self) -> Iterator[str]:
-        """Yield a temporary path to bind the socket to, then move the socket to its own path.
+        """Yield a temporary path to which to bind the socket, then move the socket to its own path.
 
         Other users cannot enter the temporary folder, so nobody can connect before the socket has
-        its mode. (The umask would not do: all threads of the process share it.)
+        its mode. (Setting the umask is no solution, because all threads of the process share it.)
 
         Raises:
             EndpointError: The socket cannot be created, or a file with its path exists.

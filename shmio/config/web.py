@@ -13,7 +13,12 @@ EXTRA: Final = "metrics: the HTTP endpoint needs other libraries: pip install 's
 
 
 def check_metrics(config: Config) -> None:
-    """Check address, plain-text access and patterns, or raise ConfigError."""
+    """Check the address, plain-text access and patterns.
+
+    Raises:
+        ConfigError: A rule is broken.
+
+    """
     metrics = config.metrics
     if metrics is None:
         return
@@ -25,19 +30,25 @@ def check_metrics(config: Config) -> None:
         raise ConfigError(f"metrics.listen: {error}") from None
     if not address.loopback and metrics.certificate is None and not metrics.insecure:
         raise ConfigError(
-            f"metrics.listen: {metrics.listen} can be reached from other hosts in plain text; that needs certificate "
+            f"metrics.listen: {metrics.listen} can be reached from other hosts in plain text; this requires "
+            "certificate "
             "and key, or insecure = true beside it"
         )
 
 
 def resolve_metrics(metrics: Metrics, config: Config) -> None:
-    """Make the section's paths absolute."""
+    """Make the paths in the section absolute."""
     for field in ("certificate", "key"):
         if name := getattr(metrics, field):
             setattr(metrics, field, str(config.path(name)))
 
 
 def check_library() -> None:
-    """Raise ConfigError if the libraries of the HTTP endpoint are not installed."""
+    """Check that the libraries of the HTTP endpoint are installed.
+
+    Raises:
+        ConfigError: One of them is not.
+
+    """
     if any(importlib.util.find_spec(name) is None for name in ("uvicorn", "starlette", "prometheus_client")):
         raise ConfigError(EXTRA)

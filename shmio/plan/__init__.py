@@ -1,1 +1,1 @@
-"""Plan an instance: turn a checked configuration into the processes to start."""
+"""Plans an instance: turns a checked configuration into the processes to start."""

@@ -1,4 +1,4 @@
-"""Check what a configuration needs of the host, and what other users of the host may do."""
+"""Checks what a configuration needs from the host, and what it allows other users of the host."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MAX_NAMES: Final = 3
 
 
 def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> list[str]:
-    """Check group, priorities, folders, TLS files and tokens, and return warnings. Create nothing.
+    """Check group, priorities, folders, TLS files and tokens; return warnings. Nothing is created.
 
     ``catching`` returns a context manager that collects a ConfigError instead of raising it.
     """
@@ -95,7 +95,7 @@ def _check_opcua(opcua: OpcUa) -> Iterator[str]:
     if identity is not None and application_uri(identity[0]) is None:
         yield (
             f"opcua.certificate: {opcua.certificate}: it has no application URI (a URI among its subject alternative "
-            "names), without which many clients refuse it"
+            "names); many clients refuse such a certificate"
         )
 
 
@@ -114,7 +114,9 @@ def _check_group(name: str | None) -> None:
     except KeyError:
         raise ConfigError(f"instance.group: this host has no group {name!r}") from None
     if os.geteuid() != 0 and gid not in (os.getegid(), *os.getgroups()):
-        raise ConfigError(f"instance.group: this user is not in group {name!r}, and so cannot give it the segment")
+        raise ConfigError(
+            f"instance.group: this user is not in group {name!r}, and so cannot give that group access to the segment"
+        )
 
 
 def _check_priority(key: str, priority: int | None) -> None:
@@ -126,7 +128,12 @@ def _check_priority(key: str, priority: int | None) -> None:
 
 
 def _check_folder(key: str, folder: Path) -> list[str]:
-    """Raise ConfigError if a folder cannot be written; if its disk is full, return a warning."""
+    """Check that a folder can be written; if its disk is full, return a warning.
+
+    Raises:
+        ConfigError: The folder cannot be written for another reason.
+
+    """
     found = unwritable(folder)
     if found is None:
         return []
@@ -136,7 +143,10 @@ def _check_folder(key: str, folder: Path) -> list[str]:
 
 
 def exposure(config: Config) -> str | None:
-    """Return a line about what other users of this host may do without authentication, or None."""
+    """Return a line that says what other users of this host may do without logging in.
+
+    None if nothing.
+    """
     ways = [*_open_grpc(config), *_open_mqtt(config), *_open_opcua(config)]
     users = other_users() if ways else []
     if not users:
@@ -150,9 +160,9 @@ def exposure(config: Config) -> str | None:
 
 
 def other_users() -> list[str]:
-    """Return the names of other users who can log in, without root.
+    """Return the names of other users who can log in. The user root is not included.
 
-    Users that a directory service does not list are missing.
+    Users that are only known to a directory service are missing.
     """
     return [user.pw_name for user in pwd.getpwall() if _may_log_in(user) and user.pw_uid not in (0, os.geteuid())]
 
@@ -162,7 +172,7 @@ def _may_log_in(user: pwd.struct_passwd) -> bool:
 
 
 def _open_grpc(config: Config) -> Iterator[str]:
-    """Yield a text for what clients without token and certificate may do by gRPC."""
+    """Yield texts that say what clients without token and certificate may do by gRPC."""
     grpc = config.grpc
     if grpc is None:
         return
@@ -177,7 +187,7 @@ def _open_grpc(config: Config) -> Iterator[str]:
 
 
 def _open_mqtt(config: Config) -> Iterator[str]:
-    """Yield a text for what clients without account may do at shmio's own broker."""
+    """Yield texts that say what clients without an account may do at shmio's own broker."""
     mqtt = config.mqtt
     if mqtt is None or not mqtt.listen:
         return
@@ -190,7 +200,7 @@ def _open_mqtt(config: Config) -> Iterator[str]:
 
 
 def _open_opcua(config: Config) -> Iterator[str]:
-    """Yield a text for what clients without account and certificate may do by OPC UA."""
+    """Yield texts that say what clients without account and certificate may do by OPC UA."""
     opcua = config.opcua
     if opcua is None or opcua.trusted:
         return

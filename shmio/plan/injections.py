@@ -1,4 +1,4 @@
-"""Check declared injections against registers, types, conditions and their source's limits."""
+"""Checks the configured injections against registers, types, conditions and the source's limits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shmio.segment.standing_injections import StandingInjection, declared_docume
 
 
 def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
-    """Return the declared injections, encoded for each source's process, and a line about each.
+    """Return the encoded injections for each source's process, and a line about each injection.
 
     Raises:
         ConfigError: An injection is invalid; the message begins with the full key.
@@ -34,7 +34,7 @@ def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dic
     for index, declaration in enumerate(config.injection):
         try:
             if not config.source:
-                raise ConfigError("target: there is no [[source]]")
+                raise ConfigError("target: the configuration has no [[source]]")
             program = compile_program(declaration, layouts, periods_ns)
             source = next(source for source in config.source if source.name == program.source)
             if program.direction == "in":
@@ -51,7 +51,7 @@ def _check_in(program: Program, source: Source, layout: Layout) -> None:
     connector = registry.load(source.connector)
     device = issubclass(connector, Connector) and connector.provenance is Provenance.LIVE
     if issubclass(connector, Connector) and not connector.can_write:
-        raise ConfigError(f"target: {source.name}/…/in: its connector cannot write")
+        raise ConfigError(f"target: {source.name}/…/in: the source's connector cannot write")
     if device and not source.armed:
         raise ConfigError(f"target: an injection toward a device needs `armed = true` in source {source.name!r}")
     writable = np.frombuffer(cover(layout, source.writable), np.uint8)
@@ -70,11 +70,11 @@ def _document(source: str, programs: list[Program]) -> bytes:
         encode([msgspec.json.encode(_standing(program)) for program in programs], GROWTH * len(programs))
         return declared_document(declarations)
     except ValueError as error:
-        raise ConfigError(f"injection: source {source!r} has {len(programs)}: {error}") from None
+        raise ConfigError(f"injection: source {source!r} has {len(programs)} injections: {error}") from None
 
 
 def _standing(program: Program) -> StandingInjection:
-    """Return a declared injection as the record that its source's process publishes."""
+    """Return a declared injection in the form in which its source's process publishes it."""
     declaration = program.declaration
     return StandingInjection(
         2**64 - 1, program.direction, declaration.priority, True, declaration.name, NO_WRITER, 0,

@@ -1,4 +1,4 @@
-"""Compile the data-block sources that a configuration names, and choose a block from each."""
+"""Compiles the layout files that a configuration names, and chooses a data block from each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _QUOTED = re.compile(r"'[^']*'")
 
 
 class LayoutFiles:
-    """A cache that reads each set of files once and compiles each of their data blocks once."""
+    """A cache that reads each set of files once, and compiles each of their data blocks once."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -31,9 +31,9 @@ class LayoutFiles:
     def get(self, key: str, section: Source | Emulator, number: int | None, *, optimized: bool = False) -> Layout:
         """Return the layout of a section's data block.
 
-        If the files declare several blocks, ``block`` or ``number`` chooses one, and errors in the
-        other blocks are ignored. ``optimized`` says that the section can use a block with optimized
-        access: then there is no warning about it.
+        If the files declare several blocks, the key ``block`` or ``number`` chooses one. Errors in
+        the other blocks are then ignored. With ``optimized``, the section can use a block with
+        optimized access, so that there is no warning about this.
 
         Raises:
             ConfigError: A file or block is missing, or no block is chosen.
@@ -62,7 +62,9 @@ class LayoutFiles:
 
     def _program(self, key: str, section: Source | Emulator) -> tuple[tuple[Path, ...], compiler.Program]:
         if section.layout is None:
-            raise ConfigError(f"{key}.layout: this key is needed: the data block's source (.db), and its UDTs")
+            raise ConfigError(
+                f"{key}.layout: this key is needed: name the data block's source file (.db), and the files of its UDTs"
+            )
         names = [section.layout] if isinstance(section.layout, str) else section.layout
         paths = tuple(self._config.path(name) for name in names)
         if paths not in self._programs:
@@ -79,7 +81,7 @@ class LayoutFiles:
         *,
         optimized: bool = False,
     ) -> tuple[Layout, ...]:
-        """Compile one block, or all blocks."""
+        """Compile one block, or all blocks if ``block`` is None."""
         sizes = section.type_bytes
         which = paths, block and block.lower(), tuple(sorted(sizes.items()))
         if which not in self._compiled:
@@ -111,12 +113,14 @@ def _choose(
     if len(found) != 1:
         if number is not None:
             raise ConfigError(f"{key}.dbNumber: no data block has the number {number} ({held}); choose one by block")
-        raise ConfigError(f"{key}.layout: it holds several data blocks ({held}); choose one by block or dbNumber")
+        raise ConfigError(
+            f"{key}.layout: the files contain several data blocks ({held}); choose one by block or dbNumber"
+        )
     return found[0]
 
 
 def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
-    """Read files that may use each other's types.
+    """Read files, which may use the types of each other.
 
     Raises:
         ConfigError: A file cannot be read; the message begins with ``key``.
@@ -127,7 +131,7 @@ def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
 
 
 def _read(path: Path, key: str) -> compiler.Source:
-    """Read a source, a few bytes more than allowed at most: the compiler refuses larger files."""
+    """Read a file. Of a file that is too large, read just enough that the compiler refuses it."""
     try:
         with open(path, "rb", opener=_open_at_once) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -138,12 +142,15 @@ def _read(path: Path, key: str) -> compiler.Source:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Open a file; if it is a FIFO, do not wait for a writer."""
+    """Open a file. If it is a FIFO, do not wait for a process that writes to it."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
 def summarize(warnings: Iterable[Diagnostic]) -> list[str]:
-    """Return a line for each warning; merge those of a file that differ only in the quoted name."""
+    """Return a line for each warning.
+
+    Warnings of a file that differ only in a quoted name share a line.
+    """
     lines: list[str] = []
     alike: dict[tuple[str, str], int] = {}
     for warning in warnings:

@@ -1,4 +1,4 @@
-"""What the sources of a checked configuration ask of their devices, and which registers may be written."""
+"""How much the sources of a checked configuration request from devices, and what may be written."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from shmio.layout.values.write import bits_of, cover
 
 
 def source_load(source: Source, layout: Layout) -> Load | None:
-    """Return what a source asks of its device in a cycle; None if it has no device, or its connector does not say.
+    """Return what a source requests from its device in a cycle.
+
+    None if the source has no device, or its connector does not report it.
 
     Args:
         source: A source that was checked.
-        layout: The layout of its block.
+        layout: The layout of the source's block.
 
     """
     connector = registry.load(source.connector)
@@ -29,7 +31,7 @@ def source_load(source: Source, layout: Layout) -> Load | None:
 
 
 def writable_registers(source: Source, layout: Layout) -> int:
-    """Return how many registers of a checked source commands may write, at least in part."""
+    """Return how many registers of a checked source can be written by commands, at least in part."""
     connector = registry.load(source.connector)
     if not source.writable or (issubclass(connector, Connector) and not connector.for_layout(layout).can_write):
         return 0

@@ -1,4 +1,4 @@
-"""Check before the start that listening addresses are local and free."""
+"""Checks before the start that the addresses to listen on belong to this host and are free."""
 
 from __future__ import annotations
 
@@ -25,9 +25,13 @@ _LISTEN: Final = "0A"
 
 
 def check_listening(config: Config) -> None:
-    """Raise ConfigError if a host name cannot be resolved or two addresses share a port.
+    """Check that host names can be resolved, and that no two addresses share a port.
 
-    Port 0 is any free port.
+    Port 0, which stands for any free port, is never shared.
+
+    Raises:
+        ConfigError: One of these conditions is not met.
+
     """
     listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
     if config.grpc:
@@ -42,7 +46,7 @@ def check_listening(config: Config) -> None:
         address = parse_address(text)
         if isinstance(address, UnixAddress):
             if address in sockets:
-                raise ConfigError(f"{key}: {text} is the socket of {sockets[address]} already; choose another")
+                raise ConfigError(f"{key}: {text} is already the socket of {sockets[address]}; choose another path")
             sockets[address] = key
             continue
         try:
@@ -51,20 +55,25 @@ def check_listening(config: Config) -> None:
             raise ConfigError(f"{key}: {error}") from None
         for other, told, port, others in seen:
             if port == address.port != 0 and _share(hosts, others):
-                raise ConfigError(f"{key}: {text} is the port of {other} ({told}) already; choose another")
+                raise ConfigError(f"{key}: {text} is already the port of {other} ({told}); choose another port")
         seen.append((key, text, address.port, hosts))
 
 
 def check_ports(plan: Plan) -> None:
-    """Raise EndpointError if an address of the plan is in use."""
+    """Check that all addresses of the plan are free.
+
+    Raises:
+        EndpointError: An address is in use.
+
+    """
     for problem in taken(plan):
         raise EndpointError(problem)
 
 
 def taken(plan: Plan) -> Iterator[str]:
-    """Yield a message for each address of the plan that is in use, with the program if visible.
+    """Yield a message for each address of the plan that is in use. It names the program, if known.
 
-    Other faults of an address are reported by its process.
+    Other faults of an address are reported by the process that listens there.
     """
     for job in plan.jobs:
         for text in job.listening:
@@ -77,19 +86,29 @@ def taken(plan: Plan) -> Iterator[str]:
 
 
 def in_use(address: Address) -> bool:
-    """Return whether the address, or each one of a name, is in use; an unknown name: ConfigError."""
+    """Return whether the address is in use. For a host name, all of its addresses must be in use.
+
+    Raises:
+        ConfigError: The host name cannot be resolved.
+
+    """
     with suppress(OSError):
         return address.port != 0 and all(_taken(family, place) for family, place in _places(address))
     return False
 
 
 def served(address: Address) -> bool:
-    """Return whether a process of this host listens at the address, or at one that the name has."""
+    """Return whether a process of this host listens at the address, or at one of a host name's addresses."""
     return any(True for _ in _listening(address))
 
 
 def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
-    """Return (family, socket address) for each address of a host, or raise ConfigError."""
+    """Return (family, socket address) for each address of a host.
+
+    Raises:
+        ConfigError: The host name cannot be resolved.
+
+    """
     try:
         found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:  # UnicodeError: a part of the name is empty, or too long
@@ -101,7 +120,7 @@ def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
 
 
 def _hosts(address: Address) -> set[str]:
-    """Return all addresses of a host name in the form of /proc/net/tcp."""
+    """Return all addresses of a host, in the form in which /proc/net/tcp has them."""
     return {
         _words(socket.inet_pton(family, str(place[0]).partition("%")[0])).removeprefix(_MAPPED)
         for family, place in _places(address)
@@ -109,7 +128,7 @@ def _hosts(address: Address) -> set[str]:
 
 
 def _share(hosts: set[str], others: set[str]) -> bool:
-    """Return whether listeners on two sets of hosts conflict; [::] includes IPv4."""
+    """Return whether listeners on the same port of two sets of hosts conflict. [::] includes IPv4."""
     if hosts & others or _ANY in hosts | others:
         return True
     ours, theirs = ({host for host in all_ if len(host) == len(_ANY_IPV4)} for all_ in (hosts, others))
@@ -161,7 +180,10 @@ def _words(packed: bytes) -> str:
 
 
 def _with_children(pid: int) -> Iterator[int]:
-    """Yield a process and its children: the broker's process runs mosquitto."""
+    """Yield a process and its children.
+
+    The broker's process, for example, has mosquitto as a child.
+    """
     yield pid
     with suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():

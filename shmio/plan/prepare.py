@@ -1,4 +1,4 @@
-"""Prepare a plan from a configuration file: compile layouts, check connectors and emulators."""
+"""Prepares a plan from a configuration file: compiles layouts, checks connectors and emulators."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ NONFINITE = ("REAL", "LREAL")
 
 @dataclass(frozen=True)
 class Prepared:
-    """A checked configuration, ready to start."""
+    """A checked configuration from which an instance can be started."""
 
     config: Config
     plan: Plan
@@ -55,16 +55,16 @@ class Prepared:
     injections: tuple[str, ...]
     """Lines about the declared injections."""
     notes: tuple[str, ...] = ()
-    """Remarks that are not faults."""
+    """Remarks for the user that are not about faults."""
 
 
 def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = None) -> Prepared:
-    """Read a configuration and check everything that can be checked without starting anything.
+    """Read a configuration, and check everything that can be checked without starting anything.
 
     Args:
         file: The configuration file.
         mode: ``live``, ``log`` or ``replay``.
-        keys: Keys of ``[replay]`` that override those of the file.
+        keys: Keys that override those of the section ``[replay]``.
 
     Raises:
         ConfigError: The configuration has faults.
@@ -143,7 +143,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
 
 
 def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
-    """Return the configuration with TIA Portal's spelling of paths translated to shmio's."""
+    """Return the configuration with paths in shmio's spelling, where it has that of TIA Portal."""
     default = next(iter(layouts)) if len(layouts) == 1 else None
 
     def topics(patterns: str | list[str]) -> str | list[str]:
@@ -164,9 +164,9 @@ def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
 
 
 def _spelled_source(source: Source, layout: Layout) -> Source:
-    """Return the source with its patterns spelled as the layout spells them.
+    """Return the source with patterns spelled as in the layout.
 
-    Registers that a tag table makes writable join the patterns.
+    Registers that a tag table makes writable are added to the key ``writable``.
     """
     patterns = dict.fromkeys(block_path(pattern, layout) for pattern in source.writable)
     return replace(
@@ -177,7 +177,7 @@ def _spelled_source(source: Source, layout: Layout) -> Source:
 
 
 def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) -> None:
-    """Warn about patterns of sources with known layouts, although there are faults elsewhere."""
+    """Add warnings about patterns, although there are faults, for sources whose layout is known."""
     names = [source.name for source in config.source]
     for index, source in enumerate(config.source):
         if source.name in layouts and names.count(source.name) == 1:
@@ -188,7 +188,10 @@ def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) ->
 
 
 def peer(source: Source) -> str:
-    """Return the device of a checked source as URL, as host:port, as the host alone, or ""."""
+    """Return the device of a checked source: a URL, host:port, or the host alone.
+
+    "" if it has none.
+    """
     if url := source.options.get("url"):
         return str(url)
     host, port = source.options.get("host"), source.options.get("port")
@@ -203,7 +206,7 @@ def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
 
 
 def _check_emulator(index: int, emulator: Emulator, config: Config, files: LayoutFiles) -> tuple[Served, ...]:
-    """Return the blocks and tag tables that an emulator serves, that of its program first."""
+    """Return the blocks and tag tables that an emulator serves, beginning with that of its program."""
     key = f"emulator[{index}]"
     if emulator.kind not in KINDS:
         raise ConfigError(
@@ -238,10 +241,10 @@ def _check_served(key: str, emulator: Emulator, served: Sequence[Served]) -> tup
 
 
 def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles) -> list[Served]:
-    """Return the blocks and tag tables of the sources that read an emulator without a layout of its own."""
+    """Return the blocks and tag tables that sources read from an emulator without its own layout."""
     for name in ("block", "dbNumber", "type_bytes"):
         if getattr(emulator, name):
-            raise ConfigError(f"{key}.{name}: needs a layout beside it")
+            raise ConfigError(f"{key}.{name}: this key needs layout in the same section")
     blocks: dict[int | None, Layout] = {}
     tables: list[Served] = []
     for index, source in enumerate(config.source):
@@ -280,16 +283,28 @@ def _reads(source: Source, emulator: Emulator) -> bool:
 
 
 def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
-    """Raise ConfigError if a block has no number; the compiler ensures that numbers are unique."""
+    """Check that each block has a number. The compiler ensures that numbers are unique.
+
+    Raises:
+        ConfigError: A block has none.
+
+    """
     for layout in layouts:
         if layout.number is None:
-            alone = f'; block = "{layout.name}" beside it, to serve only that block' if len(layouts) > 1 else ""
+            alone = (
+                f'; or set block = "{layout.name}" in this section, to serve only that block'
+                if len(layouts) > 1
+                else ""
+            )
             why = f"the data block {layout.name!r} has no number in its name"
             raise ConfigError(f"{key}.dbNumber: this key is needed, because {why}{alone}")
 
 
 def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str]:
-    """Return warnings about probably unintended settings; add faults for invalid patterns."""
+    """Return warnings about settings that are probably not intended.
+
+    Add faults for invalid patterns.
+    """
     odd = []
     for index, source in enumerate(config.source):
         key, layout = f"source[{index}]", layouts[source.name]
@@ -298,14 +313,17 @@ def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str
         odd += _odd_patterns(key, source, layout, faults)
         number = source.options.get("dbNumber")
         if number is not None and layout.number is not None and number != layout.number:
-            odd.append(f"{key}.dbNumber: {number}, but the layout is that of DB{layout.number}")
+            odd.append(f"{key}.dbNumber: the number is {number}, but the layout is that of DB{layout.number}")
     if not config.source:
-        odd.append("there is no [[source]]: the instance will hold no registers")
+        odd.append("there is no [[source]]: the instance will have no registers")
     return odd
 
 
 def _odd_patterns(key: str, source: Source, layout: Layout, faults: Faults) -> Iterator[str]:
-    """Yield warnings about a source's patterns that name nothing; add faults for invalid ones."""
+    """Yield warnings about patterns of a source that match no register.
+
+    Add faults for invalid ones.
+    """
     for name, patterns in (("writable", source.writable), ("allow_nonfinite", source.allow_nonfinite)):
         for pattern in patterns:
             try:
@@ -318,7 +336,7 @@ def _odd_patterns(key: str, source: Source, layout: Layout, faults: Faults) -> I
 
 
 def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
-    """Yield warnings about unused patterns of endpoints and an open broker.
+    """Yield warnings about endpoints' patterns that match nothing, and about an open broker.
 
     Raises:
         ConfigError: A pattern is invalid.
@@ -341,17 +359,22 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
             raise ConfigError(f"{key}: {error}") from None
         paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
         if not any(map(glob.matches, paths)):
-            yield f"{key}: {pattern!r} names no register; the path of one begins with its source"
+            yield f"{key}: {pattern!r} names no register; the path of a register begins with its source"
 
 
 def _check_part(path: str, layouts: dict[str, Layout]) -> None:
-    """Raise PathError if the path names a bit, slice or other part that does not exist."""
+    """Check that the bit, slice or other part that the path names exists.
+
+    Raises:
+        PathError: It does not exist.
+
+    """
     topic = parse_topic(path, layouts, None)
     look_up(layouts[topic.source], topic)
 
 
 def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
-    """Yield warnings about accounts of shmio's own broker with unexpected permissions."""
+    """Yield warnings about accounts of shmio's own broker with probably unintended permissions."""
     free = any(account.name is None and "write" in account.roles for account in mqtt.account)
     shown = mqtt.tls is not None and mqtt.tls.ca is not None
     if free and (mqtt.password_file or not (address.loopback or shown)):
@@ -362,11 +385,11 @@ def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
     if mqtt.password_file:
         named = {account.name for account in mqtt.account}
         if others := ", ".join(name for name in read_accounts(mqtt.password_file) if name not in named):
-            yield f"mqtt.password_file: {others} may only read: [[mqtt.account]] can give the role write"
+            yield f"mqtt.password_file: {others} may only read: an [[mqtt.account]] with the role write changes this"
 
 
 def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
-    """Yield warnings about patterns of ``recorder.registers`` that name nothing."""
+    """Yield warnings about patterns of ``recorder.registers`` that match nothing."""
     if config.recorder is not None:
         for text in Selection(registers=config.recorder.registers).nothing(layouts):
             yield f"recorder.registers: {text}"
@@ -392,7 +415,7 @@ def _near(pattern: str, layout: Layout) -> str:
 
 
 def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:
-    """Yield warnings about sources whose emulator in this file does not serve what they read."""
+    """Yield warnings about sources that read something that their emulator does not serve."""
     for index, source in enumerate(config.source):
         layout = layouts[source.name]
         number = source.options.get("dbNumber") or layout.number
@@ -422,7 +445,7 @@ def _served(emulator: Emulator, served: Sequence[Served]) -> dict[str, None]:
 
 
 def _not_emulated(config: Config) -> Iterator[str]:
-    """Yield warnings about sources that read this host at an address without an emulator."""
+    """Yield warnings about sources that read an address of this host where no emulator listens."""
     listening = {emulator.name: str(Address.parse(emulator.listen)) for emulator in config.emulator}
     for index, source in enumerate(config.source):
         device = peer(source)
@@ -434,14 +457,14 @@ def _not_emulated(config: Config) -> Iterator[str]:
 
 
 def _unread(emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:
-    """Yield warnings about initial values that an emulator cannot read."""
+    """Yield warnings about initial values of a layout that an emulator does not understand."""
     for name, served in emulated.items():
         for text in (text for one in served for text in initial_value_warnings(one.layout)):
             yield f"emulator {name!r}: {text}"
 
 
 def _covers(pattern: str, layout: Layout, types: Sequence[str] = ()) -> bool:
-    """Return whether a pattern names a register of these types, a part of it, or its container.
+    """Return whether a pattern matches a register of these types, a part of it, or its container.
 
     Without ``types``, all types count.
 

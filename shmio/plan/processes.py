@@ -1,4 +1,4 @@
-"""Plan the blocks and processes of a checked configuration. No I/O."""
+"""Plans the blocks and processes of a checked configuration. No I/O."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ RANKS: Final[Mapping[str, int]] = {
     "opcua": 2,
     "web": 2,
 }
-"""Order of start by kind: emulators, then sources, then endpoints.
+"""Order of start by kind: emulators first, then sources, then endpoints.
 
-The recorder starts before the sources and stops after them, to record their last frames and events.
+The recorder starts before the sources and stops after them, so that it records all their frames and
+events.
 """
 
 BROKER: Final = "broker"
@@ -36,7 +37,10 @@ It starts before the bridge and stops after it, so that the bridge can disconnec
 
 
 def rank(name: str, kind: str) -> int:
-    """Return a process's place in the order of start; a kind unknown to this version stops last."""
+    """Return a process's place in the order of start.
+
+    A kind that this version does not know stops last.
+    """
     return 0 if (name, kind) == (BROKER, "mqtt") else RANKS.get(kind, 0)
 
 
@@ -52,18 +56,19 @@ MODULES: Final[Mapping[str, str]] = {
 """The module that each kind of process runs."""
 
 RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
-"""Keys of a section that its process reloads while it runs, by kind."""
+"""By kind of process, the keys of its section that the process can read again while it runs."""
 
 MAX_PROCESSES = 200
 MODES = ("live", "log", "replay")
-"""Modes of an instance; log: without endpoints; replay: a recording replaces the sources."""
+"""Modes of an instance. ``log`` starts no endpoints; ``replay`` replaces sources by a recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
     """A process to run; ``config`` is its resolved section, which the process receives.
 
-    ``rules`` is the part of the section that the running process can reload, None if there is none.
+    ``rules`` is the part of the section that the process can read again while it runs; None if
+    there is no such part.
     """
 
     name: str
@@ -79,7 +84,7 @@ class Job:
 
     @property
     def listening(self) -> list[str]:
-        """The process's listening addresses, as configured."""
+        """The addresses at which the process listens, as configured."""
         listen = self.config.get("listen") or ()
         texts = [listen] if isinstance(listen, str) else [*listen]
         return [*texts, *(address["listen"] for address in self.config.get("address", ()))]
@@ -89,7 +94,7 @@ class Job:
         return self._json(instance, epoch, self.config | (self.rules or {}))
 
     def identify(self, instance: str, epoch: int) -> bytes:
-        """Return the part of the description whose change requires a new process."""
+        """Return the part of the description that cannot change without starting a new process."""
         return self._json(instance, epoch, self.config)
 
     def _json(self, instance: str, epoch: int, config: dict[str, Any]) -> bytes:
@@ -118,11 +123,11 @@ class Plan:
     blocks: tuple[BlockSpec, ...]
     jobs: tuple[Job, ...]
     warnings: tuple[str, ...] = ()
-    """Warnings about the configuration, a line each."""
+    """Warnings about the configuration, one line each."""
     stepped: bool = False
-    """Whether the instance's clock is stopped from the start, until it is stepped."""
+    """Whether the instance's clock stands still from the start, and moves only by steps."""
     origin: Origin | None = None
-    """The clock's origin in a replayed recording; None for an instance with its own time."""
+    """The instance time at which the clock starts, if a recording is replayed; else None."""
 
     @property
     def processes(self) -> list[ProcessSpec]:
@@ -131,7 +136,7 @@ class Plan:
 
     @property
     def segment_bytes(self) -> int:
-        """Size of the segment."""
+        """Size of the segment in bytes."""
         return segment_size(self.blocks, len(self.jobs))
 
 
@@ -161,10 +166,10 @@ def make_plan(
         declared: The encoded injections for each source's process, by source name.
         warnings: Warnings about the configuration.
         computed: Sources that follow the instance's clock.
-        replayed: The computed sources that play a recording.
-        remote: Patterns of the outputs and in-outs of sources that a remote program computes, by
-            source name.
-        origin: The clock's origin in a replayed recording.
+        replayed: Those of the computed sources that play a recording.
+        remote: For sources that a remote program computes, by source name: patterns of their
+            outputs and in-outs.
+        origin: The clock's origin in a replayed recording; None if there is none.
 
     Raises:
         ConfigError: The instance has too many processes.
@@ -213,7 +218,7 @@ def make_plan(
         recorder = msgspec.to_builtins(config.recorder) | {key: str(path) for key, path in paths.items()}
         sections.append(("recorder", "recorder", recorder))
     if len(sections) > MAX_PROCESSES:
-        raise ConfigError(f"{len(sections)} processes; an instance has at most {MAX_PROCESSES}")
+        raise ConfigError(f"there are {len(sections)} processes, but an instance has at most {MAX_PROCESSES}")
     log_dir = config.log_dir
     return Plan(
         instance=config.instance.name,
@@ -230,7 +235,7 @@ def make_plan(
 
 
 def process_names(config: Config) -> list[str]:
-    """Return the names of all processes that an instance may have, in any mode."""
+    """Return the names of all processes that the instance may have, whatever the mode."""
     names = [emulator.name for emulator in config.emulator] + [source.name for source in config.source]
     names += ["grpc"] if config.grpc else []
     names += [name for name, _, _ in _mqtt(config.mqtt)] if config.mqtt else []
@@ -248,9 +253,10 @@ def _folders(config: Config) -> dict[str, str]:
 
 
 def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
-    """Return the sections of the bridge, and of the broker if it is shmio's own.
+    """Return the section of the bridge, and that of the broker if it is shmio's own.
 
-    Each gets only the keys that it needs, so a change replaces only the process concerned.
+    Each contains only the keys that its process needs. A change of a key then replaces only that
+    process.
     """
     section = msgspec.to_builtins(mqtt)
     listen, accounts = section.pop("listen"), section.pop("account")

@@ -1,4 +1,4 @@
-"""``--mode replay``: replace a configuration's sources by those of a recording."""
+"""``--mode replay``: replaces a configuration's sources by those of a recording."""
 
 from __future__ import annotations
 
@@ -17,23 +17,26 @@ if TYPE_CHECKING:
     from shmio.connectors.replay.recording import Recording
 
 LEAD_NS: Final = 2_000_000_000
-"""Time between the clock's start and the recording's, if possible: the processes start then."""
+"""Time in ns by which the clock starts before the recording, if possible.
+
+The processes start in this time.
+"""
 
 
 class Replayed(NamedTuple):
-    """A configuration changed for a replay."""
+    """A configuration that was changed for a replay."""
 
     config: Config
     origin: Origin
     notices: list[str]
-    """Lines about what was removed from or added to the configuration."""
+    """Lines that say what was removed from the configuration or added to it."""
 
 
 class Recordings:
     """Opens the recordings that a configuration plays.
 
-    The last one stays open, so that consecutive sources of one recording share it. Use it as a
-    context manager.
+    The last one stays open, so that sources of the same recording that follow each other share it.
+    Use it as a context manager.
     """
 
     def __init__(self) -> None:
@@ -41,7 +44,12 @@ class Recordings:
         self._recording: Recording | None = None
 
     def get(self, files: Sequence[str]) -> Recording:
-        """Return the recording of these files, or raise RecordingError; the next call closes it."""
+        """Return the recording in these files. The next call may close it.
+
+        Raises:
+            RecordingError: It cannot be opened.
+
+        """
         from shmio.connectors.replay.recording import Recording  # noqa: PLC0415  most configurations play none
 
         if self._recording is None or files != self._files:
@@ -63,11 +71,18 @@ class Recordings:
 
 
 def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) -> Replayed:
-    """Return the configuration with only the recording's sources; raise ConfigError with its key."""
+    """Return the configuration with the recording's sources instead of its own.
+
+    Raises:
+        ConfigError: The recording cannot be played; the message begins with the key.
+
+    """
     section = _section(config, keys)
     files = [str(config.path(file)) for file in _listed(section.file)]
     if not files:
-        raise ConfigError('replay.file: what is to be played: --from FILE.mem, or [replay] with file = "FILE.mem"')
+        raise ConfigError(
+            'replay.file: name the recording to play, by --from FILE.mem or by file = "FILE.mem" in [replay]'
+        )
     try:
         recording = recordings.get(files)
     except RecordingError as error:
@@ -108,7 +123,7 @@ def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]
     own = [source.name for source in config.source]
     for name in own:
         if name not in names:
-            yield f"source {name} is left out: the recording has none of it; it has {', '.join(names)}"
+            yield f"source {name} is left out: the recording does not contain it; it contains {', '.join(names)}"
     for emulator in config.emulator:
         yield f"emulator {emulator.name} is left out: a replay reads no device"
     if config.injection and section.injections == "keep":
@@ -122,7 +137,7 @@ def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]
         for name in _gone(config, rule, names):
             yield f"mqtt.topic[{index}].match: {name} is left out: the recording has no such source"
     if section.record and config.recorder is None:
-        raise ConfigError("replay.record: there is no [recorder] section that says where to")
+        raise ConfigError("replay.record: this needs a [recorder] section, which says where to record")
     wanted = config.recorder.sources if section.record and config.recorder else []
     if wanted and not set(wanted) & set(names):
         raise ConfigError(
@@ -145,7 +160,7 @@ def _mqtt(config: Config, names: list[str]) -> Mqtt | None:
 
 
 def _gone(config: Config, rule: MqttTopic, names: list[str]) -> list[str]:
-    """Return the configured sources that a rule for frames names but that the recording lacks."""
+    """Return the configured sources that a rule for frames names and the recording lacks."""
     own = {source.name for source in config.source} - set(names)
     return [pattern for pattern in rule.patterns if rule.payload == "frames" and pattern in own]
 
@@ -164,7 +179,12 @@ def _source(name: str, own: Source | None, section: Replay, files: list[str]) ->
 
 
 def _check_names(names: list[str], file: str) -> None:
-    """Raise ConfigError if a source's name in a recording is invalid or reserved."""
+    """Check the names of the sources in a recording.
+
+    Raises:
+        ConfigError: A name is invalid or reserved.
+
+    """
     for name in names:
         try:
             msgspec.convert({"name": name, "connector": "replay"}, Source)

@@ -1,4 +1,4 @@
-"""Check a configuration's sources with their connectors and models, and find their layouts."""
+"""Checks a configuration's sources with their connectors and models, and finds their layouts."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from shmio.plan.replay import Recordings
 
 NEEDED: Final = "this key is needed"
 PATIENCE_S: Final = 60.0
-"""Time-out for the import of a model, in s."""
+"""Time-out in s for the import of a model."""
 
 
 class Sources(NamedTuple):
-    """Facts about the checked sources, by source name."""
+    """What is known of the checked sources, by source name."""
 
     layouts: dict[str, Layout]
     computed: list[str]
@@ -38,13 +38,13 @@ class Sources(NamedTuple):
     replayed: list[str]
     """Sources that play a recording."""
     remote: dict[str, tuple[list[str], list[str]]]
-    """Patterns of the outputs and in-outs that a remote program computes, by source name."""
+    """For each source that a remote program computes: patterns of its outputs and in-outs."""
 
 
 def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
     """Check all sources with their connectors, and add faults.
 
-    Afterwards the sources' ``options`` are complete and have their types.
+    Afterwards, ``options`` of each source contains all keys, and their values have the right types.
     """
     found = Sources({}, [], [], {})
     inputs: dict[int, tuple[str, ...]] = {}
@@ -115,7 +115,7 @@ def _check_source(
 
 
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
-    """Add the faults of a source's connector keys; ``index`` is the source's index in the file."""
+    """Add the faults in a source's connector keys; ``index`` is the source's index in the file."""
     key = f"source[{index}]"
     if what := registry.clash(connector):
         faults.add(f"{key}.connector: {what}")
@@ -136,7 +136,7 @@ def note_options(index: int, connector: str, options: dict[str, Any], texts: dic
 
 
 def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
-    """Return the connector's checked options, or add faults and return None."""
+    """Return the connector's checked options; None if they have faults, which are added."""
     before = faults.count
     note_options(int(key[7:-1]), source.connector, source.options, source.texts, faults)
     if faults.count > before:
@@ -151,7 +151,7 @@ def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
 
 
 def _filled(kind: type[msgspec.Struct], source: Source) -> msgspec.Struct | None:
-    """Return the options with placeholders for missing texts, or None if they have other faults."""
+    """Return the options with placeholders for missing texts; None if they have other faults."""
     fields = msgspec.structs.fields(kind)
     known = {field.encode_name for field in fields}
     given = {key: value for key, value in (source.texts | source.options).items() if key in known}
@@ -163,7 +163,10 @@ def _filled(kind: type[msgspec.Struct], source: Source) -> msgspec.Struct | None
 
 
 def _recorded(key: str, source: Source, config: Config, recordings: Recordings) -> Layout:
-    """Return a replayed source's layout; the recording also gives its period and stale age."""
+    """Return the layout of a source that plays a recording.
+
+    The source also gets its period and its stale age from the recording.
+    """
     from shmio.connectors.replay.source import Replay, chosen, files  # noqa: PLC0415
 
     for name in ("layout", "block", "type_bytes", "properties"):
@@ -186,7 +189,10 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
-    """Return a simulation's layout, of its files or as its model declares it, and its inputs."""
+    """Return the layout of a simulation and its inputs.
+
+    The layout comes from files or from its model.
+    """
     source.options["folder"] = str(config.path(source.options["folder"]))
     layout = None if source.layout is None else files.get(key, source, None)
     return _describe(key, msgspec.convert(source.options, Simulation.Options), layout)
@@ -228,7 +234,12 @@ def _check_connections(
     inputs: tuple[str, ...],
     layouts: Mapping[str, Layout],
 ) -> None:
-    """Raise ConfigError unless each connection goes from a source's register to a fitting input."""
+    """Check that each connection goes from a register of a source to an input that fits it.
+
+    Raises:
+        ConfigError: A connection does not.
+
+    """
     for path, topic in connections.items():
         try:
             _check_connection(source, path, topic, inputs, layouts)

@@ -38,18 +38,20 @@ MAX_CLIENTS: Final = 8
 REQUEST_S: Final = 2.0
 """Time in which a client must send its request, in s."""
 TURN_S: Final = 0.5
-"""Interval at which a waiting client checks that the supervisor is alive, in s."""
+"""Interval in s at which a waiting client checks that the supervisor is alive."""
 CONNECT_S: Final = 0.05
-"""Interval of retries while the supervisor has too many clients, in s."""
+"""Interval in s at which a client tries again while the supervisor has too many clients."""
 _TOO_MANY: Final = "too many control connections at once"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 LINE_CHARS: Final = 2000
 _MORE: Final = {
     "warnings": "… and {} more warnings: shmio-supervisor check prints them",
-    "done": "… and {} more: shmio-supervisor logs supervisor -n 500 has them",
-    "problems": "… and {} more: shmio-supervisor logs supervisor -n 500 has them",
+    "done": "… and {} more: shmio-supervisor logs supervisor -n 500 shows them",
+    "problems": "… and {} more: shmio-supervisor logs supervisor -n 500 shows them",
 }
-"""The line that replaces the lines left out, by key, in the order in which they are left out.
+"""By key of an answer, the line that stands for its left-out lines.
+
+Earlier keys are shortened first.
 
 ``kept`` is missing because it always fits: it has at most 200 names of at most 40 characters.
 """
@@ -58,11 +60,11 @@ _MORE: Final = {
 def socket_path(instance: str) -> str:
     """Return the path of an instance's control socket; create its folder with mode 0700.
 
-    It is in the first usable of ``$XDG_RUNTIME_DIR/shmio``, ``/run/user/<uid>/shmio`` and
-    ``/tmp/shmio-<uid>``.
+    It is in the first of these folders that can be used: ``$XDG_RUNTIME_DIR/shmio``,
+    ``/run/user/<uid>/shmio`` and ``/tmp/shmio-<uid>``.
 
     Raises:
-        ControlError: No folder is usable: it belongs to another user, or the path is too long.
+        ControlError: No folder can be used: it belongs to another user, or the path is too long.
 
     """
     uid = os.getuid()
@@ -79,11 +81,14 @@ def socket_path(instance: str) -> str:
         if reason is None:
             return str(path)
         refused.append(f"{folder}: {reason}")
-    raise ControlError(f"no folder for the control socket ({'; '.join(refused)})")
+    raise ControlError(f"no folder can be used for the control socket ({'; '.join(refused)})")
 
 
 def _prepare(folder: Path, uid: int) -> str | None:
-    """Create a folder for this user alone, without following links; return an error or None."""
+    """Create a folder that only this user can enter, without following links.
+
+    Return an error, or None.
+    """
     try:
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
@@ -100,7 +105,7 @@ def _prepare(folder: Path, uid: int) -> str | None:
 
 
 def remove_socket(path: str) -> None:
-    """Remove a socket. Another file with this name stays, and makes bind fail."""
+    """Remove a socket. Another kind of file with this name stays, so that bind fails."""
     with suppress(FileNotFoundError):
         if stat.S_ISSOCK(os.lstat(path).st_mode):
             Path(path).unlink()
@@ -125,25 +130,25 @@ class Reload(_Request, tag="reload"):
 
 
 class Where(_Request, tag="where"):
-    """Ask for the configuration in force, when it was read, the log folder and addresses."""
+    """Ask for the configuration in force, when it was read, the log folder and the addresses."""
 
 
 Request = Stop | Restart | Reload | Where
 
 
 class Answer:
-    """Answers the client of one request; has no effect if the client has disconnected."""
+    """Answers the client that sent a request. It has no effect if the client has disconnected."""
 
     def __init__(self, server: ControlServer, client: socket.socket) -> None:
         self._server = server
         self._client = client
 
     def ok(self, **values: object) -> None:
-        """Answer with success. Lists of lines are shortened to fit."""
+        """Answer that the request succeeded. Lists of lines are shortened to fit."""
         self._server.answer(self._client, _shorten({"ok": True, **values}, MAX_ANSWER_BYTES - 1))
 
     def error(self, message: str) -> None:
-        """Answer with an error."""
+        """Answer that the request failed."""
         self._server.answer(self._client, {"error": _cut_lines(message, MAX_ANSWER_BYTES // 8)})
 
 
@@ -154,10 +159,14 @@ class ControlServer:
     """
 
     def __init__(self, path: str, selector: selectors.BaseSelector, handle: Callable[[Request, Answer], None]) -> None:
-        """Bind the socket; raise ControlError if that fails.
+        """Bind the socket.
 
-        The caller must have locked the instance: an existing socket is then that of a dead
+        The caller must have locked the instance. An existing socket is then that of a dead
         supervisor, and is removed.
+
+        Raises:
+            ControlError: The socket cannot be created.
+
         """
         self._path = path
         self._selector = selector
@@ -172,7 +181,7 @@ class ControlServer:
             self._listener.listen(MAX_CLIENTS)
         except OSError as error:
             self._listener.close()
-            raise ControlError(f"cannot make the control socket {path}: {error.strerror}") from None
+            raise ControlError(f"cannot create the control socket {path}: {error.strerror}") from None
         selector.register(self._listener, selectors.EVENT_READ, self._accept)
 
     def _accept(self) -> None:
@@ -192,7 +201,10 @@ class ControlServer:
             self._selector.register(client, selectors.EVENT_READ, lambda: self._receive(client))
 
     def _has_room(self) -> bool:
-        """Return whether there is room for a client; if needed, drop the one silent longest."""
+        """Return whether another client can connect.
+
+        If needed, disconnect the one that was silent longest.
+        """
         silent = (client for client, (_, deadline) in self._clients.items() if deadline is not None)
         if len(self._clients) >= MAX_CLIENTS and (longest := next(silent, None)):
             self.answer(longest, {"error": _TOO_MANY})
@@ -214,7 +226,9 @@ class ControlServer:
         data += received
         line, end, rest = data.partition(b"\n")
         if len(data) > MAX_REQUEST_BYTES or rest:
-            self.answer(client, {"error": f"one request of at most {MAX_REQUEST_BYTES} bytes, ended by a newline"})
+            self.answer(
+                client, {"error": f"expected one request of at most {MAX_REQUEST_BYTES} bytes, ended by a newline"}
+            )
         elif end:
             self._clients[client] = data, None
             self._decode(client, bytes(line))
@@ -223,7 +237,7 @@ class ControlServer:
         try:
             request = msgspec.json.decode(line, type=Request)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            self.answer(client, {"error": f"not a request: {error}"})
+            self.answer(client, {"error": f"this is not a request: {error}"})
         else:
             if _hung_up(client):  # it gave up while the supervisor was delayed
                 self._drop(client)
@@ -231,17 +245,20 @@ class ControlServer:
             self._handle(request, Answer(self, client))
 
     def answer(self, client: socket.socket, message: dict[str, object]) -> None:
-        """Send the answer and close the connection. Bytes beyond the socket's buffer are lost."""
+        """Send the answer and close the connection.
+
+        Bytes that do not fit into the socket's buffer are lost.
+        """
         if client in self._clients:
             _send(client, message)
             self._drop(client)
 
     def expire(self) -> None:
-        """Drop the clients that have not sent a request in time."""
+        """Disconnect clients that have not sent a request in time."""
         now = time.monotonic()
         for client, (_, deadline) in list(self._clients.items()):
             if deadline is not None and now > deadline:
-                self.answer(client, {"error": f"no request within {REQUEST_S:g} s"})
+                self.answer(client, {"error": f"no request arrived within {REQUEST_S:g} s"})
 
     def _drop(self, client: socket.socket) -> None:
         del self._clients[client]
@@ -249,7 +266,10 @@ class ControlServer:
         client.close()
 
     def retire(self) -> None:
-        """Remove the socket, so that a new supervisor can create it. Clients still get answers."""
+        """Remove the socket, so that a new supervisor can create its own.
+
+        Clients still get answers.
+        """
         if self._listener.fileno() < 0:
             return
         self._selector.unregister(self._listener)
@@ -259,7 +279,7 @@ class ControlServer:
         self._listener.close()  # closed last: until then no other file can get its inode number
 
     def close(self) -> None:
-        """Remove the socket, and drop all clients."""
+        """Remove the socket, and disconnect all clients."""
         self.retire()
         for client in list(self._clients):
             self._drop(client)
@@ -268,17 +288,17 @@ class ControlServer:
 def request(
     path: str, message: Request, timeout_s: float, lost: Callable[[], str | None] = lambda: None
 ) -> dict[str, Any]:
-    """Send a request to the supervisor at ``path`` and return its answer.
+    """Send a request to the supervisor at ``path``, and return its answer.
 
     Args:
         path: The control socket.
         message: The request.
-        timeout_s: Longest time to wait.
-        lost: Called from time to time; returns the reason to stop waiting, or None.
+        timeout_s: Longest time to wait, in s.
+        lost: Called every ``TURN_S``; returns the reason to stop waiting, or None.
 
     Raises:
-        ControlError: There is no such socket, no answer within ``timeout_s``, or the supervisor
-            refuses.
+        ControlError: There is no such socket, no answer came within ``timeout_s``, or the
+            supervisor refuses.
 
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
@@ -308,11 +328,12 @@ def request(
 
 
 def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[], str | None]) -> None:
-    """Connect, as soon as the supervisor's backlog has room.
+    """Connect as soon as the supervisor accepts another client.
 
     Raises:
-        TimeoutError: There was no room until the deadline.
+        TimeoutError: It did not accept one until the deadline.
         ControlError: ``lost`` returned a reason.
+
     """
     while True:
         client.settimeout(max(0.001, deadline - time.monotonic()))
@@ -329,7 +350,13 @@ def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[
 
 
 def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]) -> bytes:
-    """Return the next bytes of the answer, or raise TimeoutError or ControlError."""
+    """Return the next bytes of the answer.
+
+    Raises:
+        TimeoutError: None came until the deadline.
+        ControlError: ``lost`` returned a reason.
+
+    """
     while True:
         client.settimeout(max(0.001, min(TURN_S, deadline - time.monotonic())))
         try:
@@ -347,7 +374,7 @@ def _trusted(client: socket.socket) -> bool:
 
 
 def _hung_up(client: socket.socket) -> bool:
-    """Return whether the client has closed its end."""
+    """Return whether the client has closed its end of the connection."""
     poll = select.poll()
     poll.register(client, select.POLLIN)
     return any(events & select.POLLHUP for _, events in poll.poll(0))
@@ -359,12 +386,15 @@ def _send(client: socket.socket, message: dict[str, object]) -> None:
 
 
 def _cut(line: str) -> str:
-    """Return a line of at most ``LINE_CHARS`` characters."""
+    """Return a line, shortened to ``LINE_CHARS`` characters."""
     return line if len(line) <= LINE_CHARS else line[: LINE_CHARS - 1] + "…"
 
 
 def _cut_lines(text: str, most_chars: int) -> str:
-    """Return a text with long lines cut; lines beyond ``most_chars`` are counted instead."""
+    """Return a text with long lines shortened.
+
+    Lines beyond ``most_chars`` are replaced by their number.
+    """
     lines = text.split("\n")
     kept: list[str] = []
     for line in map(_cut, lines):
@@ -376,7 +406,10 @@ def _cut_lines(text: str, most_chars: int) -> str:
 
 
 def _shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
-    """Return the answer shortened to fit as JSON; lines left out are counted."""
+    """Return the answer so shortened that it fits as JSON.
+
+    Left-out lines are replaced by their number.
+    """
     short = dict(answer)
     shortened = {key: [_cut(line) for line in lines] for key in _MORE if isinstance(lines := answer.get(key), list)}
     short.update(shortened)
@@ -390,7 +423,7 @@ def _shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
 
 
 def _first_lines(lines: list[str], excess: int, more: str) -> list[str]:
-    """Return the first lines, at least ``excess`` bytes shorter."""
+    """Return the first lines, so that the result is at least ``excess`` bytes shorter."""
     excess += len(msgspec.json.encode(more)) + 8  # the number, and a comma
     count = len(lines)
     while count and excess > 0:

@@ -22,13 +22,13 @@ from shmio.supervisor.policy import PHASES, Action, Event, Life, Limits, State
 from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 
 TICK_S: Final = 0.1
-"""Interval at which heartbeats are checked, in s."""
+"""Interval in s at which heartbeats are checked."""
 
 log = logging.getLogger("shmio.supervisor")
 
 
 class ManagedProcess:
-    """A process slot with its job, its state (``life``), and its process while one exists."""
+    """A process slot with its job, its state (``life``), and the process while there is one."""
 
     def __init__(self, slot: ProcessSlot) -> None:
         self.slot = slot
@@ -36,9 +36,9 @@ class ManagedProcess:
         self.child: ChildProcess | AdoptedProcess | None = None
         self.waiting: list[Answer] = []
         self.evicted_pid = 0
-        """Pid of the last foreign process that was killed because it held this role."""
+        """Pid of the foreign process that was killed last, because it occupied this slot."""
         self.complaint = ""
-        """Problem that the running process reported at the last :meth:`listen`; "" if none."""
+        """The problem that the running process reported at the last :meth:`listen`; "" if none."""
         self._missed = 0
         self._job: Job | None = None
         self._beat_ns = 0
@@ -51,28 +51,33 @@ class ManagedProcess:
 
     @property
     def rank(self) -> int:
-        """Rank in the order of start; a process of an unknown kind stops last."""
+        """Place in the order of start; a process of an unknown kind stops last."""
         return rank(self.slot.name, self.slot.kind)
 
     @property
     def job(self) -> Job:
-        """The process's job; LookupError if it was adopted only to be stopped."""
+        """The process's job.
+
+        Raises:
+            LookupError: The process has none, because it was adopted only to be stopped.
+
+        """
         if self._job is None:
             raise LookupError(f"{self.name} has no job")
         return self._job
 
     def renew(self, job: Job) -> None:
-        """Take another job, and reset the state."""
+        """Assign another job, and reset the state."""
         self._job = job
         self.life = Life()
 
     def keep(self, job: Job) -> bool:
-        """Continue with a job from a new plan.
+        """Continue the process with a job from a new plan, and signal it to read its rules again.
 
         An adopted process is always signalled, because its former rules are unknown.
 
         Returns:
-            True if the process was signalled because it has, or had, rules.
+            True if the process was signalled, and has rules or had some.
 
         """
         before, self._job = self._job, job
@@ -83,30 +88,36 @@ class ManagedProcess:
         return known
 
     def adopt(self, child: AdoptedProcess) -> None:
-        """Adopt a running process of another supervisor."""
+        """Adopt a running process that another supervisor has started."""
         supervised = self.slot.supervised
         self.child = child
         self.life = policy.adopted(supervised.spawned_ns, supervised.restarts)
 
     @property
     def well(self) -> bool:
-        """True if the process works, or is being restarted."""
+        """True if the process runs, starts or is being restarted."""
         return self.life.state not in (State.STOPPED, State.FATAL)
 
     @property
     def ready(self) -> bool:
-        """True if the present process, not its predecessor, has reported that it runs."""
+        """True if the present process has reported that it runs.
+
+        Reports of its predecessor do not count.
+        """
         report = self.slot.report
         return self.child is not None and report.pid == self.child.pid and report.activity is Activity.RUNNING
 
     @property
     def advice(self) -> str:
-        """Advice to append to the message about a start that timed out; "" for other failures."""
+        """Advice to append to a message about a start that timed out; "" for other failures."""
         late = self.life.hang and self.life.hang in self.life.note
         return f"; see its log, {self.job.log_file}; the host may be overloaded" if late else ""
 
     def listen(self) -> None:
-        """Read the problem that the process reports; when it ends, log that and the losses."""
+        """Read the problem that the process reports.
+
+        When a problem ends, log this and what was lost.
+        """
         running = self.life.state is State.RUNNING
         complaint = complaint_of(self.slot.kind, self.slot.report.note) if running else ""
         lost = ("dropped", "changes") if self.slot.kind == "mqtt" else ("missed", "frames and events")
@@ -118,7 +129,7 @@ class ManagedProcess:
         self.complaint = complaint
 
     def quiet_ns(self, elapsed_ns: int) -> int:
-        """Return the time without a heartbeat, not counting pauses of the supervisor, in ns."""
+        """Return the time in ns since the last heartbeat, without pauses of the supervisor itself."""
         beat_ns = self.slot.heartbeat_ns
         # The first look at a running process also starts the count.
         fresh = beat_ns != self._beat_ns or self.life.state is not State.RUNNING
@@ -127,7 +138,7 @@ class ManagedProcess:
         return self._quiet_ns
 
     def end_note(self, pid: int, code: int | None) -> str:
-        """Return why the process ended, with its last message if there is one."""
+        """Return why the process ended, with its last message if it left one."""
         end = describe_end(code)
         if code is not None and code <= 0:
             return end
@@ -154,7 +165,7 @@ class ManagedProcess:
 
 
 def _log_step(managed: ManagedProcess, before: Life, action: Action | None, limits: Limits) -> None:
-    """Log one change of state, if it is worth a line."""
+    """Log a change of state, if it is of interest."""
     name, life = managed.name, managed.life
     if life.stuck:
         if not before.stuck:
@@ -162,7 +173,7 @@ def _log_step(managed: ManagedProcess, before: Life, action: Action | None, limi
     elif life.state is State.RUNNING:
         log.info("%s running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
     elif life.state is State.HUNG:
-        log.warning("%s hangs, %s: killed", name, life.note)
+        log.warning("%s hangs, %s: it is killed", name, life.note)
     elif life.state is State.FATAL:
         log.error("%s cannot work as configured: %s", name, life.note)
     elif life.state is State.BACKOFF:
@@ -172,11 +183,11 @@ def _log_step(managed: ManagedProcess, before: Life, action: Action | None, limi
     elif life.state is State.STOPPED:
         log.info("%s stopped", name)
     elif action is Action.KILL and before.state is life.state:
-        log.warning("%s does not stop: killed", name)
+        log.warning("%s does not stop: it is killed", name)
 
 
 def brief(error: Exception) -> str:
-    """Return an unexpected error as one line; the log has its traceback."""
+    """Return an unexpected error as one line. Its traceback is in the log."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
@@ -204,16 +215,21 @@ class Fleet:
         return list(self._managed)
 
     def named(self, name: str) -> ManagedProcess:
-        """Return the process with this name; raise KeyError if there is none."""
+        """Return the process with this name.
+
+        Raises:
+            KeyError: There is none.
+
+        """
         return self._managed[name]
 
     @property
     def ranked(self) -> list[tuple[int, Life]]:
-        """Rank and life of each process, in order of iteration."""
+        """Rank and state of each process, in the order of iteration."""
         return [(managed.rank, managed.life) for managed in self]
 
     def assign(self, job: Job) -> None:
-        """Assign a job to a process that does not run; add a slot for a new name."""
+        """Assign a job to a process that does not run; if the name is new, add a slot."""
         managed = self._managed.get(job.name)
         if managed is None:
             slot = self._segment.processes.add(ProcessSpec(job.name, job.kind))
@@ -226,16 +242,16 @@ class Fleet:
         self._segment.processes.remove(managed.slot)
 
     def adopt(self, managed: ManagedProcess, child: AdoptedProcess) -> None:
-        """Supervise a running process of another supervisor."""
+        """Supervise a running process that another supervisor has started."""
         managed.adopt(child)
         self._watch(managed, child)
 
     def start_due(self) -> None:
-        """Start the processes whose turn has come."""
+        """Start the processes that are next in the order of start."""
         self._apply_all(policy.to_start(self.ranked), Event.START)
 
     def stop_due(self) -> None:
-        """Stop the processes whose turn has come, when all are to stop."""
+        """If all processes are to stop, stop those that are next in the order."""
         self._apply_all(policy.to_stop(self.ranked), Event.STOP)
 
     def _apply_all(self, indices: list[int], event: Event) -> None:
@@ -268,10 +284,10 @@ class Fleet:
                 self.apply(managed, event, stale_segment.survivor(dying.pid) if dying else "")
 
     def _evict(self, managed: ManagedProcess) -> None:
-        """Kill a process that holds the role but is not ours.
+        """Kill a foreign process that occupies the slot of one of our processes.
 
-        A dead supervisor started it just before its end, so the take-over missed it. Do not wait
-        for its end.
+        A dead supervisor started it just before its own end, so that the take-over did not find it.
+        Do not wait for the end of the process.
         """
         if managed.child is None:
             return
@@ -282,14 +298,18 @@ class Fleet:
         if worker is None:
             return
         if worker.pid not in spared:  # the child may have taken the role since the check above
-            log.warning("%s is held by pid %d, which no supervisor knows: killed", managed.name, worker.pid)
+            log.warning(
+                "the slot of %s is occupied by pid %d, which no supervisor knows: this process is killed",
+                managed.name,
+                worker.pid,
+            )
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(worker.pidfd, signal.SIGKILL)
             managed.evicted_pid = worker.pid
         os.close(worker.pidfd)
 
     def apply(self, managed: ManagedProcess, event: Event, note: str = "") -> None:
-        """Apply an event to a process, and carry out the resulting action."""
+        """Apply an event to the state of a process, and carry out the action that follows."""
         before = managed.life
         managed.life, action = policy.step(before, event, time.monotonic_ns(), self._limits, note)
         if managed.life == before:
@@ -335,5 +355,5 @@ class Fleet:
 
 
 def digest(description: bytes) -> bytes:
-    """Return the SHA-256 of a process description, for comparing."""
+    """Return the SHA-256 digest of a process description, which is used for comparing."""
     return hashlib.sha256(description).digest()

@@ -1,4 +1,7 @@
-"""Assess the state of the instance; publish it to the segment, the service manager and the log."""
+"""Assesses the state of the instance.
+
+Publishes it to the segment, the service manager and the log.
+"""
 
 from __future__ import annotations
 
@@ -21,17 +24,17 @@ from shmio.supervisor.policy import State
 from shmio.supervisor.process import NOTIFY_VARIABLES
 
 QUALITY_S: Final = 0.5
-"""Interval at which the sources' quality is checked after the start, in s."""
+"""Interval in s at which the sources' quality is checked after the start."""
 LOOK_S: Final = 5.0
-"""Interval at which the folder of the log files is checked, in s."""
+"""Interval in s at which the folder of the log files is checked."""
 SILENT_S: Final = 15.0
-"""Time without an answer from the disk that counts as a problem, in s."""
+"""Time in s without an answer from the disk that counts as a problem."""
 
 _SOCKET, _WATCHDOG_USEC, _WATCHDOG_PID = NOTIFY_VARIABLES
 
 
 class LogFolder:
-    """Checks in a thread whether the log folder is writable, because a disk may hang."""
+    """Checks whether the log folder is writable, in a thread because a disk may hang."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -40,7 +43,7 @@ class LogFolder:
         self._found = ""
 
     def problem(self, now_ns: int) -> str:
-        """Return the last problem found, or "". Start a new check if one is due."""
+        """Return the problem that the last check found, or "". Start a new check if one is due."""
         waited_s = 0.0 if self._begun_ns is None else (now_ns - self._begun_ns) / 1e9
         if self._looking is not None and self._looking.is_alive():
             return f"log_dir: {self._folder}: the disk does not answer" if waited_s > SILENT_S else self._found
@@ -68,7 +71,7 @@ class Notifier:
         self._beat_ns = 0
 
     def ready(self) -> None:
-        """Report that the start or a reload is over."""
+        """Report that the start or a reload is complete."""
         self._send("READY=1")
 
     def reloading(self) -> None:
@@ -80,11 +83,11 @@ class Notifier:
         self._send("STOPPING=1")
 
     def status(self, text: str) -> None:
-        """Report a line of text, which the service manager shows to people."""
+        """Report a line of text, which the service manager shows to the user."""
         self._send("STATUS=" + text.replace("\n", " "))
 
     def beat(self, now_ns: int) -> None:
-        """Trigger the watchdog if that is due."""
+        """Notify the watchdog of the service manager, if that is due."""
         if self._period_ns and now_ns - self._beat_ns >= self._period_ns:
             self._beat_ns = now_ns
             self._send("WATCHDOG=1")
@@ -98,14 +101,14 @@ class Notifier:
 
 
 def _socket_address(name: str) -> str:
-    """Return the address of the socket: a path or an abstract name (``@…``), otherwise ""."""
+    """Return the address of the service manager's socket: a path, an abstract name (``@…``), or ""."""
     if name.startswith("@"):
         return "\0" + name[1:]
     return name if name.startswith("/") else ""
 
 
 def _watchdog_ns(environment: Mapping[str, str]) -> int:
-    """Return the watchdog period in ns; 0 if there is none, or it is for another process."""
+    """Return the watchdog period in ns; 0 if there is no watchdog, or it is for another process."""
     if environment.get(_WATCHDOG_PID, str(os.getpid())) != str(os.getpid()):
         return 0
     text = environment.get(_WATCHDOG_USEC, "")
@@ -123,7 +126,7 @@ class Health:
         logs: LogFolder,
         on_state: Callable[[InstanceState], None],
     ) -> None:
-        """Create it; ``on_state`` is called with each new state."""
+        """Create it. ``on_state`` is called with each new state of the instance."""
         self._segment = segment
         self._fleet = fleet
         self._notifier = notifier
@@ -134,7 +137,7 @@ class Health:
         self._qualities_ns = 0
 
     def look(self) -> list[Quality | None]:
-        """Return the present quality of each source; None for a source that has no frame."""
+        """Return the present quality of each source; None for a source without a frame."""
         qualities: list[Quality | None] = []
         for block in self._segment.blocks.values():
             try:
@@ -146,7 +149,7 @@ class Health:
         return qualities
 
     def publish(self, now_ns: int, *, started: bool, stopping: bool) -> None:
-        """Publish the state of the instance, which is also the supervisor's heartbeat."""
+        """Publish the state of the instance. This also serves as the supervisor's heartbeat."""
         note = self._logs.problem(now_ns)
         state = self._assess(now_ns, note) if started and not stopping else InstanceState.STARTING
         if stopping:

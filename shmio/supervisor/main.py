@@ -29,15 +29,15 @@ from shmio.supervisor.reload import Reloader
 from shmio.supervisor.takeover import take_over
 
 START_TICK_S: Final = 0.01
-"""Interval of checks while a process starts, in s: its report cannot wake the supervisor."""
+"""Interval in s of checks while a process starts: the process's report cannot wake the supervisor."""
 MAX_ADDRESSES: Final = 16
-"""Limit on the listening addresses of a process in an answer."""
+"""Largest number of a process's listening addresses in an answer."""
 NAME_S: Final = 1.0
-"""Interval at which to check that the segment's name still exists, in s."""
+"""Interval in s at which to check that the segment still exists under its name."""
 
 
 class Supervisor:
-    """Runs an instance from its start to its clean end. Use once, from the main thread."""
+    """Runs an instance from its start to its clean end. Use an object once, in the main thread."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class Supervisor:
 
         Args:
             plan: The instance to run. The folder of the log files must exist.
-            replan: Makes a new plan from the present configuration for a reload; it raises
+            replan: Makes a new plan from the present configuration, for a reload. It may raise
                 ShmioError.
             limits: Time-outs and counts for the processes.
             modules: The Python module of each kind of process.
@@ -73,18 +73,18 @@ class Supervisor:
         self._found_ns = 0
         self._adopted: dict[str, int] = {}
         self.history: list[str] = []
-        """Lines about what an earlier supervisor left, and what was done about it."""
+        """Lines that say what an earlier supervisor left behind, and what was done with it."""
 
     def run(self) -> None:
-        """Start everything, or take over what a dead supervisor left; return after a stop.
+        """Start the instance, or take over what a dead supervisor left behind; return after a stop.
 
         Raises:
             AlreadyRunningError: Another supervisor runs the instance.
-            SegmentError: There is no memory for the segment.
+            SegmentError: There is not enough memory for the segment.
             ControlError: The control socket cannot be created.
-            ShmioError: A process could not be started, or the segment was removed, and all is
-                stopped. Or the supervisor itself failed, and its processes continue for the next
-                one.
+            ShmioError: A process could not be started, or the segment was removed; all processes
+                are stopped. Or the supervisor itself failed; its processes continue, and the next
+                supervisor can take them over.
 
         """
         with ExitStack() as stack:
@@ -163,7 +163,7 @@ class Supervisor:
         self._reloader.drop()
 
     def _hasten(self) -> None:
-        """Kill the processes that have not stopped, after a second request to stop."""
+        """Kill the processes that have not stopped yet, after a second request to stop."""
         log.warning("killing the processes that have not stopped yet")
         for managed in self._fleet:
             self._fleet.apply(managed, Event.HASTEN)
@@ -183,7 +183,7 @@ class Supervisor:
             answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
 
     def _busy(self) -> str | None:
-        """Return why requests for changes are refused at present, or None if they are accepted."""
+        """Return why requests for changes are refused at present; None if they are accepted."""
         return "the instance is stopping" if self._stopping else self._reloader.busy()
 
     def _restart(self, name: str, answer: Answer) -> None:
@@ -192,14 +192,14 @@ class Supervisor:
         elif reason := self._busy():
             answer.error(reason)
         else:
-            log.info("asked to restart %s", name)
+            log.info("a client asked to restart %s", name)
             managed = self._fleet.named(name)
             managed.waiting.append(answer)
             self._fleet.apply(managed, Event.RESTART)
             managed.answer()  # a stuck process is reported at once
 
     def _reload(self, answer: Answer) -> None:
-        log.info("asked to reload %s", self._reloader.plan.config_file)
+        log.info("a client asked to reload %s", self._reloader.plan.config_file)
         reason = self._busy() or (None if self._started else "the instance is starting: try again when it is running")
         if reason:
             answer.error(reason)
@@ -207,7 +207,7 @@ class Supervisor:
             self._reloader.reload(answer)
 
     def _replaced(self) -> list[str]:
-        """Return a line about each adopted process that was replaced or stopped at once."""
+        """Return a line about each adopted process that was immediately replaced or stopped."""
         lines = []
         for name, pid in self._adopted.items():
             managed = self._fleet.named(name) if name in self._fleet.names else None
@@ -244,16 +244,18 @@ class Supervisor:
         return self._stopping and policy.all_gone(self._fleet.ranked)
 
     def _follow_stop(self) -> None:
-        """Answer the clients that wait for the stop if stuck processes prevent it."""
+        """If stuck processes prevent the stop, answer the clients that wait for it."""
         there = [managed for managed in self._fleet if managed.life.state is not State.STOPPED]
         if there and all(managed.life.stuck for managed in there):
             stuck = "; ".join(f"{managed.name}: {managed.life.note}" for managed in there)
             for answer in self._stop_answers:
-                answer.error(f"all else is stopped, but {stuck}; the stop continues as soon as it has ended")
+                answer.error(
+                    f"all other processes are stopped, but {stuck}; the stop continues as soon as it has ended"
+                )
             self._stop_answers.clear()
 
     def _follow_name(self) -> None:
-        """Stop if the segment's name is gone: nobody could find or stop the instance any more."""
+        """Stop if the segment no longer has its name: nobody could find or stop the instance."""
         if not self._segment.shared.current():
             name = self._segment.shared.name
             self._failure = f"the shared memory {name} was removed while the instance ran: stopping all processes"
@@ -277,7 +279,7 @@ class Supervisor:
 def _wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int], None]) -> Iterator[None]:
     """Call ``on_signal`` from the selector's loop for SIGINT, SIGTERM and SIGHUP.
 
-    SIGHUP is included unless it is ignored, as under nohup.
+    SIGHUP is left out if it is ignored, as under nohup.
     """
     receiver, sender = socket.socketpair()
     with receiver, sender:
@@ -304,4 +306,4 @@ def _wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int]
 
 
 def _wake(_number: int, _frame: FrameType | None) -> None:
-    """Do nothing: Python writes the wake-up descriptor only for signals with a handler."""
+    """Do nothing. Python writes to the wake-up descriptor only for signals that have a handler."""

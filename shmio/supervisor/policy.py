@@ -28,7 +28,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """Events that change a process's state. ELAPSED: the time limit of its state has passed."""
+    """What can change a process's state. ELAPSED: the time limit of the state has passed."""
 
     START = "start"
     READY = "ready"
@@ -42,7 +42,7 @@ class Event(Enum):
 
 
 class Action(Enum):
-    """The actions of the supervisor."""
+    """What the supervisor does after a change of state."""
 
     SPAWN = "spawn"
     TERMINATE = "terminate"
@@ -106,7 +106,7 @@ GRAPH: Final[Mapping[State, Mapping[Event, Edge]]] = {
         Event.HASTEN: (State.STOPPED, None),
     },
 }
-"""All edges. An event that a state does not list has no effect."""
+"""The next state for each state and event. An event that a state does not list has no effect."""
 
 PHASES: Final[Mapping[State, Phase]] = {
     State.STOPPED: Phase.STOPPED,
@@ -125,68 +125,71 @@ LIVING: Final = frozenset({State.STARTING, State.RUNNING, State.STOPPING, State.
 
 
 REFUSED_STATUS = 2
-"""Exit status of a worker that can never work as configured."""
+"""Exit status of a process that can never work as configured."""
 RESTART: Final = Backoff(0.5, 10.0)
-"""Back-off between starts of a process, from its second crash on."""
+"""The waiting times before starts of a process, from its second crash on."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Time-outs and counts for the processes; all times in s."""
+    """Time-outs and counts for the processes. All times are in s."""
 
     start_s: float = 20.0
     """Time-out from the start of a process until it reports that it runs."""
     start_most_s: float = 60.0
-    """The same time-out, for a process that has waited for a processor most of the time."""
+    """The same time-out for a process that had to wait for a processor most of this time."""
     hang_s: float = 5.0
-    """Longest time without a heartbeat while running."""
+    """Longest time without a heartbeat, while the process runs."""
     grace_s: float = 5.0
     """Time from SIGTERM to SIGKILL."""
     kill_s: float = 5.0
     """Time from SIGKILL until a process that still exists counts as stuck."""
     stable_s: float = 5.0
-    """Time after which a running process is stable: its earlier crashes no longer count."""
+    """Time after which a running process counts as stable: its earlier crashes no longer count."""
     backoff: Backoff = RESTART
     start_attempts: int = 3
-    """Number of crashes of a process that never ran after which the instance's start has failed."""
+    """If a process has never run, the number of its crashes that makes the instance's start fail."""
     settle_s: float = 3.0
-    """Longest wait for the sources' first frames before the start of the instance is over."""
+    """Longest time to wait for the sources' first frames before the instance counts as started."""
     plan_s: float = 60.0
-    """Longest time to read the configuration and all that it names for a reload."""
+    """Longest time for a reload to read the configuration and all files that it names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Life:
-    """The recorded state and history of a process. Times are CLOCK_MONOTONIC, in ns."""
+    """The state of a process, and its history. Times are in ns of CLOCK_MONOTONIC."""
 
     state: State = State.STOPPED
     due_ns: int | None = None
-    """End of the state's time limit; None if it has none."""
+    """When the time limit of the state ends; None if the state has none."""
     spawned_ns: int = 0
     ready_ns: int | None = None
-    """Time at which it reported that it runs; None from a start until then."""
+    """When the process reported that it runs; None from its start until then."""
     starts: int = 0
     crashes: int = 0
-    """Number of consecutive crashes; a stable run resets it."""
+    """Number of consecutive crashes. It is reset when the process has run stably."""
     ran: bool = False
-    """True if it has ever run."""
+    """True if the process has ever run."""
     note: str = ""
-    """Reason why it is not running."""
+    """Why the process is not running."""
     hang: str = ""
-    """Reason why it was last killed as hung; the note about its end includes this text."""
+    """Why the process was last killed as hung. The note about its end includes this text."""
     killed: bool = False
-    """True if it was sent SIGKILL and has not ended yet."""
+    """True if the process was sent SIGKILL and has not ended yet."""
     stuck: bool = False
-    """True if it has not ended in time after SIGKILL: it waits in the kernel."""
+    """True if the process has not ended in time after SIGKILL, because it waits in the kernel."""
 
     @property
     def restarts(self) -> int:
-        """Number of starts after the first, for any reason."""
+        """Number of starts of the process after the first, for any reason."""
         return max(0, self.starts - 1)
 
 
 def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") -> tuple[Life, Action | None]:
-    """Return the life after an event, and the action to take. ``note`` says how a process ended."""
+    """Return the state after an event, and the action to take.
+
+    ``note`` says how a process ended.
+    """
     edge = GRAPH[life.state].get(event)
     if edge is None:
         return life, None
@@ -242,20 +245,20 @@ def _allowed_s(state: State, action: Action | None, crashes: int, limits: Limits
 
 
 def backoff_s(crashes: int, limits: Limits) -> float:
-    """Return the wait before the next start, in s: 0 after the first crash."""
+    """Return the waiting time in s before the next start; 0 after the first crash."""
     return limits.backoff.wait_s(crashes - 2) if crashes > 1 else 0.0
 
 
 def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, waited_ns: int = 0) -> Event | None:
-    """Return the event that the time or the worker's report causes, if any.
+    """Return the event that the time or the process's report causes; None if there is none.
 
     Args:
         life: The state of the process.
-        now_ns: The time now.
-        ready: True if it has reported that it runs.
-        quiet_ns: Time without a heartbeat, in ns.
+        now_ns: The present time.
+        ready: True if the process has reported that it runs.
+        quiet_ns: Time since the last heartbeat, in ns.
         limits: The limits that apply.
-        waited_ns: Time since its start in which it waited for a processor, in ns.
+        waited_ns: How long the process has waited for a processor since its start, in ns.
 
     """
     if life.state is State.STARTING:
@@ -272,23 +275,23 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
 
 
 def adopted(spawned_ns: int, restarts: int) -> Life:
-    """Return the state of an adopted process, from its former supervisor's records."""
+    """Return the state of an adopted process, from the records of its former supervisor."""
     return Life(State.RUNNING, spawned_ns=spawned_ns, ready_ns=spawned_ns, starts=restarts + 1, ran=True)
 
 
 def ended(returncode: int | None) -> Event:
-    """Return the event for the end of a process; ``returncode`` is None if it is unknown."""
+    """Return the event for the end of a process; ``returncode`` is None if it is not known."""
     return Event.REFUSAL if returncode == REFUSED_STATUS else Event.EXIT
 
 
 Ranked = Sequence[tuple[int, Life]]
-"""Rank and state of each process. A rank starts after the lower ranks, and stops before them."""
+"""Rank and state of each process. Lower ranks start first and stop last."""
 
 
 def to_start(processes: Ranked) -> list[int]:
-    """Return the indices of the processes to start: the lowest rank not started yet.
+    """Return the indices of the processes to start: those of the lowest rank not started yet.
 
-    Higher ranks wait for a process at its first start, but not for one that has failed.
+    Higher ranks wait until processes of lower ranks run for the first time, or have failed.
     """
     ranks = {rank for rank, life in processes if not life.starts}
     if not ranks or any(life.starts == 1 and life.state is State.STARTING for _, life in processes):
@@ -298,9 +301,9 @@ def to_start(processes: Ranked) -> list[int]:
 
 
 def to_stop(processes: Ranked) -> list[int]:
-    """Return the indices of the processes to stop: those of the highest rank that has not stopped.
+    """Return the indices of the processes to stop: those of the highest rank not stopped yet.
 
-    A stop does not wait for stuck processes.
+    Stuck processes do not delay the stop of others.
     """
     there = [rank for rank, life in processes if not (life.state is State.STOPPED or _past_stopping(life))]
     turn = max(there, default=None)
@@ -313,12 +316,12 @@ def _past_stopping(life: Life) -> bool:
 
 
 def all_gone(processes: Ranked) -> bool:
-    """Return whether a stop is complete."""
+    """Return whether all processes have stopped."""
     return all(life.state is State.STOPPED for _, life in processes)
 
 
 def start_failure(life: Life, limits: Limits) -> str | None:
-    """Return the reason if this process makes the instance's start fail, or None."""
+    """Return why this process makes the instance's start fail; None if it does not."""
     if life.ran:
         return None
     if life.state is State.FATAL or life.stuck:
@@ -331,13 +334,14 @@ def start_failure(life: Life, limits: Limits) -> str | None:
 def start_over(
     processes: Ranked, qualities: Sequence[Quality | None], since_ns: int, now_ns: int, limits: Limits
 ) -> bool:
-    """Return whether the instance's start is over: all processes ran, all sources have a quality.
+    """Return whether the instance has started: all processes ran, and all sources have a quality.
 
     Args:
-        processes: Rank and life of each process.
-        qualities: The quality of each source; None for one without a frame.
-        since_ns: Time at which the last process became ready; sources get ``settle_s`` from then.
-        now_ns: The time now.
+        processes: Rank and state of each process.
+        qualities: The quality of each source; None for a source without a frame.
+        since_ns: When the last process became ready. From then on, sources have ``settle_s`` to
+            deliver a frame.
+        now_ns: The present time.
         limits: The limits that apply.
 
     """

@@ -1,4 +1,4 @@
-"""One process, spawned or adopted: signals it, watches it by its pidfd, and describes its end."""
+"""One process, started or adopted: signals it, watches it by its pidfd, and describes its end."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ _STAMP = re.compile(r"^\S+Z [A-Z]+ +\S+\[\d+\] ")  # beginning of a line of shmi
 
 
 class ChildProcess:
-    """A running child process, in a session of its own so that Ctrl-C in the terminal misses it."""
+    """A running child process.
+
+    It has its own session, so that Ctrl-C in the terminal does not reach it.
+    """
 
     def __init__(self, popen: subprocess.Popen[bytes], log_file: Path, log_size: int) -> None:
         self._popen = popen
@@ -67,7 +70,7 @@ class ChildProcess:
         self._popen.send_signal(signal.SIGTERM)
 
     def reread(self) -> None:
-        """Send SIGHUP: the process reads its rules again."""
+        """Send SIGHUP, which makes the process read its rules again."""
         self._popen.send_signal(signal.SIGHUP)
 
     def kill(self) -> None:
@@ -75,13 +78,19 @@ class ChildProcess:
         self._popen.kill()
 
     def reap(self) -> int:
-        """Return an ended process's exit code (-n: killed by signal n); close its pidfd."""
+        """Return the exit code of a process that has ended (-n: killed by signal n).
+
+        Close its pidfd.
+        """
         code = self._popen.wait()
         os.close(self.pidfd)
         return code
 
     def waited_ns(self) -> int:
-        """Return the time that its main thread has waited for a processor, in ns; 0 if unknown."""
+        """Return how long the process's main thread has waited for a processor, in ns.
+
+        0 if unknown.
+        """
         with suppress(OSError, IndexError, ValueError):  # proc(5): a kernel may lack the file
             return int(Path(f"/proc/{self.pid}/schedstat").read_text().split()[1])
         return 0
@@ -97,10 +106,13 @@ class ChildProcess:
 
 
 class AdoptedProcess:
-    """A running process of another supervisor. It is not a child, so its exit status is unknown."""
+    """A running process that another supervisor has started.
+
+    It is not a child of this process, so that its exit status cannot be known.
+    """
 
     def __init__(self, pid: int, pidfd: int) -> None:
-        """Take the process's descriptors; :meth:`reap` closes ``pidfd``."""
+        """Store the process's descriptors; :meth:`reap` closes ``pidfd``."""
         self.pid = pid
         self.pidfd = pidfd
 
@@ -109,7 +121,7 @@ class AdoptedProcess:
         self._send(signal.SIGTERM)
 
     def reread(self) -> None:
-        """Send SIGHUP: the process reads its rules again."""
+        """Send SIGHUP, which makes the process read its rules again."""
         self._send(signal.SIGHUP)
 
     def kill(self) -> None:
@@ -130,12 +142,12 @@ class AdoptedProcess:
         return 0
 
     def last_words(self) -> str:
-        """Return "", because it is unknown which lines of the log file are its own."""
+        """Return "", because it is not known which lines of the log file are from this process."""
         return ""
 
 
 def _open_log(file: Path) -> int:
-    """Open a log file for appending, or /dev/null if that fails."""
+    """Open a log file for appending; if that fails, open /dev/null."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         return os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -144,7 +156,7 @@ def _open_log(file: Path) -> int:
 
 
 def describe_end(code: int | None) -> str:
-    """Return an exit code in words; ``code`` is None if it is unknown."""
+    """Return an exit code in words; ``code`` is None if it is not known."""
     if code is None:
         return "ended; its exit status is unknown, because an earlier supervisor started it"
     if code >= 0:
@@ -156,10 +168,11 @@ def describe_end(code: int | None) -> str:
 
 
 def child_environment() -> dict[str, str]:
-    """Return the environment of a child: it imports the supervisor's shmio.
+    """Return the environment of a child, in which it imports the same shmio as the supervisor.
 
-    The current folder must not provide modules, hence ``-P``, and the folder of a shmio that is not
-    installed (never site-packages, which would precede the standard library).
+    ``-P`` prevents that modules are imported from the current folder. If shmio is not installed,
+    its folder is therefore added. (With site-packages, this would hide modules of the standard
+    library.)
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
     # gRPC prints a line for each bad handshake, which any client may send, into a log that would not even rotate then.

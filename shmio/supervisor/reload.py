@@ -1,7 +1,7 @@
-"""Reload and take-over: compare an instance with its plan, and change it to match.
+"""Reload and take-over: compares an instance with its plan, and changes it to match the plan.
 
-Processes and blocks that already match are left alone. A thread makes the plan of a reload, so that
-supervision continues meanwhile; the supervisor's loop applies the plan.
+Processes and blocks that already match are not touched. For a reload, a thread makes the plan, so
+that supervision continues meanwhile. The supervisor's loop then applies the plan.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ from shmio.supervisor.policy import Event, Limits, State
 
 @dataclass(frozen=True, slots=True)
 class _Changes:
-    """The differences between an instance and a plan, by name. ``replaced`` processes stop and start."""
+    """The differences between an instance and a plan, as names.
+
+    ``replaced`` processes stop and start.
+    """
 
     kept: tuple[str, ...]
     started: tuple[str, ...]
@@ -37,7 +40,8 @@ class _Changes:
 def _reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> _Changes:
     """Compare a plan with the present processes and blocks.
 
-    A source is replaced together with its block, because a source process writes to one block only.
+    A source is replaced together with its block, because the process of a source writes to one
+    block only.
     """
     present = {block.source: block for block in blocks}
     add = tuple(spec for spec in plan.blocks if spec.source not in present or not _same(spec, present[spec.source]))
@@ -76,7 +80,7 @@ def _same(spec: BlockSpec, block: Block) -> bool:
 
 
 def _refusal(plan: Plan, running: Plan) -> str | None:
-    """Return why a running instance cannot change to the plan, or None if it can."""
+    """Return why a running instance cannot change to the plan; None if it can."""
     fixed = {
         "instance.name": (running.instance, plan.instance),
         "instance.group": (running.group, plan.group),
@@ -86,8 +90,8 @@ def _refusal(plan: Plan, running: Plan) -> str | None:
     for key, (old, new) in fixed.items():
         if old != new:
             return (
-                f"{key}: {_shown(new)} instead of {_shown(old)} cannot be taken while the instance runs; "
-                "nothing has changed: shmio-supervisor down and up take it"
+                f"{key}: {_shown(new)} instead of {_shown(old)} cannot be applied while the instance runs; "
+                "nothing has changed: apply it by shmio-supervisor down and up"
             )
     return None
 
@@ -110,7 +114,7 @@ class InstanceChange:
         """Begin the change.
 
         Raises:
-            SegmentError: There is no room for new processes or blocks; nothing has changed.
+            SegmentError: There is no room for new processes or blocks; nothing was changed.
 
         """
         self.plan = plan
@@ -135,7 +139,10 @@ class InstanceChange:
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
-        """Continue as far as possible; return True once each new process runs or has failed once."""
+        """Continue as far as possible now.
+
+        Return True when each new process runs or has failed once.
+        """
         if not self._stopped:
             self._stopped = self._stop()
             if self._stopped:
@@ -150,15 +157,18 @@ class InstanceChange:
 
     @property
     def stuck(self) -> str:
-        """Text about processes that do not end although the change waits for them; "" if none."""
+        """A text about processes that do not end although the change waits for their end.
+
+        "" if none.
+        """
         leaving = [] if self._stopped else [self._fleet.named(name) for name in self._leaving]
         return "; ".join(f"{managed.name}: {managed.life.note}" for managed in leaving if managed.life.stuck)
 
     def _stop(self) -> bool:
-        """Stop the processes to remove or replace, by rank: the recorder must get the last data.
+        """Stop the processes to remove or replace, in order of rank: the recorder stops last.
 
         Returns:
-            True if all have ended.
+            True if all of them have ended.
 
         """
         leaving = [self._fleet.named(name) for name in self._leaving]
@@ -190,7 +200,7 @@ class InstanceChange:
     def outcome(self) -> tuple[list[str], list[str]]:
         """Return two lists of lines: what was done, and which problems there are."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
-        done += [f"{name}: asked to reload its tokens and roles" for name in self._signalled]
+        done += [f"{name}: the supervisor asked it to reload its tokens and roles" for name in self._signalled]
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)
@@ -229,7 +239,7 @@ class _PendingPlan:
 
     @property
     def late(self) -> bool:
-        """True if the time limit has passed. A late result is ignored."""
+        """True if the time limit has passed. A result that comes later is ignored."""
         return not self.over and time.monotonic() >= self._deadline
 
     def result(self) -> Plan:
@@ -245,7 +255,7 @@ class _PendingPlan:
 
 
 class Reloader:
-    """Keeps the plan in force, and carries out one change of the instance at a time."""
+    """Holds the plan in force, and carries out one change of the instance at a time."""
 
     def __init__(
         self,
@@ -258,7 +268,7 @@ class Reloader:
     ) -> None:
         self.plan = plan
         self.read_ns = time.time_ns()
-        """Time at which the configuration was read, in ns since 1970."""
+        """When the configuration was read, in ns since 1970."""
         self._fleet = fleet
         self._segment = segment
         self._notifier = notifier
@@ -274,7 +284,7 @@ class Reloader:
         return self._change is not None
 
     def busy(self) -> str | None:
-        """Return why another change cannot begin at present, or None if it can."""
+        """Return why another change cannot begin at present; None if it can."""
         if self._change is None:
             return None
         if stuck := self._change.stuck:
@@ -282,11 +292,16 @@ class Reloader:
         return "another change of the instance is in progress: try again when it is done"
 
     def follow(self) -> None:
-        """Change a taken-over instance to match the plan, or raise SegmentError: no room."""
+        """Begin to change an instance that was taken over, so that it matches the plan.
+
+        Raises:
+            SegmentError: There is no room for new processes or blocks.
+
+        """
         self._change = InstanceChange(self._fleet, self._segment, self.plan)
 
     def reload(self, answer: Answer) -> None:
-        """Make a new plan and apply it; refuse while another reload is in progress."""
+        """Make a new plan and apply it. Refuse this if another reload is in progress."""
         reason = self.busy() or (self._planning and "another reload is being prepared: try again when it is done")
         if reason:
             answer.error(reason)
@@ -295,7 +310,7 @@ class Reloader:
         self._planning, self._answer = _PendingPlan(self._replan, self._limits.plan_s), answer
 
     def drop(self) -> None:
-        """Cancel the change, because the instance is stopping."""
+        """Cancel the change, because the instance stops."""
         if self._answer is not None:
             self._answer.error("the instance is stopping")
         self._planning = self._change = self._answer = None
@@ -317,7 +332,7 @@ class Reloader:
         except Exception as error:  # noqa: BLE001 - a connector's own check may raise anything; the instance goes on
             expected = isinstance(error, ShmioError)
             reason = str(error) if expected else f"the reload failed: {brief(error)}"
-            log.error("nothing is changed: %s", reason, exc_info=None if expected else error)
+            log.error("nothing was changed: %s", reason, exc_info=None if expected else error)
             self._answer_client(lambda answer: answer.error(reason))
             return
         self.plan, self.read_ns = plan, planning.read_ns
@@ -341,7 +356,7 @@ class Reloader:
         self._answer_client(lambda answer: answer.ok(**result))
 
     def _answer_client(self, how: Callable[[Answer], None]) -> None:
-        """Answer the client that asked for the reload, unless it was answered."""
+        """Answer the client that asked for the reload, unless it already has an answer."""
         if self._answer is not None:
             self._notifier.ready()
             how(self._answer)

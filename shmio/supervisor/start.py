@@ -1,4 +1,4 @@
-"""Checks before an instance starts: it is not running, and its ports and its folder for log files are free."""
+"""Checks before an instance starts: it does not run, and its ports and its log folder are free."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOCK_NAME: Final = ".instance"
 
 
 def check_startable(plan: Plan) -> None:
-    """Check that an instance can start. Ports of a dead supervisor's processes count as free.
+    """Check that an instance can start. Ports used by processes of a dead supervisor count as free.
 
     Raises:
         AlreadyRunningError: The instance is running; the message says how to stop it.
@@ -43,7 +43,7 @@ def _refuse_second(plan: Plan) -> None:
 
 
 def _whose(plan: Plan) -> str:
-    """Return the end of a message: the running instance's configuration file, and what to do."""
+    """Return the end of a message: which file the running instance was started from, and what to do."""
     down = f"shmio-supervisor down --instance {plan.instance} stops it"
     with suppress(ShmioError), Segment.open(plan.instance) as segment:
         if segment.config not in (None, plan.config_file):
@@ -53,13 +53,13 @@ def _whose(plan: Plan) -> str:
 
 @contextmanager
 def hold_log_folder(folder: Path, instance: str) -> Iterator[None]:
-    """Create an instance's folder for log files, and lock it for the length of a ``with`` block.
+    """Create an instance's folder for log files, and lock it for the duration of a ``with`` block.
 
-    Only one instance may use a folder, because log files of two would have the same names.
+    Only one instance may use a folder, because the log files of two would have the same names.
 
     Raises:
-        ConfigError: Another instance uses the folder, or it cannot be written.
-        AlreadyRunningError: This instance already runs, and uses it.
+        ConfigError: Another instance uses the folder, or the folder cannot be written.
+        AlreadyRunningError: This instance already runs, and uses the folder.
 
     """
     try:

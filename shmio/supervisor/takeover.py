@@ -1,4 +1,4 @@
-"""Take over the segment and the running processes of a dead supervisor."""
+"""Takes over the segment and the running processes of a dead supervisor."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from shmio.supervisor.process import AdoptedProcess
 
 @dataclass
 class TakenOver:
-    """A dead supervisor's segment, now locked by this one, and its processes that continue."""
+    """The segment of a dead supervisor, locked by this one now, and its processes that continue."""
 
     segment: Segment
     children: list[tuple[ProcessSlot, AdoptedProcess]] = field(default_factory=list)
 
 
 def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | None, list[str]]:
-    """Take over the segment and the processes that match the plan; stop and remove the rest.
+    """Take over the segment and the processes that match the plan; stop and remove all others.
 
     Args:
         plan: The plan of the instance.
@@ -34,7 +34,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | Non
         limits: Time-outs for the processes.
 
     Returns:
-        What was taken over, or None, and a line about each thing that was done.
+        What was taken over, or None; and a line about each thing that was done.
 
     Raises:
         AlreadyRunningError: A supervisor is alive.
@@ -63,7 +63,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | Non
 
 
 def _usable_segment(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str]]:
-    """Return the segment, or None if the plan cannot continue in it, and lines about it."""
+    """Return the segment, or None if the plan cannot use it; and lines that say why."""
     try:
         segment = stale_segment.read(shared, plan.instance)
     except (FormatError, UnfinishedError):  # reported when the segment is cleared
@@ -80,18 +80,18 @@ def _usable_segment(shared: SharedObject, plan: Plan) -> tuple[Segment | None, l
         return None, [f"{plan.instance} played another recording: it starts anew"]
     status = (shm.DIRECTORY / shared.name).stat()
     if status.st_uid != os.geteuid():
-        return None, [f"segment {shared.name} belongs to another user: it starts anew"]
+        return None, [f"segment {shared.name} belongs to another user: the instance starts anew"]
     if stat.S_IMODE(status.st_mode) & 0o040 != (0o040 if plan.group else 0) or (
         plan.group and status.st_gid != grp.getgrnam(plan.group).gr_gid
     ):
-        return None, [f"instance.group has changed, {plan.instance} starts anew"]
+        return None, [f"instance.group has changed: {plan.instance} starts anew"]
     return segment, []
 
 
 def _adopt_or_end(
     segment: Segment, shared: SharedObject, limits: Limits
 ) -> tuple[list[tuple[ProcessSlot, AdoptedProcess]], list[str]]:
-    """Adopt the processes that run well, and end the others.
+    """Adopt the processes that run properly, and end the others.
 
     Raises:
         SegmentError: A process cannot be identified, or does not end.
@@ -133,7 +133,7 @@ def _adopt_or_end(
 
 
 def _unfit_reason(slot: ProcessSlot, limits: Limits) -> str | None:
-    """Return why a living process cannot be adopted, or None if it can."""
+    """Return why a living process cannot be adopted; None if it can."""
     if slot.report.activity is not Activity.RUNNING:
         return f"was {slot.report.activity.name.lower()}"
     quiet_s = (time.monotonic_ns() - slot.heartbeat_ns) / 1e9

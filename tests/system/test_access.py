@@ -69,7 +69,10 @@ def test_a_reload_adds_and_removes_tokens(guarded: Cell) -> None:
         before = file.read_text()
         file.write_text(before + MORE)
         reload = guarded.supervisor("reload")
-        assert (reload.returncode, "grpc: asked to reload its tokens and roles" in reload.stdout) == (0, True)
+        assert (reload.returncode, "grpc: the supervisor asked it to reload its tokens and roles" in reload.stdout) == (
+            0,
+            True,
+        )
         until(lambda: subscribe(guarded, address, "--token-file", "other").returncode == 0, "the new token taken")
         assert next(stream).value, "the stream of a token that is still valid continues"
         (guarded.folder / "other").chmod(0o644)

@@ -69,7 +69,7 @@ def test_recorded_sources_replace_the_configured_ones(file: Path) -> None:
     options = plan.jobs[0].config["options"]
     assert (options["own_clock"], options["loop"], options["file"]) == (True, True, [str(file)])
     notices = "\n".join(plan.warnings)
-    assert "source panel is left out: the recording has none of it; it has cell, arm" in notices
+    assert "source panel is left out: the recording does not contain it; it contains cell, arm" in notices
     assert "emulator plc is left out: a replay reads no device" in notices
     assert "the configuration's injections are left out" in notices
     assert "grpc.default_source is left out" in notices
@@ -163,7 +163,7 @@ def test_check_covers_the_replay_section(
     assert main(["check"]) == 0
     out = capsys.readouterr().out
     assert "  with --mode replay: source cell: DB1, 2 registers, 4 bytes" in out
-    assert "warning: source panel is left out: the recording has none of it; it has cell, arm\n" in out
+    assert "warning: source panel is left out: the recording does not contain it; it contains cell, arm\n" in out
     assert out.endswith("usable, with 1 warning\n")
     config.write_text(text + "speed = 2.0\n")
     assert main(["check"]) == 0
@@ -183,7 +183,7 @@ def test_check_covers_the_replay_section(
 @pytest.mark.parametrize(
     ("keys", "error"),
     [
-        ({}, "replay.file: what is to be played"),
+        ({}, "replay.file: name the recording to play"),
         ({"file": ["none.mem"]}, "replay.file: "),
         ({"start": 90.0}, "replay.start, end: there is nothing to play"),
         ({"start": "then"}, "replay.start: 'then' is neither"),

@@ -235,7 +235,8 @@ def test_an_idle_emulator_plays_all_blocks_of_its_files(example: Edit, capsys: p
     capsys.readouterr()
     assert main(["check"]) == 1
     assert (
-        "emulator[0].layout: it holds several data blocks (DB7, DB201); choose one by block" in capsys.readouterr().err
+        "emulator[0].layout: the files contain several data blocks (DB7, DB201); choose one by block"
+        in capsys.readouterr().err
     )
 
 
@@ -530,7 +531,7 @@ def test_check_reports_a_priority_that_is_not_allowed(
     )
 
 
-TAKEN = "is the port of emulator[0].listen (127.0.0.1:1102) already; choose another"
+TAKEN = "is already the port of emulator[0].listen (127.0.0.1:1102); choose another port"
 
 
 @pytest.mark.parametrize(
@@ -603,7 +604,7 @@ def test_up_detach_reports_faults(example: Edit, capsys: pytest.CaptureFixture[s
     example("perid_ms", "period_ms")
     Path("supervisor.toml").rename("other.toml")
     assert main(["up", "--detach", "--mode", "replay", "-c", "other.toml"]) == 1
-    assert capsys.readouterr().err.startswith("other.toml: replay.file: what is to be played")
+    assert capsys.readouterr().err.startswith("other.toml: replay.file: name the recording to play")
 
 
 @pytest.mark.parametrize("address", ["127.0.0.2:1102", "[::1]:1102", "localhost:0"])
@@ -712,7 +713,9 @@ def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys
     example('layout = "db201.db"\nhost', 'layout = "two.db"\nhost')
     assert main(["check"]) == 1
     error = capsys.readouterr().err
-    assert "source[0].layout: it holds several data blocks (DB201, DB7); choose one by block or dbNumber" in error
+    assert (
+        "source[0].layout: the files contain several data blocks (DB201, DB7); choose one by block or dbNumber" in error
+    )
     example("port = 1102", f"port = 1102\n{key}")
     example('writable = ["Outputs", "Robot_*/*"]', "")
     assert main(["check"]) == 0
@@ -732,7 +735,7 @@ def test_help_lists_the_arguments_of_init_and_the_modes(capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        (["--mode", "replay"], "replay.file: what is to be played: --from FILE.mem, or "),
+        (["--mode", "replay"], "replay.file: name the recording to play, by --from FILE.mem or "),
         (["--mode", "replay", "--from", "none.mem"], "replay.file: "),
         (["--mode", "replay", "--from", "db201.db"], "replay.file: "),
         (["--mode", "replay", "--from", "none.mem", "--speed", "0"], "replay.speed: expected a number >= 0.01"),
@@ -1049,7 +1052,7 @@ def test_number_of_declared_injections_is_bounded(example: Edit, capsys: pytest.
     tables = "".join(INJECTION.replace("one", f"n{place}").replace("[grpc]\n", "") for place in range(65))
     example("[grpc]\n", f"{tables}[grpc]\n")
     assert main(["check"]) == 1
-    assert "injection: source 'cell' has 65: at most 64 are allowed" in capsys.readouterr().err
+    assert "injection: source 'cell' has 65 injections: at most 64 are allowed" in capsys.readouterr().err
 
 
 def test_all_faults_are_reported_together(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,7 +32,7 @@ def test_file_and_hash_give_the_same_token(file: Path) -> None:
     (one,), (other,) = read_tokens([token(file)]), read_tokens([token(sha256=expected)])
     assert one == other
     assert SECRET not in repr(one)
-    with pytest.raises(ConfigError, match=r"grpc\.token\[1\]: the same token as that of 'dash'"):
+    with pytest.raises(ConfigError, match=r"grpc\.token\[1\]: this is the same token as that of 'dash'"):
         read_tokens([token(file), token(sha256=expected, name="other")])
 
 

@@ -57,9 +57,9 @@ def test_configuration_may_declare_injections(tmp_path: Path) -> None:
         ("end_s = 2.5", "probability = 0", "injection[0].probability: expected"),
         ("end_s = 2.5", "seed = -1", "injection[0].seed: expected"),
         ("end_s = 2.5", "priority = 1.5", "injection[0].priority: expected a whole number"),
-        ("[[injection]]", "[injection]", "injection: write [[injection]], in two brackets"),
+        ("[[injection]]", "[injection]", "injection: write [[injection]] with double brackets"),
         ("[[injection]]", "[[injections]]", "injections: unknown key; did you mean injection?"),
-        ("value = 1.5", f"value = {2**65}", "injection[0].value: a number of more than 64 bits"),
+        ("value = 1.5", f"value = {2**65}", "injection[0].value: the number has more than 64 bits"),
         ("value = 1.5", "value = [[1, 2024-01-01]]", "injection[0].value: expected numbers, text"),
     ],
 )  # fmt: skip
@@ -86,7 +86,7 @@ def test_duplicate_name_is_refused(tmp_path: Path) -> None:
         ("delay", {"delay_ms": 1, "delay_cycles": 1}, "delay_ms: operation 'delay' needs delay_ms, or delay_cycles"),
         ("clamp", {}, "min: operation 'clamp' needs min, max, or both"),
         ("freeze", {"probability": 0.5}, "probability: operation 'freeze' has no such key"),
-        ("set", {"value": [[[[[[[[1]]]]]]]]}, "value: lists within more than 6 others"),
+        ("set", {"value": [[[[[[[[1]]]]]]]]}, "value: lists are nested in more than 6 others"),
     ],
 )
 def test_operands_must_fit_the_operation(operation: str, keys: dict[str, object], message: str) -> None:

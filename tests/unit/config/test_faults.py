@@ -82,7 +82,7 @@ def test_all_faults_are_reported_together_with_their_lines(tmp_path: Path) -> No
             '(emulator "model")'
         ),
         (
-            "F:23: grpc.listen[0]: 0.0.0.0:1 can be reached from other hosts in plain text; that needs a [grpc.tls] "
+            "F:23: grpc.listen[0]: 0.0.0.0:1 can be reached from other hosts in plain text; this requires a [grpc.tls] "
             "table, or insecure = true beside it"
         ),
         "F:28: grpc.token[0].roles[0]: no role 'Read'; did you mean read?",

@@ -61,6 +61,6 @@ def test_obstacle_is_reported_with_a_remedy(
 
 def test_file_system_without_files_is_found_even_as_root(tmp_path: Path) -> None:
     for folder in ("/proc", "/proc/logs"):
-        assert "its file system takes no files: choose another folder" in str(unwritable(Path(folder)))
+        assert "its file system accepts no files: choose another folder" in str(unwritable(Path(folder)))
     (tmp_path / "file").touch()
     assert unwritable(tmp_path / "file/logs") == Obstacle(f"{tmp_path}/file is not a directory")

@@ -64,8 +64,8 @@ def test_roles_of_each_address(tmp_path: Path, text: str, expected: list[tuple[s
         ("[grpc]\n", r"grpc\.listen: this key is needed"),
         ('[grpc]\nlisten = ["unix:"]\n', r"grpc\.listen\[0\]: 'unix:' is not a UNIX socket"),
         (f'[grpc]\nlisten = ["unix:{"x" * 120}"]\n', r"grpc\.listen\[0\]: unix:x*: the path is longer than the 107"),
-        (f'[grpc]\nlisten = ["10.0.0.5:1"]\n{OLD}', r"grpc\.listen\[0\]: .*plain text; that needs a \[grpc\.tls\]"),
-        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}', r"grpc\.address\[0\]\.listen: .*plain text; that needs"),
+        (f'[grpc]\nlisten = ["10.0.0.5:1"]\n{OLD}', r"grpc\.listen\[0\]: .*plain text; this requires a \[grpc\.tls\]"),
+        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}', r"grpc\.address\[0\]\.listen: .*plain text; this requires"),
         (
             f'[grpc]\nlisten = ["10.0.0.5:1"]\ninsecure = true\n{TOKEN}',
             r"grpc\.listen\[0\]: .*tokens of \[\[grpc\.token\]\].*tokens_in_plain_text = true",

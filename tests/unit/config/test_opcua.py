@@ -48,7 +48,7 @@ def test_sound_sections(tmp_path: Path, text: str) -> None:
         ('listen = "127.0.0.1:4840"\nkey = "k.pem"\n', "opcua.certificate: give both certificate and key"),
         ('listen = "127.0.0.1:4840"\ntrusted = ["ca.pem"]\n', "opcua.trusted: clients show certificates only"),
         (f'listen = "127.0.0.1:4840"\ninsecure = true\n{KEYS}trusted = ["ca.pem"]\n', "opcua.trusted: has no effect"),
-        (f'listen = "127.0.0.1:4840"\n{KEYS}{CLIENT}', "opcua.client: clients are known by their certificates"),
+        (f'listen = "127.0.0.1:4840"\n{KEYS}{CLIENT}', "opcua.client: clients are identified by their certificates"),
         (f'listen = "0.0.0.0:1"\ninsecure = true\n{ACCOUNT}{SECRET}', "opcua.account: beyond loopback, passwords"),
         (f'listen = "127.0.0.1:1"\n{ACCOUNT}', "opcua.account[0]: give either token_file"),
         (f'listen = "127.0.0.1:1"\n{ACCOUNT}sha256 = "12"\n', "opcua.account[0].sha256: expected 64 digits"),

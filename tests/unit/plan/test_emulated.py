@@ -91,7 +91,7 @@ def test_a_program_runs_on_the_only_table(folder: Path) -> None:
     ("parts", "reason"),
     [
         (("",), r"emulator\[0\].*layout: this key is needed, because no source with connector = .s7. reads 127.0.0.1:"),
-        ((source("press", "press.toml"), "dbNumber"), r"emulator\[0\].*dbNumber: needs a layout beside it"),
+        ((source("press", "press.toml"), "dbNumber"), r"emulator\[0\].*dbNumber: this key needs layout in the same"),
         (
             (source("press", "press.toml"), source("line", "line.toml"), "wave"),
             "layout: this key is needed: program wave runs on one of press, line",

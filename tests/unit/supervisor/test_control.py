@@ -202,7 +202,7 @@ def test_a_silent_client_is_dropped_after_the_time_out(served: Served, monkeypat
     moved = time.monotonic() + control.REQUEST_S + 1
     monkeypatch.setattr(time, "monotonic", lambda: moved)
     served.server.expire()
-    assert "no request within" in str(answer_to(client)["error"])
+    assert "no request arrived within" in str(answer_to(client)["error"])
     served.requests[0][1].ok()
     assert answer_to(other) == {"ok": True}, "a client whose request is in progress is not dropped"
 

@@ -65,14 +65,14 @@ def test_a_process_that_hangs_is_replaced(launch: Launch, behaviour: str) -> Non
     if behaviour == "stopped":
         os.kill(cell.pid("cell"), signal.SIGSTOP)
     until(lambda: cell.of("cell").restarts == 1 and cell.of("cell").state == "running")
-    assert "cell hangs, no heartbeat for 0.5 s: killed" in cell.log()
+    assert "cell hangs, no heartbeat for 0.5 s: it is killed" in cell.log()
     assert "cell crashed: no heartbeat for 0.5 s, killed by SIGKILL" in cell.log()
 
 
 def test_a_process_that_never_becomes_ready_is_replaced(launch: Launch) -> None:
     cell = launch([("cell", "source", ["never", "good"])], start_s=1.5)
     cell.wait_state("running")
-    assert "cell hangs, not running 1.5 s after its start: killed" in cell.log()
+    assert "cell hangs, not running 1.5 s after its start: it is killed" in cell.log()
     assert cell.of("cell").restarts >= 1, "on a busy host the next process may be late, too"
 
 
@@ -80,7 +80,7 @@ def test_a_process_that_ignores_sigterm_is_killed(launch: Launch) -> None:
     cell = launch([("plc", "emulator", ["stubborn"])], grace_s=0.2)
     cell.wait_state("running")
     assert cell.stop() == 0
-    assert "plc does not stop: killed" in cell.log()
+    assert "plc does not stop: it is killed" in cell.log()
 
 
 def test_a_second_stop_signal_skips_the_grace_time(launch: Launch) -> None:
@@ -225,7 +225,7 @@ def test_an_unknown_process_in_a_slot_is_killed(launch: Launch) -> None:
                 stranger.kill()
         until(lambda: cell.of("plc").state == "running")
         assert cell.pid("plc") != stranger.pid
-    assert f"plc is held by pid {stranger.pid}, which no supervisor knows: killed" in cell.log()
+    assert f"the slot of plc is occupied by pid {stranger.pid}, which no supervisor knows" in cell.log()
 
 
 def test_a_frozen_process_is_not_taken_over(launch: Launch) -> None:

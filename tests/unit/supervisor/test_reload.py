@@ -192,7 +192,7 @@ def test_a_key_that_cannot_change_is_named_in_the_refusal(launch: Launch, others
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
-    with pytest.raises(ControlError, match=rf"{refused}: .* cannot be taken while the instance runs.*down and up"):
+    with pytest.raises(ControlError, match=rf"{refused}: .* cannot be applied while the instance runs.*down and up"):
         cell.reload([*CELL, PRESS], **others)
     assert cell.pids() == before
 

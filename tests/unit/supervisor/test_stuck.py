@@ -74,7 +74,10 @@ def test_a_stop_names_a_stuck_process_and_stops_all_others(launch: Launch) -> No
     for _ in range(2):
         with pytest.raises(ControlError) as caught:
             cell.request(Stop())
-        assert str(caught.value) == f"all else is stopped, but {stuck}; the stop continues as soon as it has ended"
+        assert (
+            str(caught.value)
+            == f"all other processes are stopped, but {stuck}; the stop continues as soon as it has ended"
+        )
     for fd in others:
         with pytest.raises(ProcessLookupError):
             signal.pidfd_send_signal(fd, 0)

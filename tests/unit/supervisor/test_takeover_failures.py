@@ -18,7 +18,7 @@ def test_a_take_over_without_a_control_socket_changes_nothing(launch: Launch, ru
     socket.touch()
     failing = launch()
     assert failing.wait_end() == 1
-    assert failing.errors() == f"cannot make the control socket {socket}: Address already in use\n"
+    assert failing.errors() == f"cannot create the control socket {socket}: Address already in use\n"
     assert cell.pids() == before
     socket.unlink()
     successor = launch()
