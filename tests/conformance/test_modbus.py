@@ -81,7 +81,9 @@ class TestModbus(WriteConformance):
 
     def test_a_confirmation_of_another_write_confirms_nothing(self, run: Run, writer: Writer, rig: ModbusRig) -> None:
         """The outcome is unknown, and the connection is dropped."""
-        rig.proxy.edit(lambda frame: frame[:9] + bytes((frame[9] ^ 1,)) + frame[10:] if frame[7] in (6, 16) else frame)
+        rig.proxy.edit(
+            lambda frame: frame[:9] + bytes((frame[9] ^ 1,)) + frame[10:] if frame[7] in (6, 16, 22) else frame
+        )
         end = writer.write(Write(rig.spare, 0, b"x"))
         assert end.kind == EventKind.UNKNOWN
         assert "another write" in end.text

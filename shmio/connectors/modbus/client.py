@@ -25,12 +25,12 @@ _MAX_PDU: Final = 253
 _FAILED: Final = 0x80
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE, ACKNOWLEDGE, BUSY = 1, 2, 3, 4, 5, 6
-NO_PATH, NO_ANSWER = 10, 11
+PARITY, NO_PATH, NO_ANSWER = 8, 10, 11
 _NAMES: Final = {
     ILLEGAL_FUNCTION: "illegal function", ILLEGAL_ADDRESS: "illegal data address", ILLEGAL_VALUE: "illegal data value",
     DEVICE_FAILURE: "device failure", BUSY: "device busy",
     ACKNOWLEDGE: "acknowledged, but not done yet; it may still be done",
-    8: "memory parity error", NO_PATH: "gateway path unavailable",
+    PARITY: "memory parity error", NO_PATH: "gateway path unavailable",
     NO_ANSWER: "no answer from the unit behind the gateway",
 }  # fmt: skip
 

@@ -13,7 +13,7 @@ from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.load import Load, Requests, counted
 from shmio.connectors.modbus import client
 from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError
-from shmio.connectors.modbus.plan import Element, Limits, ReadRequest, plan
+from shmio.connectors.modbus.plan import MAX_PROBES, Element, Limits, ReadRequest, Refusals
 from shmio.connectors.register_image import RegisterImage
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.addresses.modbus import Address, Order, Table, WordCodec, parse
@@ -30,8 +30,6 @@ from shmio.model.statuses import (
     BAD_TIMEOUT,
 )
 
-RETRY_NS: Final = 10_000_000_000
-"""How long an address that the device refuses is left alone."""
 GATEWAY_RETRY_NS: Final = 1_000_000_000
 """How long a unit that does not answer its gateway is left alone."""
 _STATUS: Final = {
@@ -39,12 +37,16 @@ _STATUS: Final = {
     client.ILLEGAL_ADDRESS: BAD_OUT_OF_RANGE,
     client.ILLEGAL_VALUE: BAD_OUT_OF_RANGE,
     client.DEVICE_FAILURE: BAD_DEVICE_FAILURE,
+    client.PARITY: BAD_DEVICE_FAILURE,
     client.ACKNOWLEDGE: BAD_RESOURCE_UNAVAILABLE,
     client.BUSY: BAD_RESOURCE_UNAVAILABLE,
     client.NO_PATH: BAD_NO_COMMUNICATION,
     client.NO_ANSWER: BAD_TIMEOUT,
 }
-_OF_ADDRESSES: Final = frozenset({client.ILLEGAL_FUNCTION, client.ILLEGAL_ADDRESS, client.ILLEGAL_VALUE})
+_OF_ADDRESSES: Final = frozenset(
+    {client.ILLEGAL_FUNCTION, client.ILLEGAL_ADDRESS, client.ILLEGAL_VALUE, client.DEVICE_FAILURE, client.PARITY}
+)
+"""Exceptions that may be due to some of the addresses of a request."""
 _OF_UNITS: Final = frozenset({client.NO_PATH, client.NO_ANSWER})
 _TABLE_NAMES: Final = {
     Table.HOLDING: "holding register", Table.INPUT: "input register", Table.COIL: "coil",
@@ -104,7 +106,7 @@ class ModbusConnector(Connector):
     """Reads all registers of a layout in each cycle.
 
     Addresses that the device refuses are bad by themselves: a refused request is split until they
-    are found, and they are tried again every 10 s.
+    are found, and they are tried again every 10 s, also after the connection was lost.
     """
 
     Options = ModbusOptions
@@ -124,13 +126,14 @@ class ModbusConnector(Connector):
                 raise ConfigError(f"layout: {register.path}: {error}") from None
             self._registers.append(_Register(index, register, address, options))
         limits = Limits(options.max_registers, options.max_bits, options.max_gap)
-        elements = (one.element(place) for one in self._registers for place in range(one.register.count))
+        elements = [one.element(place) for one in self._registers for place in range(one.register.count)]
         try:
-            self._requests = plan(elements, limits)
+            self._refusals = Refusals(elements, limits)
         except ValueError as error:
             raise ConfigError(f"layout: {error}: raise max_registers or max_bits") from None
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
-        self._left_alone: dict[object, tuple[int, int]] = {}  # by request or unit: until when (ns), and the status
+        self._silent: dict[int, tuple[int, int]] = {}  # units that do not answer: until when (ns), and the status
+        self._probes = 0  # that this cycle may still send
         self._no_masks: set[int] = set()  # units that do not know function 22
 
     @property
@@ -140,22 +143,22 @@ class ModbusConnector(Connector):
 
     def describe(self) -> str:
         """Return the peer and the number of requests of a cycle as a text for logs."""
-        return f"to {self._client.peer} in {len(self._requests)} requests a cycle"
+        return f"to {self._client.peer} in {len(self._refusals.requests)} requests a cycle"
 
     def load(self) -> Load:
         """Return the requests that read all registers."""
         counts: dict[Table, int] = {}
-        for request in self._requests:
+        for request in self._refusals.requests:
             counts[request.table] = counts.get(request.table, 0) + request.count
         what = ", ".join(counted(counts[table], name) for table, name in _TABLE_NAMES.items() if table in counts)
-        units = sorted({request.unit for request in self._requests})
+        units = sorted({request.unit for request in self._refusals.requests})
         some = f"unit {units[0]}" if len(units) == 1 else f"{len(units)} units"
-        return Load(f"{what} of {some}", (Requests(len(self._requests)),), NOTE)
+        return Load(f"{what} of {some}", (Requests(len(self._refusals.requests)),), NOTE)
 
     def connect(self) -> None:
         """Connect to the device; ConnectorError if it cannot be reached."""
         self._client.connect()
-        self._left_alone.clear()
+        self._silent.clear()
         self._no_masks.clear()
 
     def close(self) -> None:
@@ -171,9 +174,12 @@ class ModbusConnector(Connector):
         self._client.begin()
         now_ns = time.monotonic_ns()
         values: dict[int, list[Any]] = {}
-        failed: dict[int, int] = {}
-        for request in list(self._requests):
+        failed = {one.register: status for one, (_, status) in self._refusals.refused.items()}
+        self._probes = MAX_PROBES
+        for request in list(self._refusals.requests):
             self._fetch(request, now_ns, values, failed)
+        for request in self._refusals.due(now_ns, self._probes):
+            self._try_again(request, now_ns)
         for one in self._registers:
             found = values.get(one.index, [])
             if one.index in failed:
@@ -184,32 +190,62 @@ class ModbusConnector(Connector):
         return bytes(self._image)
 
     def _fetch(self, request: ReadRequest, now_ns: int, values: dict[int, list[Any]], failed: dict[int, int]) -> None:
-        """Read a request's elements; if the device refuses it, find the addresses that it refuses."""
-        until = max((self._left_alone.get(key, (0, 0)) for key in (request, request.unit)), key=lambda one: one[0])
-        if until[0] > now_ns:
-            failed.update((one.register, until[1]) for one in request.elements)
+        """Read a request's elements; if the device refuses it, search for the addresses that it refuses.
+
+        The search goes on in the next cycles if it needs more than ``MAX_PROBES`` requests, or more
+        than half of the time-out.
+        """
+        until_ns, status = self._silent.get(request.unit, (0, 0))
+        if until_ns > now_ns:
+            failed.update((one.register, status) for one in request.elements)
             return
+        if (suspicion := self._refusals.suspects.get(request)) is not None:
+            if not self._may_probe(now_ns):
+                failed.update((one.register, suspicion) for one in request.elements)
+                return
+            self._probes -= 1
         try:
             data = self._client.read(request.unit, request.table, request.start, request.count)
         except RefusedError as error:
-            parts = request.halves() if error.code in _OF_ADDRESSES else [request]
-            if len(parts) > 1:
-                place = self._requests.index(request)
-                self._requests[place : place + 1] = parts
-                for part in parts:
-                    self._fetch(part, now_ns, values, failed)
-                return
             status = _STATUS.get(error.code, BAD_COMMUNICATION_ERROR)
-            key, pause_ns = (request.unit, GATEWAY_RETRY_NS) if error.code in _OF_UNITS else (request, RETRY_NS)
-            if error.code in _OF_ADDRESSES | _OF_UNITS:
-                self._left_alone[key] = now_ns + pause_ns, status
-            log.warning("%s: %s", self._named(request), error)
+            if error.code in _OF_ADDRESSES:
+                parts = self._refusals.split(request, status)
+                if len(parts) > 1:
+                    for part in parts:
+                        self._fetch(part, now_ns, values, failed)
+                    return
+                news = len(parts) == 1 and self._refusals.refuse(request, status, now_ns)
+            else:
+                news = True
+                if error.code in _OF_UNITS:
+                    self._silent[request.unit] = now_ns + GATEWAY_RETRY_NS, status
+            if news:
+                log.warning("%s: %s", self._named(request), error)
             failed.update((one.register, status) for one in request.elements)
             return
+        self._refusals.suspects.pop(request, None)
         for one in request.elements:
             register = self._registers[one.register]
             found = values.setdefault(one.register, [None] * register.register.count)
             found[one.place] = register.value(data, one.start - request.start)
+
+    def _may_probe(self, now_ns: int) -> bool:
+        """Return whether this cycle may send more requests than it needs."""
+        used_ns = time.monotonic_ns() - now_ns
+        return self._probes > 0 and used_ns < self._options.timeout * 500_000
+
+    def _try_again(self, request: ReadRequest, now_ns: int) -> None:
+        """Read a refused address alone; from the next cycle on, with the others if the device answers."""
+        if self._silent.get(request.unit, (0, 0))[0] > now_ns or not self._may_probe(now_ns):
+            return
+        self._probes -= 1
+        try:
+            self._client.read(request.unit, request.table, request.start, request.count)
+        except RefusedError as error:
+            self._refusals.refuse(request, _STATUS.get(error.code, BAD_COMMUNICATION_ERROR), now_ns)
+        else:
+            log.info("%s can be read again", self._named(request))
+            self._refusals.accept(request)
 
     def _named(self, request: ReadRequest) -> str:
         first = self._registers[request.elements[0].register].register.path
@@ -357,7 +393,10 @@ class ModbusConnector(Connector):
         for at in range(0, len(words), 2 * MAX_WRITE_WORDS):
             part = words[at : at + 2 * MAX_WRITE_WORDS]
             start = (number + at // 2).to_bytes(2, "big")
-            if len(words) == 2:
+            if address.kind.size == 1 and address.kind.base != "STRING" and len(words) == 2:
+                keep = b"\xff\0" if self._options.byte_order == "big" else b"\0\xff"  # the other byte of the word
+                yield one.unit, client.MASK_WORD, start + keep + part
+            elif len(words) == 2:
                 yield one.unit, client.WRITE_WORD, start + part
             else:
                 count = (len(part) // 2).to_bytes(2, "big") + bytes((len(part),))

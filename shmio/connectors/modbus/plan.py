@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from shmio.layout.addresses.modbus import Table
 
@@ -54,6 +54,14 @@ class ReadRequest:
         return [_request(part) for part in parts]
 
 
+RETRY_NS: Final = 10_000_000_000
+"""How long a refused address is left alone."""
+MAX_PROBES: Final = 20
+"""Most additional requests of a cycle that search for refused addresses or try them again."""
+Place = tuple[int, Table, int]
+"""An entry of a device: unit id, table, and number in the table."""
+
+
 class Limits(NamedTuple):
     """What one request may read."""
 
@@ -63,8 +71,13 @@ class Limits(NamedTuple):
     """Most unused entries between two elements of a request."""
 
 
-def plan(elements: Iterable[Element], limits: Limits) -> list[ReadRequest]:
-    """Return requests that read all elements, none of them in two parts.
+def plan(elements: Iterable[Element], limits: Limits, refused: Collection[Place] = ()) -> list[ReadRequest]:
+    """Return requests that read all elements, each of them in one request.
+
+    Args:
+        elements: The elements.
+        limits: What one request may read.
+        refused: Places that the device refuses; no request reads over them.
 
     Raises:
         ValueError: An element is longer than a request may be.
@@ -72,7 +85,8 @@ def plan(elements: Iterable[Element], limits: Limits) -> list[ReadRequest]:
     """
     requests: list[ReadRequest] = []
     ordered = sorted(elements, key=lambda one: (one.unit, one.table.value, one.start, one.size))
-    for (_, table), group in groupby(ordered, key=lambda one: (one.unit, one.table)):
+    for key, group in groupby(ordered, key=lambda one: (one.unit, one.table)):
+        table = key[1]
         most = limits.bits if table.of_bits else limits.words
         part: list[Element] = []
         end = 0
@@ -80,7 +94,8 @@ def plan(elements: Iterable[Element], limits: Limits) -> list[ReadRequest]:
             if one.size > most:
                 raise ValueError(f"{table.value} {one.start}: {one.size} words, but a request reads at most {most}")
             stop = max(end, one.start + one.size)
-            if part and (one.start - end > limits.gap or stop - part[0].start > most):
+            over = any((*key, address) in refused for address in range(end, one.start)) if refused and part else False
+            if part and (over or one.start - end > limits.gap or stop - part[0].start > most):
                 requests.append(_request(part))
                 part, stop = [], one.start + one.size
             part.append(one)
@@ -94,3 +109,56 @@ def _request(elements: Sequence[Element]) -> ReadRequest:
     start = min(one.start for one in elements)
     stop = max(one.start + one.size for one in elements)
     return ReadRequest(first.unit, first.table, start, stop - start, tuple(elements))
+
+
+@dataclass
+class Refusals:
+    """What is known of the addresses that a device refuses; it outlives the connection."""
+
+    elements: Sequence[Element]
+    limits: Limits
+    requests: list[ReadRequest] = field(init=False)
+    """The requests of a cycle, without refused addresses."""
+    refused: dict[Element, tuple[int, int]] = field(default_factory=dict)
+    """The refused elements: when to try each again, in ns of CLOCK_MONOTONIC, and its status."""
+    suspects: dict[ReadRequest, int] = field(default_factory=dict)
+    """Halves of refused requests that have not been answered yet, with the status of the refusal."""
+
+    def __post_init__(self) -> None:
+        self.requests = plan(self.elements, self.limits)
+
+    def split(self, request: ReadRequest, status: int) -> list[ReadRequest]:
+        """From now on, read a refused request in two halves; return them, or only itself if it has one address."""
+        halves = request.halves()
+        self.suspects.pop(request, None)
+        if len(halves) > 1:
+            self.suspects |= dict.fromkeys(halves, status)
+            place = self.requests.index(request)
+            self.requests[place : place + 1] = halves
+        return halves
+
+    def refuse(self, request: ReadRequest, status: int, now_ns: int) -> bool:
+        """Leave the one address of a request alone for ``RETRY_NS``; return whether this is news."""
+        news = request.elements[0] not in self.refused
+        self.refused.update((one, (now_ns + RETRY_NS, status)) for one in request.elements)
+        if request in self.requests:
+            self.requests.remove(request)
+        return news
+
+    def due(self, now_ns: int, most: int) -> list[ReadRequest]:
+        """Return requests for at most this many refused addresses that are due for another attempt."""
+        found: dict[tuple[Place, int], list[Element]] = {}
+        for one, (retry_ns, _) in self.refused.items():
+            if retry_ns <= now_ns:
+                found.setdefault(((one.unit, one.table, one.start), one.size), []).append(one)
+        return [_request(some) for some in list(found.values())[: max(0, most)]]
+
+    def accept(self, request: ReadRequest) -> None:
+        """Read the elements of a request with the others again."""
+        for one in request.elements:
+            self.refused.pop(one, None)
+        refused = {
+            (one.unit, one.table, address) for one in self.refused for address in range(one.start, one.start + one.size)
+        }
+        self.suspects.clear()
+        self.requests = plan((one for one in self.elements if one not in self.refused), self.limits, refused)

@@ -12,6 +12,7 @@ import pytest
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.modbus import connector as module
+from shmio.connectors.modbus import plan
 from shmio.connectors.modbus.client import ModbusClient, RefusedError
 from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
 from shmio.connectors.registry import convert_options
@@ -176,10 +177,15 @@ def test_one_bad_address_among_good_ones_is_bad_alone_and_not_asked_in_each_cycl
         found = values(connector, layout)
         for at in range(60):
             assert found[f"n{at}"] == (0 if at < 50 else hex(BAD_OUT_OF_RANGE))
+        assert len(device.calls()) <= 1 + plan.MAX_PROBES + 1
+        for _ in range(3):  # the search for ten addresses takes several cycles
+            assert values(connector, layout) == found
         device.calls()
+        connector.close()
+        connector.connect()  # what is known outlives the connection
         assert values(connector, layout) == found
         assert all(address + count <= WORDS for _, address, count in device.calls())
-        now_ns[0] += module.RETRY_NS
+        now_ns[0] += plan.RETRY_NS
         values(connector, layout)
         assert any(address >= WORDS for _, address, _ in device.calls())
 
@@ -194,7 +200,10 @@ def test_writes_of_all_kinds(device: Device) -> None:
         "flag": tag("BOOL", "holding 30.1"),
         "word": tag("WORD", "holding 30"),
         "name": tag("STRING[5]", "unit 2 holding 40"),
+        "byte": tag("BYTE", "holding 60"),
+        "small": tag("SINT", "holding 61"),
     }
+    device.set("holding", 60, [0x1234, 0xABCD])
     with connected(device, tags) as (connector, layout):
 
         def write(path: str, value: object) -> list[str]:
@@ -217,6 +226,8 @@ def test_writes_of_all_kinds(device: Device) -> None:
         assert device.get("holding", 30) == [0b0101 | 2 | 1 << 12]
         assert write("name", "abc") == [""]
         assert device.get("holding", 40, 3, unit=2) == [0x6162, 0x6300, 0]
+        assert write("byte", 7) == write("small", -1) == [""]
+        assert device.get("holding", 60, 2) == [0x1207, 0xABFF]
         assert {call[0] for call in device.calls()} == {5, 6, 15, 16, 22}
 
 

@@ -12,11 +12,12 @@ from contextlib import closing
 import pytest
 
 from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
+from shmio.connectors.modbus.plan import RETRY_NS
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
-from shmio.model.statuses import BAD_OUT_OF_RANGE, StatusArea
+from shmio.model.statuses import BAD_OUT_OF_RANGE, GOOD, StatusArea
 from tests.unit.connectors import hostile
 
 TIMEOUT_MS = 300
@@ -113,8 +114,8 @@ def test_a_device_that_refuses_everything_gives_no_value() -> None:
         assert found == {BAD_OUT_OF_RANGE}
 
 
-def test_a_device_that_refuses_slowly_is_a_lost_connection() -> None:
-    """The requests that find the refused addresses share the time-out of a cycle."""
+def test_a_device_that_refuses_slowly_is_searched_for_half_a_time_out() -> None:
+    """Its connection is not lost, and the next cycles continue the search."""
 
     def refuse(request: bytes, _: int) -> bytes:
         threading.Event().wait(0.02)
@@ -122,5 +123,40 @@ def test_a_device_that_refuses_slowly_is_a_lost_connection() -> None:
 
     with hostile.peer(answering(refuse)) as address, closing(source(address.port)) as connector:
         connector.connect()
-        with pytest.raises(ConnectorError, match="no answer within 300 ms"):
-            connector.read()
+        for _ in range(3):
+            image = connector.read()
+            area = StatusArea(LAYOUT)
+            assert {area.get(image, index).code for index in range(len(LAYOUT.registers))} == {BAD_OUT_OF_RANGE}
+
+
+@pytest.mark.parametrize("code", [2, 4, 8])
+def test_an_address_that_recovers_is_read_with_the_others_again(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns = [10**12]
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns[0])
+    refused, sent = {2}, []
+
+    def answer(request: bytes, _: int) -> bytes:
+        start, count = int.from_bytes(request[8:10], "big"), int.from_bytes(request[10:12], "big")
+        sent.append((start, count))
+        if refused.intersection(range(start, start + count)):
+            return request[:4] + b"\0\x03" + request[6:7] + bytes((request[7] | 0x80, code))
+        return request[:4] + (3 + 2 * count).to_bytes(2, "big") + request[6:8] + bytes((2 * count,)) + bytes(2 * count)
+
+    area = StatusArea(LAYOUT)
+    with hostile.peer(answering(answer)) as address, closing(source(address.port)) as connector:
+        connector.connect()
+
+        def bad() -> list[int]:
+            image = connector.read()
+            return [index for index in range(len(LAYOUT.registers)) if area.get(image, index).code != GOOD]
+
+        assert bad() == [1]
+        sent.clear()
+        assert bad() == [1]
+        assert all(2 not in range(start, start + count) for start, count in sent)
+        refused.clear()
+        now_ns[0] += RETRY_NS
+        assert bad() == [1]
+        sent.clear()
+        assert bad() == []
+        assert len(sent) == 1
