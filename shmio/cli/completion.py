@@ -1,7 +1,7 @@
-"""Command-line completion by argcomplete: the shell runs the command, which prints the choices.
+"""Completes command lines by argcomplete: the shell runs the command, which prints the choices.
 
-argcomplete itself completes options, verbs and choices. This module completes other arguments
-by their ``dest``.
+argcomplete itself completes options, verbs and choices. This module completes other arguments,
+chosen by the ``dest`` of the argument.
 """
 
 from __future__ import annotations
@@ -20,13 +20,23 @@ Completer = Callable[..., Iterable[str]]
 
 
 def script(shell: str) -> str:
-    """Return the code that a shell reads at its start, or raise MissingLibraryError."""
+    """Return the code that a shell runs at its start.
+
+    Raises:
+        MissingLibraryError: argcomplete is not installed.
+
+    """
     text: str = _argcomplete().shellcode(PROGRAMS, shell=shell)
     return text
 
 
 def answer(parser: argparse.ArgumentParser) -> None:
-    """Print the possible completions for the shell and exit, or raise MissingLibraryError."""
+    """Print the possible completions for the shell, and exit.
+
+    Raises:
+        MissingLibraryError: argcomplete is not installed.
+
+    """
     completers = _argcomplete().completers
     files = completers.FilesCompleter
 
@@ -94,7 +104,7 @@ def _sources(parsed_args: argparse.Namespace, **_: object) -> list[str]:
 
 
 def _registers(prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
-    """Return the paths that begin with the prefix, up to the next slash, as for files."""
+    """Return the paths that begin with the prefix, each up to its next slash."""
     found = _paths(parsed_args)
     paths = [f"{source}/{path}" for source, ones in found.items() for path in ones]
     if len(found) == 1 and not any(path.startswith(prefix) for path in paths):
@@ -104,7 +114,10 @@ def _registers(prefix: str, parsed_args: argparse.Namespace, **_: object) -> lis
 
 
 def _paths(options: argparse.Namespace) -> dict[str, list[str]]:
-    """Return paths by source, from the recordings on the command line or from the instance."""
+    """Return paths by source.
+
+    They come from the recordings on the command line, or from the instance.
+    """
     files = getattr(options, "files", None) or [getattr(options, "file", None)]
     try:
         return _recorded(files) if hasattr(options, "output") or files[0] else _running(options)

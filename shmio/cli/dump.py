@@ -1,4 +1,7 @@
-"""``shmio-dump``: record a running instance, and examine recordings. The verbs are in ``shmio.cli.recordings``."""
+"""``shmio-dump``: records a running instance, and examines recordings.
+
+The verbs are in ``shmio.cli.recordings``.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,13 @@ from shmio.version import __version__
 
 PROGRAM = "shmio-dump"
 MODULES = {"info": "examine", "verify": "examine", "cut": "rewrite", "merge": "rewrite", "recover": "rewrite"}
-"""Modules of the verbs whose module has another name than the verb."""
+"""The modules of those verbs whose module does not have the verb's name."""
 SOME_FILES = "print JSON: one object, or a list for several files"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
-"""Choices of ``diff --ignore``, copied from shmio.recording.compare to save its import."""
+"""Choices of ``diff --ignore``.
+
+They are copied from shmio.recording.compare to avoid its import.
+"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -71,7 +77,9 @@ def _parser() -> argparse.ArgumentParser:
         help="only these registers: paths or globs",
     )
 
-    record.add_argument("--when", metavar="CONDITION", help="record only around the times when this is true")
+    record.add_argument(
+        "--when", metavar="CONDITION", help="record only the time around moments at which this condition is true"
+    )
     for option, what in (("--before", "before it becomes true"), ("--after", "after it was last true")):
         record.add_argument(
             option, dest=f"{option[2:]}_s", type=_amount, metavar="SECONDS",
@@ -85,7 +93,9 @@ def _parser() -> argparse.ArgumentParser:
     note.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
     note.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     note.add_argument(
-        "--source", metavar="NAME", help="source that gets the note (default: grpc.default_source, or the first source)"
+        "--source",
+        metavar="NAME",
+        help="source whose events get the note (default: grpc.default_source, or the first source)",
     )
 
     info = verb("info", "describe recordings")
@@ -136,9 +146,19 @@ def _parser() -> argparse.ArgumentParser:
         metavar="WHAT",
         help=f"ignore differences in: {', '.join(IGNORABLE)}",
     )
-    diff.add_argument("--tolerance", type=_amount, default=0.0, metavar="X", help="REAL and LREAL may differ by this")
     diff.add_argument(
-        "--relative", type=_amount, default=0.0, metavar="X", help="or by this fraction of the larger value"
+        "--tolerance",
+        type=_amount,
+        default=0.0,
+        metavar="X",
+        help="ignore differences of REAL and LREAL values up to this",
+    )
+    diff.add_argument(
+        "--relative",
+        type=_amount,
+        default=0.0,
+        metavar="X",
+        help="ignore differences up to this fraction of the larger value",
     )
     add_json(diff)
 

@@ -1,7 +1,7 @@
-"""The console scripts, with few imports, so that Ctrl-C ends a command at once while it loads.
+"""The console scripts. They import little, so that Ctrl-C ends a command at once while it loads.
 
-Ctrl-C raises no exception meanwhile: an exception during an import would leave a half-loaded
-library, and C code that uses such a library crashes.
+Ctrl-C does not raise an exception while the command loads. An exception during an import would
+leave a library half loaded, and C code that uses such a library crashes.
 """
 
 from __future__ import annotations
@@ -46,7 +46,10 @@ def shmio_supervisor() -> int:
 
 
 def _run(module: str) -> int:
-    """Run a module's ``main`` and return its exit status; 130 if Ctrl-C came early."""
+    """Run a module's ``main`` and return its exit status.
+
+    130 if Ctrl-C was pressed during the import.
+    """
     try:
         main = importlib.import_module(module).main
         if _HEEDED:
@@ -62,7 +65,7 @@ def _run(module: str) -> int:
 
 
 def _leave(status: int) -> None:
-    """Exit without the interpreter's shutdown, in which gRPC's threads may crash or hang."""
+    """Exit without shutting the interpreter down: gRPC's threads may crash or hang in that phase."""
     for stream in filter(None, (sys.stdout, sys.stderr)):
         try:
             stream.flush()
@@ -72,6 +75,6 @@ def _leave(status: int) -> None:
 
 
 def _end_quietly() -> None:
-    """Let Ctrl-C end the process at once, without the interpreter's traceback."""
+    """Let Ctrl-C end the process at once, without printing a traceback."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

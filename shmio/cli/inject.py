@@ -1,4 +1,4 @@
-"""``shmio inject``: override values as long as the command runs, singly or by a campaign file."""
+"""``shmio inject``: overrides values while the command runs, one by one or by a campaign file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from shmio.model.cell import Campaign, Cell
 from shmio.model.injection import Happening
 
 TURN_S: Final = 0.2
-"""Interval at which to check for a campaign's events, for signals, and for the end of the time."""
+"""Interval in s at which to check for a campaign's events, signals and the end of the time."""
 SEED_BITS: Final = 32
 
 
@@ -40,16 +40,26 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "VALUE is JSON or an S7 literal. Without any PATH, the present injections are listed."
     )
     parser.add_argument("pairs", nargs="*", action=Pairs, metavar="PATH VALUE", help="register or array element")
-    parser.add_argument("--file", type=Path, metavar="CAMPAIGN.toml", help="lay the injections that a file declares")
-    parser.add_argument("--seed", type=_seed, metavar="N", help="seed for injections that have none")
-    parser.add_argument("--from-now", action="store_true", help="times in the file count from now, not from the start")
-    parser.add_argument("--list", action="store_true", help="list the present injections, as without any PATH")
+    parser.add_argument("--file", type=Path, metavar="CAMPAIGN.toml", help="inject what a campaign file declares")
+    parser.add_argument("--seed", type=_seed, metavar="N", help="seed for those injections of the file that have none")
+    parser.add_argument(
+        "--from-now", action="store_true", help="count the times in the file from now, not from the start"
+    )
+    parser.add_argument("--list", action="store_true", help="list the present injections (default without PATH)")
     how_long = parser.add_mutually_exclusive_group()
-    how_long.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="lift after this many seconds")
-    parser.add_argument("--priority", type=int, default=0, metavar="N", help="the highest is outermost (default: 0)")
-    parser.add_argument("--name", default="", help="its name in the list")
-    how_long.add_argument("--keep", action="store_true", help="keep it until it is lifted by its number")
-    parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one injection, whoever laid it")
+    how_long.add_argument(
+        "--for", dest="for_s", type=seconds, metavar="S", help="lift the injections after this many seconds"
+    )
+    parser.add_argument(
+        "--priority",
+        type=int,
+        default=0,
+        metavar="N",
+        help="the injection with the highest priority is outermost (default: 0)",
+    )
+    parser.add_argument("--name", default="", help="the name of the injection in the list")
+    how_long.add_argument("--keep", action="store_true", help="keep the injection until it is lifted by its number")
+    parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one injection, whoever created it")
     parser.add_argument("--lift-all", action="store_true", help="lift all injections of all sources")
 
 
@@ -98,7 +108,13 @@ def _seed(text: str) -> int:
 
 
 def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, Value]:
-    """Return what a path names, and the value for it, or raise PathError or ValueRangeError."""
+    """Return what a path names, and the value to inject there.
+
+    Raises:
+        PathError: The path names no register.
+        ValueRangeError: The value does not fit the register.
+
+    """
     topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.source not in layouts:
         raise PathError(f"{path}: unknown source {topic.source}")
@@ -110,7 +126,7 @@ def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, V
 
 
 def _wait(for_s: float | None) -> None:
-    """Wait for Ctrl-C, SIGTERM or SIGHUP, at most for this time."""
+    """Wait for Ctrl-C, SIGTERM or SIGHUP, but at most ``for_s`` (in s; None: without limit)."""
     with stop_on_signals() as over:
         over.wait(for_s)
 
@@ -164,7 +180,10 @@ def _list(cell: Cell, *, as_json: bool) -> None:
 
 
 def _targets(one_found: dict[str, Any]) -> list[str]:
-    """Return an injection's targets; for a declared injection, the patterns of its declaration."""
+    """Return the paths of an injection.
+
+    For a declared injection, the patterns in its declaration.
+    """
     running = one_found.get("running")
     if running is None:
         return list(one_found["registers"])
@@ -184,11 +203,13 @@ def _running(running: dict[str, Any] | None) -> str:
 def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
     """Run a campaign until all its injections are over, the time is up, or Ctrl-C.
 
-    With ``keep``, return as soon as it has started.
+    With ``keep``, return as soon as the campaign has started.
 
     Raises:
         ConfigError: The file is wrong. Nothing was started.
-        CommandError: A source refused an injection, or its time has passed. Nothing was started.
+        CommandError: A source refused an injection, or the time of an injection has passed. Nothing
+            was started.
+
     """
     seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
     read = read_campaign(options.file)
@@ -211,7 +232,7 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespace) -> None:
-    """Print events until no injection is left, the time is up, or a signal comes."""
+    """Print events until no injection is left, the time is up, or a signal arrives."""
     deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
     names = {(one.source, one.number): one.name for one in campaign.declared}
     unheard = set(names)
@@ -238,7 +259,7 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
 
 
 def _queue(campaign: Campaign, told: queue.SimpleQueue[Happening | ShmioError | None]) -> None:
-    """Queue the events of a campaign, then None, or the error that ended it."""
+    """Put the events of a campaign into a queue, then None, or the error that ended the campaign."""
     try:
         for happening in campaign:
             told.put(happening)
@@ -248,7 +269,12 @@ def _queue(campaign: Campaign, told: queue.SimpleQueue[Happening | ShmioError | 
 
 
 def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
-    """Raise CommandError if the time of an injection has passed, so that it would do nothing."""
+    """Check that no injection would have no effect because its time has passed.
+
+    Raises:
+        CommandError: An injection would have no effect.
+
+    """
     for one in declarations:
         if one.end_s is not None and one.end_s <= now_s:
             raise CommandError(
@@ -258,18 +284,18 @@ def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
 
 
 def _with_seed(declaration: Declaration, seed: int) -> Declaration:
-    """Return a declaration with the given seed, unless it has its own."""
+    """Return a declaration with the given seed, unless the declaration has its own."""
     return msgspec.structs.replace(declaration, seed=seed) if declaration.seed is None else declaration
 
 
 def _shifted(declaration: Declaration, now_s: float) -> Declaration:
-    """Return a declaration with times that count from now."""
+    """Return a declaration whose times are counted from now."""
     end_s = None if declaration.end_s is None else declaration.end_s + now_s
     return msgspec.structs.replace(declaration, start_s=(declaration.start_s or 0) + now_s, end_s=end_s)
 
 
 def _print_event(happening: Happening, names: Mapping[tuple[str, int], str], *, as_json: bool) -> None:
-    """Print an event as a line: time, cycle, injection, what happened."""
+    """Print an event as a line: time, cycle, injection, and what happened."""
     source, number, time_s = happening.source, happening.number, happening.clock_ns / 1e9
     text = happening.text or names[source, number]
     if as_json:

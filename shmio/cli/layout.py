@@ -1,4 +1,4 @@
-"""``shmio-layout``: compile data-block sources and print every register with its place."""
+"""``shmio-layout``: compiles source files of data blocks and prints registers with offsets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HEADINGS = ("offset", "size", "type", "path", "over", "initial", "comment")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit status: 0 done, 1 failed, 2 wrong usage."""
+    """Run the command. Return its exit status: 0 success, 1 failure, 2 wrong usage."""
     given = sys.argv[1:] if arguments is None else arguments
     if given[:1] == ["import"]:
         return layout_import.main(given[1:])
@@ -83,7 +83,7 @@ def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], 
 
 
 def _read(name: str) -> Source:
-    """Read a source, a few bytes more than allowed at most: the compiler refuses larger files."""
+    """Read a file. Of a file that is too large, read just enough that the compiler refuses it."""
     with Path(name).open("rb") as file:
         return Source(name, file.read(MAX_SOURCE_BYTES + 4))
 
@@ -94,7 +94,10 @@ def _complain(lines: Iterable[object]) -> None:
 
 
 def _unread(layout: Layout) -> Iterator[str]:
-    """Yield warnings about initial values that cannot be read; an emulated PLC lacks them."""
+    """Yield warnings about initial values that cannot be understood.
+
+    An emulated PLC does not have them.
+    """
     for text in initial_value_warnings(layout):
         yield f"{layout.name}: warning: {text}"
 

@@ -1,4 +1,4 @@
-"""``shmio-layout import``: convert a plant's tag list into a tag table."""
+"""``shmio-layout import``: converts a plant's tag list into a tag table."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shmio.logs import printable
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command; return its exit status: 0 done, 1 failed, 2 wrong usage."""
+    """Run the command. Return its exit status: 0 success, 1 failure, 2 wrong usage."""
     parser = argparse.ArgumentParser(
         prog="shmio-layout import",
         description=f"Convert a tag list into a tag table, and report what was left out. Imports {FORMATS}.",
@@ -24,7 +24,9 @@ def main(arguments: Sequence[str]) -> int:
         "-o", "--output", metavar="TABLE.toml", type=Path, help="the new tag table; default: standard output"
     )
     parser.add_argument(
-        "--writable", action="store_true", help="commands may write what the vendor's tool lets others write"
+        "--writable",
+        action="store_true",
+        help="allow commands to write what the vendor's tool lets other programs write",
     )
     options = parser.parse_args(arguments)
     return run(parser.prog, lambda: _import(options.file, options.output, writable=options.writable), options)

@@ -33,7 +33,7 @@ def list_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def list_registers(cell: Cell, options: argparse.Namespace) -> int:
-    """Print a line for each register, or one JSON list."""
+    """Print a line for each register, or all registers as one JSON list."""
     layouts = cell.layouts()
     found = [(f"{source}/{one.path}", one) for source, one in choose(options.patterns or layouts, layouts)]
     if options.json:
@@ -63,7 +63,7 @@ def get_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def get(cell: Cell, options: argparse.Namespace) -> int:
-    """Print present values; all values of one source are from one frame."""
+    """Print present values. All values of a source are from the same frame."""
     found = cell.get(*options.patterns)
     _load_numpy(found)
     if options.json:
@@ -93,7 +93,7 @@ def watch_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def watch(cell: Cell, options: argparse.Namespace) -> int:
-    """Print until interrupted, until the instance ends, or up to the number of lines."""
+    """Print values until Ctrl-C, the end of the instance, or the given number of lines."""
     lines = options.json or options.lines or options.count is not None
     if not lines and sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb":
         return _table(cell, options)
@@ -119,7 +119,7 @@ def watch(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _table(cell: Cell, options: argparse.Namespace) -> int:
-    """Show a line for each register, updated in place."""
+    """Show a line for each register, and update the lines in place."""
     drawn = 0
     for read in _rounds(cell, options.patterns, options.every_s or TABLE_EVERY_S):
         columns, rows = shutil.get_terminal_size()
@@ -143,10 +143,11 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _changes(cell: Cell, patterns: Sequence[str], *, every_frame: bool) -> Iterator[Sequence[Reading]]:
-    """Yield the present readings of all registers that the patterns name, then those that change.
+    """Yield the present readings of all registers that match the patterns, then changed readings.
 
     Raises:
         NotRunningError: The instance has ended, or a reload has removed a source or a register.
+
     """
     batch: Sequence[Reading] = cell.get(*patterns)
     last: dict[str, tuple[object, ...]] = {}
@@ -164,10 +165,10 @@ def _changes(cell: Cell, patterns: Sequence[str], *, every_frame: bool) -> Itera
 
 
 def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Sequence[Reading]]:
-    """Yield the readings of all registers that the patterns name, now and every ``every_s`` s.
+    """Yield the readings of all registers that match the patterns, every ``every_s`` s from now on.
 
     Raises:
-        PathError: A pattern names nothing.
+        PathError: A pattern matches nothing.
         NotRunningError: The instance has stopped, or a reload has removed the registers.
 
     """
@@ -184,7 +185,10 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Seq
 
 
 def _load_numpy(readings: Sequence[Reading]) -> None:
-    """Import numpy, which formats REAL values; Ctrl-C ends the process at once meanwhile."""
+    """Import numpy, which formats REAL values.
+
+    During the import, Ctrl-C ends the process at once.
+    """
     if any(one.register.element.base == "REAL" for one in readings):
         with ended_by_interrupt():
             import numpy as np  # noqa: F401, PLC0415  other values are printed without it
@@ -196,7 +200,7 @@ def _width(readings: Sequence[Reading]) -> int:
 
 
 def _clock(reading: Reading) -> str:
-    """Return the time of a value; for a bad value, the present time."""
+    """Return the time of a value as text; for a bad value, the present time."""
     if reading.quality is Quality.BAD:
         when = datetime.now(UTC)
     elif reading.source_time is None:
@@ -219,7 +223,10 @@ def _object(reading: Reading) -> dict[str, Any]:
 
 
 def _line(reading: Reading, width: int, limit: int | None) -> str:
-    """Return a reading as a line of text, with its quality unless good, and a note if injected."""
+    """Return a reading as a line of text.
+
+    It shows the quality unless good, and whether it is injected.
+    """
     quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {printable(reading.reason)}"
     injected = f"  ({reading.provenance})" if reading.provenance == str(Provenance.INJECTED) else ""
     value = shown(reading.value, reading.register, limit)
@@ -227,9 +234,10 @@ def _line(reading: Reading, width: int, limit: int | None) -> str:
 
 
 def shown(value: Value, register: Register, limit: int | None) -> str:
-    """Return a value as text; ``-`` if there is none, ``""`` if it is empty.
+    """Return a value as text; ``-`` if there is no value, ``""`` if it is an empty text.
 
-    ``limit`` is the maximum number of characters; longer text is cut, with a hint on how to see all.
+    ``limit`` is the maximum number of characters (None: no limit). A longer text is cut; a hint at
+    its end says how to see all of it.
     """
     text = "-" if value is None else printable(literal_text(value, register)) or '""'
     return text if limit is None or len(text) <= limit else f"{text[: max(limit - len(CUT), 0)]}{CUT}"

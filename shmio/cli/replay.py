@@ -1,4 +1,4 @@
-"""``shmio replay``: control sources that replay recordings."""
+"""``shmio replay``: controls sources that replay recordings."""
 
 from __future__ import annotations
 
@@ -37,8 +37,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("action", choices=_VERBS, nargs="?", default="status", metavar="ACTION")
     parser.add_argument("value", nargs="?", metavar="VALUE")
-    parser.add_argument("--speed", type=float, metavar="X", help="with play: how fast")
-    parser.add_argument("--jump", action="store_true", help="with to-change, to-event: go there at once")
+    parser.add_argument(
+        "--speed", type=float, metavar="X", help="with play: the speed relative to the instance's clock"
+    )
+    parser.add_argument(
+        "--jump", action="store_true", help="with to-change and to-event: go there at once, without playing"
+    )
     parser.add_argument(
         "--source", action="append", default=[], metavar="NAME", help="only the recording that has this source"
     )
@@ -62,14 +66,14 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _wish(options: argparse.Namespace) -> Wish:
-    """Return the changes that the action makes to a replay."""
+    """Return the changes that the action makes to the state of a replay."""
     action, value = options.action, options.value
     if (value is None) != (action in _ALONE):
         options.refuse(f"{action} takes no VALUE" if value is not None else f"{action} needs a VALUE: {_VERBS[action]}")
     if options.speed is not None and action != "play":
-        options.refuse("--speed goes with play")
+        options.refuse("--speed is only for the action play")
     if options.jump and action not in ("to-change", "to-event"):
-        options.refuse("--jump goes with to-change and to-event")
+        options.refuse("--jump is only for the actions to-change and to-event")
     wishes: dict[str, Wish] = {
         "status": {},
         "pause": {"paused": True},

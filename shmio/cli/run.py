@@ -25,7 +25,10 @@ SHOWN_CHARACTERS = 60
 
 
 class PartlyDoneError(CommandError):
-    """A command failed after a part was done; ``found`` describes that part for its JSON output."""
+    """A command failed after it had done a part.
+
+    ``found`` describes that part for the JSON output.
+    """
 
     def __init__(self, message: str, found: Mapping[str, object]) -> None:
         super().__init__(message)
@@ -67,7 +70,8 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
 def load(command: str) -> Callable[[argparse.Namespace], int]:
     """Import the function of a verb, such as ``shmio.cli.instance.status:status``.
 
-    Only the modules that this verb needs are imported. Ctrl-C ends the process at once meanwhile.
+    Only the modules that this verb needs are imported. During the import, Ctrl-C ends the process
+    at once.
     """
     module, _, function = command.partition(":")
     with ended_by_interrupt():
@@ -76,7 +80,7 @@ def load(command: str) -> Callable[[argparse.Namespace], int]:
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer a shell's request for completion and exit; otherwise do nothing."""
+    """If a shell asks for completions, print them and exit; otherwise do nothing."""
     if "_ARGCOMPLETE" in os.environ:
         from shmio.cli.completion import answer  # noqa: PLC0415  only for a shell
 
@@ -84,13 +88,13 @@ def complete(parser: argparse.ArgumentParser) -> None:
 
 
 def say(line: str, stream: TextIO | None = None) -> None:
-    """Print a line at once; a closed terminal must not stop the command."""
+    """Print a line at once. A closed terminal does not stop the command."""
     with suppress(OSError):
         print(printable(line), file=stream or sys.stdout, flush=True)
 
 
 def say_json(value: Any) -> None:
-    """Print an object as one line of JSON at once; a closed terminal is ignored."""
+    """Print an object as one line of JSON at once. A closed terminal does not stop the command."""
     with suppress(OSError):
         print(dumps(value), flush=True)
 
@@ -102,7 +106,7 @@ def _tell(error: str, found: Mapping[str, object] = MappingProxyType({}), *, as_
 
 
 def _give_up_output() -> None:
-    """Discard the output, so that the interpreter's flush at its exit does not fail again."""
+    """Discard the output, so that flushing it when the interpreter exits does not fail again."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -110,7 +114,7 @@ def _give_up_output() -> None:
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """Return an argument type: a whole number of at least ``least``."""
+    """Return a type for arguments that are whole numbers of at least ``least``."""
 
     def convert(text: str) -> int:
         if not text.isascii() or not text.isdecimal() or len(text) > 7 or int(text) < least:
@@ -143,7 +147,7 @@ def milliseconds(text: str) -> float:
 
 
 def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:
-    """Add ``--json``, which :func:`run` also applies to errors."""
+    """Add the option ``--json``, which also makes :func:`run` print errors as JSON."""
     parser.add_argument("--json", action="store_true", help=f"{text}; an error, too")
 
 
@@ -155,21 +159,24 @@ def add_full(parser: argparse.ArgumentParser) -> None:
 
 
 def room(options: argparse.Namespace) -> int | None:
-    """Return the maximum characters of a value; None (no limit) with ``--full`` or no terminal."""
+    """Return the maximum number of characters of a value; None: no limit.
+
+    There is no limit with ``--full``, and if the output is not a terminal.
+    """
     return None if options.full or not sys.stdout.isatty() else SHOWN_CHARACTERS
 
 
 def dumps(value: Any, indent: int | None = None) -> str:
-    """Return JSON that standard output can encode."""
+    """Return JSON that contains only characters that standard output can encode."""
     utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
     return json.dumps(value, indent=indent, ensure_ascii=not utf8)
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """Yield an event that the first of these signals sets; restore the handlers at the end.
+    """Yield an event that is set by SIGINT, SIGTERM or SIGHUP; restore the handlers at the end.
 
-    SIGHUP is included unless it is ignored, as under nohup.
+    SIGHUP is left out if it is ignored, as under nohup.
     """
     stopping = threading.Event()
 
@@ -190,7 +197,7 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
 @contextmanager
 def ended_by_interrupt() -> Iterator[None]:
-    """Let Ctrl-C end the process at once and silently; an exception would break an import."""
+    """Let Ctrl-C end the process at once and silently. An exception would interrupt an import."""
     main = threading.current_thread() is threading.main_thread()
     heeded = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heeded:
@@ -206,8 +213,8 @@ def ended_by_interrupt() -> Iterator[None]:
 def exit_on_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP raise SystemExit, so that unfinished work is undone.
 
-    The exit status is 128 + n, as in shells. Ignored signals, such as SIGHUP under nohup, stay
-    ignored.
+    The exit status is 128 + n, as in shells. Signals that are ignored, such as SIGHUP under nohup,
+    are still ignored.
     """
 
     def end(number: int, _frame: FrameType | None) -> None:

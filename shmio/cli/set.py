@@ -1,4 +1,4 @@
-"""``shmio set``: write values to a source, and print the outcomes."""
+"""``shmio set``: writes values to sources, and prints the outcomes."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def shield(words: Sequence[str]) -> list[str]:
-    """Put a space before words that begin like negative numbers, which argparse takes for options.
+    """Put a space before words that look like negative numbers but that argparse takes for options.
 
-    argparse itself knows ``-1.5``, but not ``-1.5e-3``, ``-16#FF`` or ``-Infinity``.
+    argparse itself recognizes ``-1.5``, but not ``-1.5e-3``, ``-16#FF`` or ``-Infinity``.
     """
     return [f" {word}" if _NEGATIVE.match(word) else word for word in words]
 
 
 class Pairs(argparse.Action):
-    """The arguments PATH VALUE, any number of times."""
+    """Reads the arguments PATH VALUE, which may be repeated."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, _: str | None = None
@@ -64,7 +64,12 @@ class Pairs(argparse.Action):
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Write all values of each source as one command; raise CommandError with the first failure."""
+    """Write all values of each source as one command.
+
+    Raises:
+        CommandError: A write failed; the message is about the first failure.
+
+    """
     wanted: dict[str, dict[str, Value]] = {}
     layouts = cell.layouts()
     for path, text in options.pairs:
@@ -99,9 +104,13 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def read_value(text: str, register: Register) -> Value:
-    """Convert JSON or an S7 literal to a value for a register, or raise ValueRangeError.
+    """Convert JSON or an S7 literal to a value for a register.
 
-    An array's literal must have all elements: missing ones would be written as zero.
+    The literal of an array must have all elements, because missing ones would be written as zero.
+
+    Raises:
+        ValueRangeError: The text is not a value, or does not fit the register.
+
     """
     try:
         value = json.loads(text)
@@ -141,7 +150,12 @@ def _literal(text: str, register: Register) -> Value:
 
 
 def _target(layouts: Mapping[str, Layout], path: str) -> tuple[str, Register]:
-    """Return the source and the register that a path names, or raise PathError."""
+    """Return the source and the register that a path names.
+
+    Raises:
+        PathError: The path does not name a single register that can be written.
+
+    """
     topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.direction == "out":
         raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
@@ -164,7 +178,10 @@ def _described(outcomes: dict[str, Outcome]) -> dict[str, object]:
 
 
 def _print(outcomes: dict[str, Outcome], complaint: str) -> None:
-    """Print the outcomes as text, without the reason that the error line gives."""
+    """Print the outcomes as text.
+
+    A reason equal to ``complaint`` is left out, as the error line has it.
+    """
     width = max((len(printable(path)) for path in outcomes), default=0)
     for path, end in outcomes.items():
         reason = f": {printable(end.text)}" if end.text and end.text != complaint else ""

@@ -1,4 +1,4 @@
-"""``shmio step``: advance, play or stop the clock of an instance."""
+"""``shmio step``: advances, plays or releases the clock of an instance."""
 
 from __future__ import annotations
 
@@ -32,9 +32,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="step at RATE times real time (default: 1) until Ctrl-C; then time is paused",
     )
     how.add_argument("--pause", action="store_true", help="pause time, without a step")
-    how.add_argument("--release", action="store_true", help="return to real time, without a step")
+    how.add_argument("--release", action="store_true", help="make the instance follow real time again, without a step")
     parser.add_argument(
-        "--yes", action="store_true", help="do not ask for confirmation if time is real and sources have devices"
+        "--yes",
+        action="store_true",
+        help="do not ask for confirmation if the instance follows real time and has devices",
     )
 
 
@@ -80,7 +82,7 @@ def _ask(cell: Cell) -> None:
     sys.stderr.write(f"{what}. Go on? [y/N] ")
     sys.stderr.flush()
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-        raise CommandError("time was left as it is")
+        raise CommandError("the clock was not changed")
 
 
 def _play(cell: Cell, rate: float, dt_s: float | None) -> None:

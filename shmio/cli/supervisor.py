@@ -1,4 +1,7 @@
-"""``shmio-supervisor``: start, watch and stop an instance. The verbs are in ``shmio.cli.instance``."""
+"""``shmio-supervisor``: starts, watches and stops an instance.
+
+The verbs are in ``shmio.cli.instance``.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,9 @@ def _parser() -> argparse.ArgumentParser:
         default="live",
         help="live (default); log: record, serve nothing; replay: play a recording in place of the sources",
     )
-    up.add_argument("--detach", action="store_true", help="return when it runs, and leave it running")
+    up.add_argument(
+        "--detach", action="store_true", help="start the instance in the background, and return when it runs"
+    )
     _add_replay(up)
     up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor for the report of a detached start
     verb("down", "stop the instance", target, command="control:down")
@@ -65,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     add_json(check)
     logs = verb("logs", "print the end of the log files", target)
     logs.add_argument("name", metavar="NAME", nargs="?", help="a process, or supervisor (default: all)")
-    logs.add_argument("-f", "--follow", action="store_true", help="continue with new lines")
+    logs.add_argument("-f", "--follow", action="store_true", help="continue to print new lines until Ctrl-C")
     logs.add_argument("-n", "--lines", type=at_least(0), default=20, metavar="LINES", help="default: 20")
     add_json(logs, "print one JSON object per line")
     init = verb("init", "write a configuration: the A50 example, or one for the files given", file)
@@ -108,12 +113,16 @@ def _add_replay(parser: argparse.ArgumentParser) -> None:
     """Add the options that override the keys of ``[replay]``."""
     group = parser.add_argument_group("with --mode replay, in place of the keys of [replay]")
     group.add_argument("--from", nargs="+", metavar="FILE", help="the recording: one .mem, or several of one run")
-    group.add_argument("--start", metavar="TIME", help="seconds from its begin, or a date and time")
+    group.add_argument("--start", metavar="TIME", help="seconds from its beginning, or a date and time")
     group.add_argument("--end", metavar="TIME", help="the same")
-    group.add_argument("--speed", type=float, metavar="X", help="times real time, 0.01 to 1000 (default: 1)")
-    group.add_argument("--injections", choices=("keep", "leave out"), help="those of the recording (default: keep)")
+    group.add_argument("--speed", type=float, metavar="X", help="a factor of real time, 0.01 to 1000 (default: 1)")
+    group.add_argument(
+        "--injections", choices=("keep", "leave out"), help="the injections of the recording (default: keep)"
+    )
     group.add_argument("--loop", action="store_true", default=None, help="again and again")
-    group.add_argument("--paused", action="store_true", default=None, help="begin when told to: shmio replay play")
+    group.add_argument(
+        "--paused", action="store_true", default=None, help="wait at the beginning until shmio replay play"
+    )
     group.add_argument("--record", action="store_true", default=None, help="start the recorder of the configuration")
 
 

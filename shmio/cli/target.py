@@ -1,4 +1,4 @@
-"""Find the instance that a command acts on."""
+"""Finds the instance on which a command acts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def config_file(arguments: argparse.Namespace) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The instance that a verb acts on, and the configuration that names it, if any."""
+    """The instance on which a verb acts, and the configuration that names it, if any."""
 
     name: str
     file: Path | None = None
@@ -36,13 +36,19 @@ class Target:
         """Open the instance's segment.
 
         Raises:
-            SegmentError: The segment cannot be opened; see Segment.open.
+            SegmentError: The segment cannot be opened, as for Segment.open.
             WrongInstanceError: The instance was started from another file.
+
         """
         return Segment.open(self.name, writable=writable, config=self.file)
 
     def open_supervised(self) -> Segment:
-        """Open the instance's segment; raise NotRunningError if its supervisor is dead."""
+        """Open the instance's segment, and check that its supervisor is alive.
+
+        Raises:
+            NotRunningError: The supervisor is dead.
+
+        """
         segment = self.open()
         if not segment.supervised:
             segment.close()
@@ -54,7 +60,7 @@ class Target:
 
 
 def target(arguments: argparse.Namespace) -> Target:
-    """Return the instance named by option or configuration, else the only running one.
+    """Return the instance that an option or the configuration names, or else the only running one.
 
     Raises:
         ConfigError: The name is invalid or missing in the file.
@@ -76,9 +82,9 @@ def target(arguments: argparse.Namespace) -> Target:
 
 
 def config_option(arguments: argparse.Namespace) -> str | None:
-    """Return the option that names the same configuration: ``-c FILE``, or "" for the default.
+    """Return the option that selects the same configuration: ``-c FILE``, "" for the default file.
 
-    Return None if the configuration is unknown, because the instance was named or found running.
+    Return None if the configuration is not known, because the instance was named or found running.
     """
     if getattr(arguments, "instance", None) is not None:
         return None
@@ -88,12 +94,17 @@ def config_option(arguments: argparse.Namespace) -> str | None:
 
 
 def option_for(file: Path) -> str:
-    """Return the option that names a configuration; empty for the default file."""
+    """Return the option that selects a configuration; "" for the default file."""
     return "" if file == DEFAULT_CONFIG else f"-c {shlex.quote(str(file))}"
 
 
 def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
-    """Return the supervisor's answer to a request; raise ControlError once it appears dead."""
+    """Return the supervisor's answer to a request.
+
+    Raises:
+        ControlError: The supervisor refuses, does not answer, or seems to be dead.
+
+    """
     try:
         return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
     except UnreachableError as error:
@@ -101,7 +112,7 @@ def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[st
 
 
 def _named_in(file: Path) -> str:
-    """Read only the instance's name from a file, so that even an invalid file allows a stop."""
+    """Read only the instance's name from a file. The rest of the file may be invalid."""
     tables = read_tables(file)
     try:
         name = tables["instance"]["name"]

@@ -1,4 +1,4 @@
-"""``shmio``: read, write and control a running instance on this host or another."""
+"""``shmio``: reads, writes and controls a running instance on this host or another."""
 
 from __future__ import annotations
 
@@ -81,13 +81,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
-    """Open the instance that the options name: on this host, or with ``--host`` behind an endpoint.
+    """Open the instance that the options name.
+
+    With ``--host``, it is the instance behind an endpoint.
 
     Raises:
-        ConfigError: ``--host`` comes with options for an instance here, or the address is invalid.
+        ConfigError: ``--host`` was combined with options for an instance on this host, or the
+            address is invalid.
         OSError: A file cannot be read.
-        ValueRangeError: The token would go to another host in plain text.
-        UnknownClientError: The instance requires a token; the message has the option for it.
+        ValueRangeError: The token would be sent to another host in plain text.
+        UnknownClientError: The instance requires a token; the message names the option for it.
 
     """
     if arguments.host is None:
@@ -95,7 +98,7 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
             yield attachment
         return
     if arguments.config is not None or arguments.instance is not None:
-        raise ConfigError("--host names the instance already: leave out -c and --instance")
+        raise ConfigError("--host already names the instance: remove -c and --instance")
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its errors say the same
     with ended_by_interrupt():  # gRPC crashes if an exception interrupts its import
         from shmio.client import connect  # noqa: PLC0415  only for --host
@@ -119,7 +122,7 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
 
 
 def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
-    """Return the arguments with paths in TIA Portal's spelling translated to shmio's."""
+    """Return the arguments with paths in shmio's spelling, where they have that of TIA Portal."""
     patterns, pairs = getattr(arguments, "patterns", None) or (), getattr(arguments, "pairs", None) or ()
     if not any(map(may_be_tia_spelling, [*patterns, *(path for path, _ in pairs)])):
         return arguments
@@ -140,12 +143,17 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     add_json(common, "print JSON")
     common.add_argument("--host", metavar="HOST:PORT", help="an instance's gRPC endpoint, on any host; or unix:PATH")
-    common.add_argument("--ca", type=Path, metavar="FILE", help="with --host: use TLS, and trust this authority (PEM)")
+    common.add_argument(
+        "--ca",
+        type=Path,
+        metavar="FILE",
+        help="with --host: use TLS, and trust certificates of this authority (PEM)",
+    )
     common.add_argument(
         "--certificate", type=Path, metavar="FILE", help="client certificate (PEM), if the endpoint needs one"
     )
     common.add_argument("--key", type=Path, metavar="FILE", help="its key (PEM)")
-    common.add_argument("--token-file", type=Path, metavar="FILE", help="what the endpoint knows us by")
+    common.add_argument("--token-file", type=Path, metavar="FILE", help="a file with the token of this client")
     common.add_argument(
         "--token-in-plain-text", action="store_true", help="send the token to another host even without TLS"
     )

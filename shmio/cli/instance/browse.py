@@ -1,4 +1,4 @@
-"""``shmio-supervisor browse``: list what a device offers, as a tree or as a tag table."""
+"""``shmio-supervisor browse``: lists what a device offers, as a tree or as a tag table."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shmio.logs import printable
 
 
 def browse(arguments: argparse.Namespace) -> int:
-    """List the offers of a device; return 1 if there may be more of them."""
+    """List what a device offers; return 1 if the list may be incomplete."""
     output = arguments.output
     if output is not None and output.suffix != ".toml":
         raise ConfigError(f"{output}: the table is TOML: have its name end in .toml")
@@ -82,7 +82,7 @@ def _write(arguments: argparse.Namespace, found: Browsed) -> None:
 
 
 def tree(offers: list[Offer]) -> Iterator[str]:
-    """Yield the lines of a tree: each group before what is in it."""
+    """Yield the lines of a tree: each group, followed by its contents."""
     by_names = {one.names: one for one in offers}
     children: dict[tuple[str, ...], dict[tuple[str, ...], None]] = {}
     for names in by_names:

@@ -1,4 +1,4 @@
-"""``shmio-supervisor check``: validate a configuration and the files it names; start nothing."""
+"""``shmio-supervisor check``: validates a configuration and the files it names; starts nothing."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from shmio.plan.processes import Plan
 from shmio.segment import PREFIX, BlockSpec, Segment
 
 MAX_PATTERNS: Final = 200
-"""Most characters of a source's patterns in a line."""
+"""Largest number of characters that a line shows of a source's patterns."""
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """Print what the instance would need: processes, registers and memory."""
+    """Print the processes, registers and memory that the instance would have."""
     file = config_file(arguments)
     prepared = prepare(file)
     plan = prepared.plan
@@ -60,7 +60,7 @@ def check(arguments: argparse.Namespace) -> int:
 def _taken(file: Path, plan: Plan) -> list[str]:
     """Return a note for each address that another program uses.
 
-    If the instance runs, or if its processes outlived the supervisor, there are no notes: these
+    If the instance runs, or its processes have survived their supervisor, there are no notes: these
     processes use the addresses, and ``up`` takes them over.
     """
     with suppress(ShmioError), Segment.open(plan.instance, config=file) as segment:
@@ -70,9 +70,9 @@ def _taken(file: Path, plan: Plan) -> list[str]:
 
 
 def _unserved(prepared: Prepared) -> list[str]:
-    """Return a note for each S7 source that reads from an address of this host without a listener.
+    """Return a note for each S7 source that reads an address of this host where nothing listens.
 
-    If the file has emulators, ``prepare`` warns instead.
+    If the file has emulators, ``prepare`` warns about this instead.
     """
     notes = []
     for source in prepared.config.source if not prepared.config.emulator else ():
@@ -127,7 +127,7 @@ def _line(source: dict[str, Any]) -> str:
 
 
 class _Figures:
-    """What a source reads and writes, and whether its period can be met."""
+    """How much a source reads and may write, and whether its period can be met."""
 
     def __init__(self, source: Source, block: BlockSpec, round_trip_ms: float | None) -> None:
         self._load = source_load(source, block.layout)
@@ -141,7 +141,7 @@ class _Figures:
             "writable": list(source.writable),
             "writable_registers": writable_registers(source, block.layout),
         }
-        """The keys of the source for ``--json``."""
+        """The keys and values that ``--json`` prints for the source."""
 
     def _case(self, requests: Requests) -> dict[str, Any]:
         round_trips, round_trip_ms = requests.round_trips, self._round_trip_ms
@@ -156,7 +156,7 @@ class _Figures:
         }
 
     def slow(self, key: str) -> Iterator[str]:
-        """Yield a warning if the period cannot be met, whatever is assumed."""
+        """Yield a warning if the period cannot be met under any of the assumptions."""
         cases = self.found["requests"]
         if cases and not any(case["met"] in (True, None) for case in cases):
             best = min(cases, key=lambda case: case["cycle_ms"])
@@ -168,7 +168,7 @@ class _Figures:
 
 
 def _load_lines(source: dict[str, Any]) -> Iterator[str]:
-    """Yield lines about what a source reads and writes."""
+    """Yield lines that say what a source reads and what commands may write."""
     if source["reads"] is not None:
         cases, note = source["requests"], source["load_note"]
         if not cases:
@@ -185,7 +185,7 @@ def _load_lines(source: dict[str, Any]) -> Iterator[str]:
         patterns = shorten(", ".join(source["writable"]), MAX_PATTERNS)
         yield f"  writable: {counted(count, 'register')}: {patterns}"
     elif source["writable"]:
-        yield "  writable: none: its connector cannot write, or the patterns name nothing"
+        yield "  writable: none: the connector cannot write, or the patterns match nothing"
 
 
 def _case_text(case: dict[str, Any], period_ms: float) -> str:

@@ -25,7 +25,10 @@ WHERE_S = 5.0
 
 
 def down(arguments: argparse.Namespace) -> int:
-    """Ask the supervisor to stop, and wait for its end. If it is dead, remove what it left."""
+    """Ask the supervisor to stop, and wait for its end.
+
+    If it is dead, remove what it left behind.
+    """
     wanted = target(arguments)
     name = wanted.name
     if name not in instances():
@@ -66,14 +69,14 @@ def _stop(segment: Segment) -> None:
 
 
 def _pidfd(pid: int) -> int | None:
-    """Return a pidfd of the supervisor, or None if it is in another PID namespace."""
+    """Return a pidfd of the supervisor; None if it is in another PID namespace."""
     with suppress(OSError):
         return os.pidfd_open(pid)
     return None
 
 
 def reload(arguments: argparse.Namespace) -> int:
-    """Apply the configuration's changes; return 1 if a changed process does not run."""
+    """Apply the changes of the configuration; return 1 if a changed process does not run."""
     with target(arguments).open_supervised() as segment:
         answer = ask(segment, control.Reload(), RELOAD_S)
     status = 1 if answer["problems"] else 0

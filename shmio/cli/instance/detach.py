@@ -1,6 +1,6 @@
-"""``shmio-supervisor up --detach``: start an instance in a process of its own, and wait until it runs.
+"""``shmio-supervisor up --detach``: starts an instance in another process, and waits until it runs.
 
-This process only waits, and so does not import what starts an instance.
+This process only waits. It therefore does not import the modules that start an instance.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from shmio.segment import PREFIX
 from shmio.supervisor.process import child_environment
 
 DETACH_S = 120.0
-"""Time-out for the start of a detached instance, in s."""
+"""Time-out in s for the start of a detached instance."""
 _OPTIONS: Final = ("from", "start", "end", "speed", "injections")
 _FLAGS: Final = ("loop", "paused", "record")
 
 
 class Configured(msgspec.Struct, tag=True):
-    """Message: the detached supervisor has read its configuration."""
+    """Message of the detached supervisor: it has read its configuration."""
 
     log_file: str
     warnings: tuple[str, ...]
 
 
 class Started(msgspec.Struct, tag=True):
-    """Message: the instance runs.
+    """Message of the detached supervisor: the instance runs.
 
-    ``history`` says what an earlier supervisor left; ``processes`` has a line for each process.
+    ``history`` says what an earlier supervisor left behind; ``processes`` has a line for each
+    process.
     """
 
     instance: str
@@ -49,17 +50,17 @@ class Started(msgspec.Struct, tag=True):
 
 
 class Failed(msgspec.Struct, tag=True):
-    """Message: the start has failed."""
+    """Message of the detached supervisor: the start has failed."""
 
     error: str
 
 
 StartMessage = Configured | Started | Failed
-"""A message about the start: one line of JSON without control characters."""
+"""A message about the start, sent as one line of JSON without control characters."""
 
 
 def detach(arguments: argparse.Namespace) -> int:
-    """Start the instance; return when it runs."""
+    """Start the instance in another process; return when it runs."""
     file, mode = config_file(arguments), arguments.mode
     words = replay_words(replay_keys(arguments))
     command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
@@ -92,23 +93,31 @@ def detach(arguments: argparse.Namespace) -> int:
 
 
 def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path) -> str:
-    """Return the first line about an instance. ``segment_bytes`` is None before a take-over."""
+    """Return the first line to print about an instance.
+
+    ``segment_bytes`` is None if an earlier segment is taken over, whose size is not known yet.
+    """
     size = "" if segment_bytes is None else f" ({segment_bytes / 1e6:.1f} MB)"
     return f"{instance}: mode {mode}, segment {PREFIX}{instance}{size}, logs in {log_dir}"
 
 
 def replay_keys(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the command line's keys of ``[replay]``; raise ConfigError in other modes."""
+    """Return the keys of ``[replay]`` that the command line gives.
+
+    Raises:
+        ConfigError: The command line gives such keys, but the mode is not ``replay``.
+
+    """
     found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}
     if found and arguments.mode != "replay":
-        raise ConfigError(f"--{next(iter(found))} goes with --mode replay only")
+        raise ConfigError(f"--{next(iter(found))} is only for --mode replay")
     if "from" in found:
         found["file"] = [str(Path(file).absolute()) for file in found.pop("from")]
     return {name: _moment(value) if name in ("start", "end") else value for name, value in found.items()}
 
 
 def replay_words(keys: Mapping[str, Any]) -> list[str]:
-    """Return keys of ``[replay]`` as options for the detached supervisor's command line."""
+    """Return keys of ``[replay]`` as options for the command line of the detached supervisor."""
     words: list[str] = []
     for name, value in keys.items():
         if name == "file":
@@ -119,7 +128,12 @@ def replay_words(keys: Mapping[str, Any]) -> list[str]:
 
 
 def _await(fd: int) -> tuple[str, Started]:
-    """Wait for the start; return the log file and the message, or raise ControlError."""
+    """Wait for the start; return the log file and the message.
+
+    Raises:
+        ControlError: The start failed.
+
+    """
     log_file = ""
     for line in _lines(fd):
         message = msgspec.json.decode(line, type=StartMessage)
@@ -134,7 +148,7 @@ def _await(fd: int) -> tuple[str, Started]:
 
 
 def _lines(fd: int) -> Iterator[bytes]:
-    """Yield the lines that come through the pipe, until its end or the time-out."""
+    """Yield the lines that arrive through the pipe, until it is closed or the time-out has passed."""
     deadline = time.monotonic() + DETACH_S
     received = b""
     while True:

@@ -1,4 +1,7 @@
-"""``shmio-supervisor init``: write a first configuration, the A50 example or one for the files of a controller."""
+"""``shmio-supervisor init``: writes a first configuration.
+
+This is the A50 example, or a configuration for the files of a controller.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +34,9 @@ EXAMPLE = ("supervisor.toml", "db201.db")
 EXAMPLE_NAME = "a50"
 SOURCES = (".db", ".udt", ".scl", ".awl")
 TABLES = (".toml", ".csv", ".xlsx")
-"""What tag tables are called."""
+"""File name endings of tag tables."""
 LISTS = (".csv", ".xlsx", ".sdf", ".asc", ".seq")
-"""What tag lists of other tools are called."""
+"""File name endings of other tools' tag lists."""
 _URL = re.compile(r"([a-z][a-z.+-]*):/+", re.IGNORECASE)
 TAG_LISTS: Final = (
     "a device without such files has a tag table: shmio-layout import converts the tag list of another tool, "
@@ -42,7 +45,10 @@ TAG_LISTS: Final = (
 GRPC_PORTS = range(8089, 8189)
 S7_PORTS = range(1102, 1202)
 MAX_SOURCES = 50
-"""Maximum number of sources of a new configuration; the user chooses one of more data blocks."""
+"""Maximum number of sources of a new configuration.
+
+With more data blocks, the user must choose one.
+"""
 RESERVED = RESERVED_SOURCES | SECTION_PROCESSES | {"plc"}
 _DB_NUMBER = re.compile(r"[0-9]{1,5}", re.ASCII)
 _UMLAUTS: Final = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
@@ -53,7 +59,7 @@ MAX_FILES: Final = 500
 
 
 def init(arguments: argparse.Namespace) -> int:
-    """Write the files, or none of them if one exists already."""
+    """Write the files. If one exists already, write none."""
     file = config_file(arguments)
     _refuse_present(file)
     text, missing = None, dict[Path, list[str]]()
@@ -90,11 +96,16 @@ def _example(file: Path) -> dict[Path, str]:
 
 def _refuse_present(path: Path) -> None:
     if os.path.lexists(path):
-        raise ConfigError(f"{path} is there already and is left as it is; choose another by -c FILE, or remove it")
+        raise ConfigError(
+            f"{path} exists already and was not changed; choose another name by -c FILE, or remove the file"
+        )
 
 
 def _write(files: dict[Path, str]) -> None:
-    """Write all files or none. Never change an existing file; an identical ``.db`` is kept."""
+    """Write all files or none.
+
+    Never change an existing file; an identical ``.db`` file may exist.
+    """
     for path, content in files.items():
         if not (path.is_file() and path.suffix == ".db" and path.read_bytes() == content.encode()):
             _refuse_present(path)
@@ -115,17 +126,18 @@ class NewConfig(NamedTuple):
 
 
 def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, emulated: bool = False) -> NewConfig:
-    """Make a configuration for a controller's files.
+    """Make a configuration for the files of a controller.
 
     Args:
-        file: Where the configuration will be.
-        files: Sources of data blocks and tags, and at most one properties file.
-        name: The data block to use. None: the one with the properties file's number, else all.
+        file: Where the configuration will be written.
+        files: Source files of data blocks and tags, and at most one properties file.
+        name: The data block to use. None: the block with the number in the properties file, or else
+            all blocks.
         emulated: True to add an emulated controller with these blocks.
 
     Raises:
         ConfigError: The files do not belong together, or are of other kinds.
-        LayoutError: A source cannot be compiled.
+        LayoutError: A source file cannot be compiled.
 
     """
     sources = [path for path in files if path.suffix.lower() in SOURCES]
@@ -190,7 +202,8 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
 def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layout], list[str]]:
     """Return the data blocks to use as sources, and warnings.
 
-    If a name is given, use that block; else the block with this number; else all that compile.
+    If ``name`` is given, use only this block. Otherwise use the block with ``number`` or, if there
+    is no number, all blocks that can be compiled.
     """
     held = ", ".join(block.name for block in program.blocks)
     if name is not None:
@@ -223,7 +236,12 @@ def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layo
 
 
 def _refuse_table(path: Path, file: Path) -> None:
-    """Raise ConfigError if this is a tag list or a server's URL, with what to do with it."""
+    """Refuse a tag list or the URL of a server.
+
+    Raises:
+        ConfigError: It is one; the message says what to do with it.
+
+    """
     text = str(path)
     if match := _URL.match(text):  # a path has lost one of the slashes
         url = f"{match[1]}://{text[match.end() :]}"
@@ -245,14 +263,19 @@ def _in_source(file: Path, table: str) -> str:
 
 
 def _refuse_foreign(path: Path) -> None:
-    """Raise ConfigError if a file is an export of TIA Portal, but not a source."""
+    """Refuse exports of TIA Portal that are not source files.
+
+    Raises:
+        ConfigError: The file is one.
+
+    """
     with suppress(OSError), path.open("rb") as stream:  # unreadable files are reported with the others
         if what := foreign(path.name, stream.read(HEAD_BYTES)):
             raise ConfigError(f"{path}: {what}")
 
 
 def _source_names(blocks: Sequence[Layout]) -> list[str]:
-    """Return a name for each source: ``cell`` if there is only one, else from its block's name."""
+    """Return a name for each source: ``cell`` if there is only one, else one like its block's name."""
     if len(blocks) == 1:
         return ["cell"]
     names: list[str] = []
@@ -266,7 +289,7 @@ def _source_names(blocks: Sequence[Layout]) -> list[str]:
 
 
 def _unknown(block: Layout, properties: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Yield each key about the real controller that is still unknown, and a comment line for it."""
+    """Yield each key about the real controller that has no value yet, and a comment line for it."""
     if "host" not in properties:
         yield "host", '# host = ""                           # needed: the address of your controller'
     if block.number is None and "dbNumber" not in properties:
@@ -278,7 +301,7 @@ def _number(block: Layout, number: str) -> int:
 
 
 def _emulated(block: Layout, number: str, address: Address) -> list[str]:
-    """Return the lines of a source with the address of its emulated controller."""
+    """Return the lines of a source that give the address of its emulated controller."""
     return [
         f"host = {_toml(address.host):<31}# the emulator below; for a real controller: its address",
         f"port = {address.port:<31}# for a real controller: without this line",
@@ -287,7 +310,10 @@ def _emulated(block: Layout, number: str, address: Address) -> list[str]:
 
 
 def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) -> tuple[list[Address], list[str]]:
-    """Return each block's emulator address, and the sections: one for all blocks if possible."""
+    """Return each block's emulator address, and the sections.
+
+    One emulator serves all blocks if possible.
+    """
     together = len(blocks) == held > 1 and all(block.number is not None for block in blocks)
     ports = _free(S7_PORTS, 1 if together else len(blocks))
     if not together and len(ports) < len(blocks):
@@ -311,7 +337,7 @@ def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) ->
 
 
 def _instance(block: Layout) -> str:
-    """Return a name for the instance, made from its block's name."""
+    """Return a name for the instance, made from the name of its block."""
     plain = unicodedata.normalize("NFKD", unicodedata.normalize("NFC", block.name.lower()).translate(_UMLAUTS))
     letters = "".join(char for char in plain if not unicodedata.combining(char))
     return _NAME.sub("-", letters).strip("-_")[:40] or "cell"
@@ -328,26 +354,29 @@ def _addresses(roles: list[str]) -> list[str]:
 
 
 def _free(ports: range, count: int) -> list[Address]:
-    """Return free addresses to listen on, beginning with the usual one."""
+    """Return up to ``count`` free addresses on these ports, in the order of the ports."""
     free = (address for port in ports if not in_use(address := Address("127.0.0.1", port)))
     return list(islice(free, count)) or [Address("127.0.0.1", 0)]
 
 
 def _relative(path: Path, file: Path) -> str:
-    """Return a path for the configuration: relative if it lies below the configuration's folder."""
+    """Return a path for the configuration.
+
+    It is relative if it is inside the configuration's folder.
+    """
     absolute, folder = path.resolve(), file.resolve().parent
     return str(absolute.relative_to(folder)) if absolute.is_relative_to(folder) else str(absolute)
 
 
 def _toml(value: str | list[str]) -> str:
-    """Return a TOML basic string, or an array of them; JSON's escapes are a subset of TOML's."""
+    """Return a text as TOML string, or texts as an array. JSON's escapes are also valid in TOML."""
     return json.dumps(value, ensure_ascii=False)
 
 
 def vacant_name(name: str, file: Path) -> str:
-    """Return a name that no instance and no configuration nearby has: ``name``, ``name-2`` and so on.
+    """Return a name that no instance or nearby configuration has: ``name``, ``name-2`` and so on.
 
-    ``file``: where the new configuration will be.
+    ``file`` is where the new configuration will be written.
     """
     taken = {*instances(), *_configured(file)}
     numbered = (f"{name[: MAX_LENGTH - len(end)]}{end}" for end in (f"-{number}" for number in count(2)))
@@ -355,7 +384,7 @@ def vacant_name(name: str, file: Path) -> str:
 
 
 def _configured(file: Path) -> Iterator[str]:
-    """Yield instance names of the configurations in this folder, its neighbours and its parent."""
+    """Yield the names of instances configured in this folder, its neighbours and its parent."""
     folder = file.resolve().parent
     found = chain(folder.glob("*.toml"), folder.parent.glob("*/supervisor.toml"), folder.parent.glob("*.toml"))
     for other in islice(found, MAX_FILES):

@@ -1,4 +1,4 @@
-"""``shmio-supervisor logs [NAME]``: print the end of the log files."""
+"""``shmio-supervisor logs [NAME]``: prints the end of the log files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SUPERVISOR = "supervisor"
 _LINE = re.compile(
     r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
 )
-"""A line as shmio.logs writes it."""
+"""The form in which shmio.logs writes a line."""
 
 MAX_LINE_BYTES: Final = 65536
 _STAMP = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z ")
@@ -62,10 +62,10 @@ def logs(arguments: argparse.Namespace) -> int:
 
 
 def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
-    """Return the log folder and the process names.
+    """Return the log folder and the names of the processes.
 
-    They come from the configuration, or else from the running instance, whose file may be gone.
-    Running processes that are not in the file, such as a replay's sources, are included.
+    They come from the configuration. If it cannot be read, they come from the running instance.
+    Running processes that are not in the file, such as the sources of a replay, are included.
     """
     wanted = target(arguments)
     if wanted.file is not None:
@@ -90,7 +90,10 @@ def _print(lines: Iterable[bytes], *, as_json: bool) -> None:
 
 
 def _parsed(line: str) -> dict[str, Any]:
-    """Split a line; a continuation, such as a line of a traceback, has only text."""
+    """Split a line into its fields.
+
+    A continuation, such as a line of a traceback, has only text.
+    """
     found = _LINE.fullmatch(line)
     if found is None:
         return {"time": None, "level": None, "process": None, "pid": None, "text": line}
@@ -98,16 +101,19 @@ def _parsed(line: str) -> dict[str, Any]:
 
 
 def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
-    """Return the last ``count`` lines of the files together, in the order of their time stamps.
+    """Return the last ``count`` lines of all files together, in the order of their time stamps.
 
-    A line without a time stamp, such as one of a traceback, stays after the line before it.
+    A line without a time stamp, such as a line of a traceback, stays after the line before it.
     """
     merged = heapq.merge(*(_stamped(file, count) for file in files), key=lambda entry: entry[0])
     return list(deque((line for _, line in merged), maxlen=count))
 
 
 def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
-    """Return the last ``count`` lines of a file, each with its time stamp or an earlier line's."""
+    """Return the last ``count`` lines of a file.
+
+    Each has its time stamp, or else that of an earlier line.
+    """
     try:
         with file.open("rb") as stream:
             return deque(_lines(stream), maxlen=count)
@@ -124,13 +130,18 @@ def _lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 class Follower:
-    """Follows log files from now on; reads a rotated file to its end, then the new one.
+    """Follows log files from now on. It reads a rotated file to its end, and then the new file.
 
     It waits on inotify, so that idle files cost nothing. Use it as a context manager.
     """
 
     def __init__(self, files: Iterable[Path]) -> None:
-        """Begin to follow; raise OSError if a folder cannot be watched."""
+        """Begin to follow the files.
+
+        Raises:
+            OSError: A folder cannot be watched.
+
+        """
         self._files: dict[Path, BinaryIO | None] = {}
         self._partial: dict[Path, bytes] = {}
         files = list(files)
@@ -183,7 +194,7 @@ def _open(file: Path) -> BinaryIO | None:
 
 
 def _replaced(file: Path, stream: BinaryIO | None) -> bool:
-    """Return whether the path now leads to another file."""
+    """Return whether the path now leads to another file than the one that is open."""
     try:
         found = file.stat()
     except FileNotFoundError:
@@ -192,7 +203,10 @@ def _replaced(file: Path, stream: BinaryIO | None) -> bool:
 
 
 def _watch(folders: Iterable[Path]) -> int:
-    """Return an inotify descriptor for the folders. By ctypes: Python's library has no inotify."""
+    """Return an inotify descriptor for the folders.
+
+    It uses ctypes, because Python has no inotify.
+    """
     libc = ctypes.CDLL(None, use_errno=True)
     fd: int = libc.inotify_init1(os.O_CLOEXEC)
     if fd < 0:

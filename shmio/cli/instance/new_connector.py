@@ -1,4 +1,4 @@
-"""``shmio-supervisor new-connector``: write a package with a connector that works, for the user to change."""
+"""``shmio-supervisor new-connector``: writes a package with a working connector to start from."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _FILES: Final = {
     "tests/device.py": "device.py",
     "tests/test_{part}.py": "test_fieldbus.py",
 }
-"""Templates, by the path in the new folder. The connector in the templates is called fieldbus."""
+"""Templates by the path in the new folder. In the templates, the connector is called fieldbus."""
 
 
 def new_connector(arguments: argparse.Namespace) -> int:
@@ -38,7 +38,9 @@ def new_connector(arguments: argparse.Namespace) -> int:
     _check_name(name)
     folder: Path = arguments.directory or Path(f"shmio-{name.replace('_', '-')}")
     if os.path.lexists(folder):
-        raise ConfigError(f"{folder} is there already and is left as it is; choose another by -o FOLDER, or remove it")
+        raise ConfigError(
+            f"{folder} exists already and was not changed; choose another name by -o FOLDER, or remove the folder"
+        )
     for path, content in package(name).items():
         file = folder / path
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""``shmio-supervisor status`` and ``list``: print the state of an instance, or all instances of this host."""
+"""``shmio-supervisor status`` and ``list``: print the state of one instance, or all instances here."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _table(status: InstanceStatus) -> list[str]:
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows as lines with columns."""
+    """Return rows as lines with aligned columns."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
     padded = ([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]] for row in rows)
     return ["  ".join(cells).rstrip() for cells in padded]
@@ -68,7 +68,7 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
 def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
     """Return the state of the clock as text.
 
-    ``dt_ms`` is the size of the steps that were made; None if that is the clock's step size.
+    ``dt_ms`` is the length of the steps that were just made; None: that of the clock's step size.
     """
     if clock.mode == str(ClockMode.WALL):
         return f"real time {clock.time_s:.3f} s"
@@ -97,7 +97,10 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
 
 
 def _said(process: ProcessStatus) -> bool:
-    """Return whether the process's note only repeats its source's reason, in full or shortened."""
+    """Return whether the note of a process only repeats the reason that its source gives.
+
+    The note may be a shortened form of the reason.
+    """
     return isinstance(process, SourceStatus) and (
         process.reason.startswith(process.note) or bool(process.reason and process.note.startswith(process.reason))
     )
@@ -116,8 +119,8 @@ def _duration(seconds: float) -> str:
 class Listed(msgspec.Struct):
     """An instance in the list.
 
-    ``file`` is the configuration that it was started from, and ``listen`` has addresses by process;
-    both are empty if unknown. ``note`` is a remark for the user.
+    ``file`` is the configuration from which it was started. ``listen`` has the addresses by
+    process. Both are empty if they are not known. ``note`` is a remark for the user.
     """
 
     name: str
@@ -140,7 +143,7 @@ def list_instances(arguments: argparse.Namespace) -> int:
 
 
 def _look(name: str) -> Listed | None:
-    """Return what this user can find out about an instance, or None if it has just ended."""
+    """Return what this user can find out about an instance; None if the instance has just ended."""
     try:
         with Segment.open(name) as segment:
             status = status_of(segment, f"shmio-supervisor down --instance {name} stops them")
@@ -155,7 +158,10 @@ def _look(name: str) -> Listed | None:
 
 
 def _listening(segment: Segment, note: str) -> tuple[dict[str, list[str]], str]:
-    """Return the listening addresses by process, and the note, which says why if there are none."""
+    """Return the addresses to listen on by process, and the note.
+
+    The note says why addresses are missing.
+    """
     try:
         answer = control.request(segment.header.control, control.Where(), WHERE_S, lambda: supervisor_silence(segment))
         return answer.get("listen", {}), note

@@ -1,4 +1,4 @@
-"""``shmio-supervisor up``: start an instance in this process, which becomes its supervisor."""
+"""``shmio-supervisor up``: starts an instance in this process, which becomes its supervisor."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ from shmio.supervisor.start import check_startable, hold_log_folder
 
 
 def up(arguments: argparse.Namespace) -> int:
-    """Run an instance until it has stopped; with ``--report``, as the child of ``up --detach``."""
+    """Run an instance until it has stopped.
+
+    With ``--report``, be the child process of ``up --detach``.
+    """
     file, mode, keys = config_file(arguments), arguments.mode, replay_keys(arguments)
     if arguments.report is not None:
         return _detached(file, mode, keys, arguments.report)
@@ -36,7 +39,7 @@ def up(arguments: argparse.Namespace) -> int:
 
 
 def _foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
-    """Run an instance on a terminal; ``keys`` are those of ``[replay]`` from the command line."""
+    """Run an instance in a terminal; ``keys`` are keys of ``[replay]`` from the command line."""
     prepared = prepare(file, mode, keys)
     plan = prepared.plan
     for warning in plan.warnings:
@@ -57,7 +60,10 @@ def _foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
 
 
 def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int:
-    """Run an instance detached, and send the result of the start through the descriptor ``report``."""
+    """Run an instance without a terminal.
+
+    Send the result of the start to the descriptor ``report``.
+    """
     told = False
 
     def tell(message: StartMessage) -> None:
@@ -104,7 +110,7 @@ def _log_file(plan: Plan) -> Path:
 
 
 def _replan(plan: Plan, keys: Mapping[str, Any]) -> Callable[[], Plan]:
-    """Return the function that makes a new plan from the same file for a reload."""
+    """Return a function that makes a new plan from the same file, for reloads."""
     return lambda: prepare(plan.config_file, plan.mode, keys).plan
 
 
@@ -134,7 +140,7 @@ def _describe(job: Job, prepared: Prepared) -> str:
 
 
 class _Console(logging.Formatter):
-    """Formats a log record as its bare message."""
+    """Formats a log record as its message alone."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(record.getMessage())

@@ -1,4 +1,4 @@
-"""``shmio-dump campaign``: write the injections of recordings as a campaign file."""
+"""``shmio-dump campaign``: writes the injections of recordings as a campaign file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shmio.recording.rewriting import new_file
 
 
 def campaign(arguments: argparse.Namespace) -> int:
-    """Write the injections of files of one run; report those that cannot be declared."""
+    """Write the injections in files of one run; report injections that cannot be declared."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         found = derive(dump)
@@ -44,5 +44,8 @@ def _table(keys: dict[str, Any]) -> str:
 
 
 def _text(value: Any) -> str:
-    """Return a value as TOML: numbers, lists and texts without control characters as in JSON."""
+    """Return a value as TOML.
+
+    Numbers, lists and texts without control characters look as in JSON.
+    """
     return json.dumps(value, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""``shmio-dump cat``: print a recording line by line, as text, JSON or CSV."""
+"""``shmio-dump cat``: prints a recording line by line, as text, JSON or CSV."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.explain import ABOUT, Explained, Explainer, cells_of, kind_of, object_of
 
 MAX_PLACES: Final = 4
-"""Maximum number of registers of one event in the text output."""
+"""Maximum number of registers that the text output shows of an event."""
 
 
 def cat(arguments: argparse.Namespace) -> int:
     """Print a line for each frame in which a chosen value or the quality changed.
 
-    Also print a line for each event, gap and step. Damage is reported where it occurs; everything
-    else is printed, and the exit status is 1.
+    Events, gaps and steps have lines of their own. If parts of the recording are damaged, this is
+    reported at their place, everything else is printed, and the exit status is 1.
     """
     report = DamageReport()
     with (
@@ -100,10 +100,13 @@ def _nothing(found: Survey) -> str:
 def _views(
     reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], report: DamageReport
 ) -> dict[int, View]:
-    """Return the blocks to show, by the channel of their frames; leave out damaged layouts.
+    """Return the blocks to show, by the channel of their frames.
+
+    Blocks with damaged layouts are missing.
 
     Raises:
-        PathError: A pattern names nothing.
+        PathError: A pattern matches nothing.
+
     """
     blocks = {}
     for channel in channels:
@@ -136,14 +139,22 @@ def _views(
 
 
 def _one_file(patterns: Sequence[str]) -> None:
-    """Raise PathError with a remedy if a pattern is a file, as when the shell expands ``*.mem``."""
+    """Check that no pattern is a file. This happens if the shell expands ``*.mem``.
+
+    Raises:
+        PathError: A pattern is one; the message has the remedy.
+
+    """
     for pattern in patterns:
         if Path(pattern).is_file():
             raise PathError(f"{pattern} is a file, but cat prints only one: shmio-dump merge FILE… -o NEW joins them")
 
 
 def _layout(reader: Reader, channel: Channel) -> Layout | None:
-    """Return the layout of a channel, or None if it is damaged; the frames' reader reports damage."""
+    """Return the layout of a channel; None if it is damaged.
+
+    Reading the frames reports this damage.
+    """
     try:
         return reader.layout(channel)
     except RecordingError:
@@ -168,7 +179,7 @@ def _lines(
 
 
 class View:
-    """The chosen registers of one block, and their last printed values."""
+    """The registers of one block that the user has chosen, and their values printed last."""
 
     def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
         self.source = channel.source
@@ -178,9 +189,9 @@ class View:
         self._shown: Frame | None = None
 
     def news(self, frame: Frame) -> bool:
-        """Return whether a value or the quality differs from the last printed frame.
+        """Return whether a value or the quality differs from those in the frame printed last.
 
-        If so, this frame becomes the last printed one.
+        If so, this frame becomes the one printed last.
         """
         shown = self._shown
         same = shown is not None and (shown.quality, shown.reason) == (frame.quality, frame.reason)
@@ -210,7 +221,7 @@ class Printer(Protocol):
 
 
 def _where(event: Event, explained: Explained, room: int | None) -> str:
-    """Return an event's registers as text, with direction and values, or its bytes' offset."""
+    """Return an event's registers as text with direction and values, or its bytes' offset."""
     if not explained.places:
         return f"{event.size} bytes at {event.offset}" if event.size and not event.data.startswith(b"{") else ""
     way = f"/{explained.direction}" if explained.direction else ""
@@ -223,15 +234,18 @@ def _where(event: Event, explained: Explained, room: int | None) -> str:
 
 
 def _laid(laid: dict[str, Any]) -> str:
-    """Return an injection's definition as text, without the facts that the event already states."""
+    """Return the definition of an injection as text, without what the event itself already states."""
     return ", ".join(f"{key} = {dumps(value)}" for key, value in laid.items() if key not in ("name", "direction"))
 
 
 class JsonLines:
-    """Formats entries as one JSON object per line, with times in UTC."""
+    """Formats entries as lines with one JSON object each, with times in UTC."""
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """Format a frame with ``values`` by path; all are null before the source's first value."""
+        """Format a frame with ``values`` by path.
+
+        All values are null before the source's first value.
+        """
         known = frame.source_ns != 0
         values = {
             register.path: json_value(decode.decode(frame.image), register.element) if known else None
@@ -249,7 +263,7 @@ class JsonLines:
         )
 
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
-        """Format an event; ``event`` is its number."""
+        """Format an event; the key ``event`` is its number."""
         fields = {name: getattr(event, name) for name in ("cycle", "incarnation", "writer")}
         return self._line(
             time_ns,
@@ -263,17 +277,20 @@ class JsonLines:
         )
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """Format a gap; ``missed`` is the number of missing frames or events."""
+        """Format a gap; the key ``missed`` is the number of missing frames or events."""
         return self._line(
             time_ns, gap.source, missed=gap.count, what=gap.what, first=gap.first, last=gap.last, why=str(gap.reason)
         )
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """Format a step, without a source: ``step`` is its number, ``clock_ns`` the time after it."""
+        """Format a step, which has no source.
+
+        ``step`` is its number, ``clock_ns`` the time after it.
+        """
         return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
-        """Format a change of a process with the fields of the recording."""
+        """Format a change of a process, with the keys that the recording has."""
         return dumps({"time": iso(time_ns), "process": msgspec.to_builtins(change)})
 
     def _line(self, time_ns: int, source: str, **fields: Any) -> str:
@@ -281,7 +298,7 @@ class JsonLines:
 
 
 class Table:
-    """Formats entries as lines with columns; prints headings when the block changes."""
+    """Formats entries as lines with columns. Headings are printed whenever the block changes."""
 
     def __init__(self, room: int | None) -> None:
         """Set the maximum number of characters of a value; None: no limit."""
@@ -337,11 +354,11 @@ class Table:
 
 
 class Csv:
-    """Formats entries as CSV rows (RFC 4180) under one heading, with times in UTC.
+    """Formats entries as CSV rows (RFC 4180) with one heading row and times in UTC.
 
-    Each register of any block has a column, named with its source if there are several sources or
-    another column has the same name. Arrays are JSON. A cell is empty if the source has had no
-    value yet, or if the register belongs to another block.
+    There is a column for each register of all blocks. Its name begins with the source if there are
+    several sources, or another column has the same name. Arrays are JSON. A field is empty if the
+    source has had no value yet, or if the register belongs to another block.
     """
 
     OWN = ("time", "source", "what", "number", "quality", "text", *ABOUT)
@@ -360,7 +377,7 @@ class Csv:
         self._begun = False
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """Format a frame: ``what`` is frame, ``text`` the reason."""
+        """Format a frame: column ``what`` is frame, ``text`` is the reason."""
         values = [""] * len(self._columns)
         if frame.source_ns != 0:
             names = self._names[self._views.index(view)]
@@ -369,12 +386,12 @@ class Csv:
         yield self._row(time_ns, view.source, "frame", frame.number, str(frame.quality), frame.reason, values)
 
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
-        """Format an event: ``what`` is its kind."""
+        """Format an event: column ``what`` is the kind of the event."""
         row = time_ns, source, kind_of(event), event.number, str(event.quality), event.text
         return self._row(*row, about=cells_of(explained, dumps))
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """Format a gap: ``number`` is that of the first missing frame or event."""
+        """Format a gap: column ``number`` is the number of the first missing frame or event."""
         return self._row(time_ns, gap.source, f"missed {gap.count} {gap.what}", gap.first, "", str(gap.reason))
 
     def step(self, time_ns: int, mark: StepMark) -> str:

@@ -1,4 +1,4 @@
-"""What several verbs of ``shmio-dump`` need: damage reports, progress, and the options ``--from`` and ``--to``."""
+"""Code shared by verbs of ``shmio-dump``: damage reports, progress, ``--from`` and ``--to``."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from shmio.recording.reading.part import MAX_NS
 from shmio.recording.times import lost
 
 FIRST_S = 1.0
-"""Work that ends within this time shows no progress, in s."""
+"""Time in s after which progress is shown; shorter work shows none."""
 EACH_S = 0.2
-"""Interval at which the progress is updated, in s."""
+"""Interval in s at which the displayed progress is updated."""
 
 
 class DamageReport:
@@ -35,7 +35,7 @@ class DamageReport:
         return bool(self.texts)
 
     def open(self, files: Sequence[Path]) -> Dump:
-        """Open a recording and report its damage; raise the errors of ``open_dump``."""
+        """Open a recording, and report its damage. It raises the errors of ``open_dump``."""
         dump = open_dump(files, self.damage)
         for text in dump.damage:
             self.say(text)
@@ -53,18 +53,20 @@ class DamageReport:
 
 
 def not_closed(end: str) -> str:
-    """Return the text about a file that was not closed, because of ``end``."""
+    """Return a text that says that a file was not closed, and that the reason is ``end``."""
     return f"not closed ({end}): still being written, or its recorder was killed"
 
 
 class Progress:
-    """Progress line on standard error, if that is a terminal; removed at the end.
+    """A line on standard error that shows progress, if that is a terminal.
+
+    It is removed at the end.
 
     Use it as a context manager.
     """
 
     def __init__(self, what: str, *, silent: bool = False) -> None:
-        """Begin. With ``silent`` nothing is shown, because the terminal has other output."""
+        """Begin. With ``silent``, nothing is shown, because the terminal shows other output."""
         self.total = 0
         """Total amount of work, in bytes or in ns of a recording."""
         self._what = what
@@ -72,7 +74,7 @@ class Progress:
         self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() and not silent else float("inf")
 
     def at(self, done: int) -> None:
-        """Show the share of the work that is done."""
+        """Show which share of the work is done."""
         if time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + EACH_S
             share = f"{min(done / self.total, 1):4.0%}" if self.total else ""
@@ -93,12 +95,16 @@ class Progress:
 
 
 def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
-    """Return the log times of ``--from`` and ``--to`` in ns; without them, everything.
+    """Return the times of ``--from`` and ``--to`` in ns.
 
-    They are seconds from the recording's start, or ISO 8601; local time if it has no offset.
+    An omitted option does not limit the range.
+
+    The options are seconds from the recording's start, or ISO 8601. A time without an offset is
+    local.
 
     Raises:
         RecordingError: A time is invalid, or the end is before the beginning.
+
     """
     begin, end = arguments.begin, arguments.end
     from_ns = 0 if begin is None else _parse("--from", begin, start_ns)

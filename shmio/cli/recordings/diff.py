@@ -1,4 +1,4 @@
-"""``shmio-dump diff``: compare two recordings."""
+"""``shmio-dump diff``: compares two recordings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_SHOWN = 50
 
 
 def diff(arguments: argparse.Namespace) -> int:
-    """Compare source by source; return 1 if anything differs."""
+    """Compare the recordings source by source; return 1 if anything differs."""
     first, second = arguments.files
     ignore = [word for words in arguments.ignore for word in words.split(",")]
     how = Comparison(ignore, arguments.only or (), arguments.tolerance, arguments.relative)
@@ -121,7 +121,7 @@ def _side_object(side: Side) -> dict[str, Any]:
 
 
 def _plain(value: Value) -> Any:
-    """Return a value for JSON; NaN and infinities become text."""
+    """Return a value for JSON, in which NaN and infinities are text."""
     if isinstance(value, list):
         return [_plain(item) for item in value]
     return str(value) if isinstance(value, float) and value - value != 0 else value

@@ -147,7 +147,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
 
 
 def _folded(lines: list[str]) -> Iterator[str]:
-    """Yield the lines; join equal neighbours to one line with their number."""
+    """Yield the lines; replace equal consecutive lines by one line with their number."""
     for line, alike in groupby(lines):
         count = sum(1 for _ in alike)
         yield line if count == 1 else f"{line} ({count} of these)"
@@ -202,10 +202,10 @@ def _each(
     look: Callable[[Path], dict[str, Any]],
     lines: Callable[[dict[str, Any]], Iterable[str]],
 ) -> int:
-    """Print what ``look`` finds in each file, as ``lines`` or JSON.
+    """Print what ``look`` finds in each file, as text made by ``lines`` or as JSON.
 
-    ``look`` raises OSError or RecordingError for a file that is not a recording; in JSON the error
-    takes the place of the result. Returns 1 if a file is damaged or not a recording.
+    ``look`` raises OSError or RecordingError for a file that is not a recording. In JSON, the error
+    replaces the result. Return 1 if a file is damaged or not a recording.
     """
     found: list[dict[str, Any]] = []
     failed = False
@@ -228,5 +228,5 @@ def _each(
 
 
 def _ended(found: dict[str, Any]) -> str:
-    """Return how a file ends, as text, from its keys ``closed`` and ``end``."""
+    """Return as text how a file ends, from the keys ``closed`` and ``end``."""
     return "closed" if found["closed"] else not_closed(found["end"])

@@ -1,4 +1,4 @@
-"""``shmio-dump export``: convert recordings for other programs."""
+"""``shmio-dump export``: converts recordings for other programs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ SHEETS: Final = frozenset({"ods", "xls", "xlsx"})
 OTHERS: Final = frozenset(
     {"arrow", "db", "duckdb", "feather", "h5", "hdf5", "json", "jsonl", "mat", "mem", "tsv", "txt"}
 )
-"""Endings of formats that ``export`` does not write; it refuses a name with one."""
+"""File name endings of formats that ``export`` cannot write; such names are refused."""
 
 
 def export(arguments: argparse.Namespace) -> int:
-    """Write tables, a file for each block, or one MCAP file for viewers."""
+    """Write tables, one file for each block, or a single MCAP file for viewers."""
     report = DamageReport()
     named, form = _form(arguments.output, arguments.format)
     if arguments.events and (not named or form not in TABLES):
@@ -81,10 +81,11 @@ def _print_result(
 
 
 def _form(output: Path, asked: str | None) -> tuple[bool, str]:
-    """Return True if the name is that of a file and False if of a folder, and the format.
+    """Return whether the name is that of a file (True) or a folder (False), and the format.
 
     Raises:
         RecordingError: The name and the requested format contradict each other.
+
     """
     suffix = output.suffix.lower().removeprefix(".")
     if suffix in SHEETS | OTHERS and not output.is_dir():
@@ -92,7 +93,7 @@ def _form(output: Path, asked: str | None) -> tuple[bool, str]:
     if suffix not in FORMATS or output.is_dir():
         return False, asked or "parquet"
     if asked not in (None, suffix):
-        raise RecordingError(f"{output}: as its name ends it is not --format {asked}; leave out one of them")
+        raise RecordingError(f"{output}: the ending of its name contradicts --format {asked}; change one of the two")
     return True, suffix
 
 
@@ -110,7 +111,12 @@ def _within(block: DumpBlock, from_ns: int, to_ns: int) -> bool:
 
 
 def _require_one(output: Path, blocks: Sequence[DumpBlock]) -> None:
-    """Raise RecordingError if these blocks do not fit into one table."""
+    """Check that these blocks fit into one table.
+
+    Raises:
+        RecordingError: They do not.
+
+    """
     if len(blocks) > 1:
         names = ", ".join(block.source for block in blocks)
         raise RecordingError(f"{output} holds one block, and there are {len(blocks)} ({names}): name a folder")

@@ -1,4 +1,4 @@
-"""``shmio-dump note``: put a note into the events of a running instance."""
+"""``shmio-dump note``: puts a note into the events of a running instance."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def note(arguments: argparse.Namespace) -> int:
 
 
 def _default_source(name: str) -> str | None:
-    """Return the default source of clients, or None if the configuration cannot be read."""
+    """Return the default source of clients; None if the configuration cannot be read."""
     with suppress(ControlError, ConfigError, KeyError), Segment.open(name) as segment:
         config = load(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
         return config.grpc.default_source if config.grpc else None

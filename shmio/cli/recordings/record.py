@@ -1,4 +1,4 @@
-"""``shmio-dump record``: record a running instance from outside."""
+"""``shmio-dump record``: records a running instance from outside."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from shmio.supervisor import control
 BY = "shmio-dump"
 WHERE_S = 2.0
 LOOK_S = 0.5
-"""Interval at which the instance and the disk are checked, in s."""
+"""Interval in s at which the instance and the disk are checked."""
 
 
 def record(arguments: argparse.Namespace) -> int:
-    """Record until Ctrl-C, the end of the time, or the end of the instance."""
+    """Record until Ctrl-C, the end of the given time, or the end of the instance."""
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     with target(arguments).open() as segment, stop_on_signals() as stopping:
         sources = arguments.sources
@@ -101,7 +101,7 @@ def _record(
 
 
 def _attachments(segment: Segment, news: Reporter) -> AttachedFiles:
-    """Return a function that attaches the configuration's files; none if their place is unknown."""
+    """Return a function that attaches the files of the configuration, if its path is known."""
     try:
         return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
     except (ControlError, KeyError) as error:
@@ -125,7 +125,7 @@ def _name(file: Path | None) -> str | None:
 
 
 class Reporter:
-    """Reports what happens: lines on standard error, or JSON lines on standard output."""
+    """Reports events of the recording: lines on standard error, or JSON lines on standard output."""
 
     def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json

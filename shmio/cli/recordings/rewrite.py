@@ -22,7 +22,7 @@ MAX_TOLD = 1000
 
 
 def cut(arguments: argparse.Namespace) -> int:
-    """Write the entries between two times, of some sources or registers, to a new file."""
+    """Write the entries between two times, of all or some sources and registers, to a new file."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         from_ns, to_ns = time_range(arguments, dump.begin_ns)
@@ -39,7 +39,7 @@ def cut(arguments: argparse.Namespace) -> int:
 
 
 def merge(arguments: argparse.Namespace) -> int:
-    """Write the contents of all files to a new one, in the order of time and without duplicates."""
+    """Write the contents of all files to a new file, in the order of time and without duplicates."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         work = _rewrite(dump, arguments.output, "shmio-dump merge", dump.items())
@@ -50,7 +50,7 @@ def merge(arguments: argparse.Namespace) -> int:
 
 
 def recover(arguments: argparse.Namespace) -> int:
-    """Write a closed file with all messages of all intact chunks, and report what was lost."""
+    """Write all messages in intact chunks to a new, closed file; report what was lost."""
     file: Path = arguments.file
     path = arguments.output or file.parent / f"{file.stem}-recovered{file.suffix}"
     places: list[str] = []
@@ -79,14 +79,22 @@ def recover(arguments: argparse.Namespace) -> int:
 
 
 def _rewrite(dump: Dump, path: Path, made: str, entries: Iterable[Entry[Item]], *, whole: bool = True) -> Rewriter:
-    """Write entries to a new file, with a line of progress; see :func:`shmio.recording.rewriting.rewrite`."""
+    """Write entries to a new file by :func:`shmio.recording.rewriting.rewrite`.
+
+    Show the progress.
+    """
     with Progress(f"writing {path}") as progress:
         progress.total = dump.end_ns - dump.begin_ns
         return rewriting.rewrite(dump, path, made, entries, whole=whole, progress=progress.at)
 
 
 def _verified(path: Path) -> list[str]:
-    """Read a new file completely, and return lines about it; raise RecordingError on damage."""
+    """Read a new file completely, and return lines about it.
+
+    Raises:
+        RecordingError: The file is damaged.
+
+    """
     found = checked(path)
     if found["damage"]:
         raise RecordingError(f"{path}: {found['damage'][0]}")

@@ -248,7 +248,7 @@ def test_suffix_chooses_the_format(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_unsuitable_output_name_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "kinds.mem", "-o", "x.csv", "--format", "parquet"]) == 1
-    message = "x.csv: as its name ends it is not --format parquet; leave out one of them\n"
+    message = "x.csv: the ending of its name contradicts --format parquet; change one of the two\n"
     assert capsys.readouterr().err == message
     varied(tmp_path / "a.mem")
     assert main(["export", "a.mem", "-o", "x.csv"]) == 1

@@ -226,7 +226,7 @@ def test_unusable_host_is_reported(capsys: pytest.CaptureFixture[str], tmp_path:
     assert main(["get", "--host", "nonsense", "cell"]) == 1
     assert capsys.readouterr().err == "'nonsense' is not an address; expected host:port, such as 127.0.0.1:8089\n"
     assert main(["get", "--host", "127.0.0.1:1", "--instance", "x", "cell"]) == 1
-    assert capsys.readouterr().err == "--host names the instance already: leave out -c and --instance\n"
+    assert capsys.readouterr().err == "--host already names the instance: remove -c and --instance\n"
     assert main(["get", "--host", "127.0.0.1:1", "--token-file", str(tmp_path / "none"), "cell"]) == 1
     assert capsys.readouterr().err == f"{tmp_path / 'none'}: No such file or directory\n"
 

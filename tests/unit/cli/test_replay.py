@@ -53,8 +53,8 @@ def test_status_is_printed_after_each_command(
         (["pause", "1"], "pause takes no VALUE"),
         (["loop", "maybe"], "loop is on or off"),
         (["speed", "fast"], "'fast' is not a number"),
-        (["seek", "1", "--jump"], "--jump goes with"),
-        (["pause", "--speed", "1"], "--speed goes with play"),
+        (["seek", "1", "--jump"], "--jump is only for"),
+        (["pause", "--speed", "1"], "--speed is only for the action play"),
         (["rewind"], "invalid choice"),
     ],
 )

@@ -172,7 +172,7 @@ def test_check_covers_the_replay_section(
         ('file = "none.mem"', f"replay.file: {Path('none.mem').absolute()}: No such file"),
         ('file = "panel.toml"', "replay.file: "),
         (f'file = "{file.name}"\nstart = 99', "replay.start, end: there is nothing to play"),
-        (f'file = "{file.name}"\nrecord = true', "replay.record: there is no [recorder] section"),
+        (f'file = "{file.name}"\nrecord = true', "replay.record: this needs a [recorder] section"),
     ):
         config.write_text(f"{text}{keys}\n")
         assert main(["check"]) == 1

@@ -751,7 +751,7 @@ def test_impossible_replay_is_refused(
 
 def test_options_for_replay_are_refused_in_other_modes(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["up", "--paused"]) == 1
-    assert capsys.readouterr().err == "--paused goes with --mode replay only\n"
+    assert capsys.readouterr().err == "--paused is only for --mode replay\n"
 
 
 def test_log_mode_needs_a_recorder_section(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:

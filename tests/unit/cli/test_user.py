@@ -134,8 +134,8 @@ def test_real_time_over_a_device_is_paused_after_consent(
         monkeypatch.setattr("sys.stdin", Keyboard(answer))
         assert main(command) == 1
         told = capsys.readouterr()
-        assert json.loads(told.out) == {"error": "time was left as it is"}
-        assert told.err == f"{REAL}. Go on? [y/N] time was left as it is\n"
+        assert json.loads(told.out) == {"error": "the clock was not changed"}
+        assert told.err == f"{REAL}. Go on? [y/N] the clock was not changed\n"
     assert mode(running) == "wall"
     monkeypatch.setattr("sys.stdin", Keyboard("y\n"))
     assert main(command) == 0
