@@ -53,5 +53,5 @@ def test_a_folder_that_is_there_is_left_as_it_is(
     monkeypatch.chdir(tmp_path)
     Path("shmio-my-bus").mkdir()
     assert main(["new-connector", "my_bus"]) == 1
-    assert "shmio-my-bus is there already" in capsys.readouterr().err
+    assert "shmio-my-bus exists already" in capsys.readouterr().err
     assert not list(Path("shmio-my-bus").iterdir())

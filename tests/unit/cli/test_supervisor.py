@@ -105,7 +105,7 @@ def test_init_says_what_to_do_with_a_tag_list(
 def test_init_never_overwrites(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path(name).write_text("mine")
     assert main(["init"]) == 1
-    assert capsys.readouterr().err.startswith(f"{name} is there already")
+    assert capsys.readouterr().err.startswith(f"{name} exists already")
     assert [entry.name for entry in Path().iterdir()] == [name]
     assert Path(name).read_text() == "mine"
 
@@ -248,7 +248,7 @@ def test_an_idle_emulator_needs_a_number_for_each_block(example: Edit, capsys: p
     assert (
         "emulator[0].dbNumber: this key is needed, because the data block 'Cell' has no number in its name; " in error
     )
-    assert 'block = "Cell" beside it, to serve only that block' in error
+    assert 'block = "Cell" in this section, to serve only that block' in error
     example('layout = "two.db"', 'layout = "two.db"\nblock = "Cell"\ndbNumber = 9')
     assert main(["check"]) == 0
 
