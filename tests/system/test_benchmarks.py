@@ -202,3 +202,17 @@ def test_the_soak_run_watches_all_processes_and_the_recording() -> None:
 def test_the_start_of_a_large_cell_is_measured() -> None:
     found = re.findall(r"^(\w+) +\d+\.\d\d +\d+\.\d\d +\d+\.\d\d$", printed("large_cell"), re.MULTILINE)
     assert found == ["up", "good", "attach", "get", "list"]
+
+
+def test_benchmark_of_reading_opc_ua() -> None:
+    pytest.importorskip("asyncua")
+    found = printed("opcua_read")
+    for contender, ratios in (("shmio, 1 session", r" +\d+\.\d+ +\d+\.\d+"), ("asyncua", "")):
+        rows = re.findall(rf"^{contender} +[1-9]\d* .*?{ratios} +(?:none|client|server).*$", found, re.MULTILINE)
+        assert len(rows) == 2, found
+
+
+def test_benchmark_of_serving_opc_ua() -> None:
+    pytest.importorskip("asyncua")
+    found = printed("opcua_server")
+    assert len(re.findall(r"^1 client, (?:shmio|asyncua alone) +[1-9]\d* +[1-9]\d* .*\w$", found, re.MULTILINE)) == 2
