@@ -231,3 +231,26 @@ class CpuTime:
     def since(self, before: CpuTime) -> CpuTime:
         """Return the CPU time used since an earlier reading."""
         return CpuTime(self.user_s - before.user_s, self.system_s - before.system_s)
+
+
+BUSY = 85.0
+"""Percent of its time that a process runs, or waits for a core, from which on it limits a rate."""
+
+
+def waited_s(pid: int) -> float:
+    """Return how long the threads of a process were ready to run without a core, in s (schedstat of proc(5))."""
+    files = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(file.read_text().split()[1]) for file in files) / 1e9
+
+
+def limits(shares: Mapping[str, tuple[float, float]]) -> str:
+    """Name the processes that limited a rate.
+
+    Args:
+        shares: Percent of the time that each ran, and that it was ready to run without a core.
+
+    """
+    found = [
+        name + (" (other load)" if ran <= BUSY else "") for name, (ran, waited) in shares.items() if ran + waited > BUSY
+    ]
+    return " and ".join(found) or "none"

@@ -59,7 +59,7 @@ def answer(values: int, begun_s: float, before: CpuTime, late: int) -> None:
 
 
 def shmio(mode: Any, port: int, count: int, period_s: float, sessions: int) -> None:
-    tags = {f"part{n // 100}/v{n}": {"type": "REAL", "address": f"ns=2;s=v{n}"} for n in range(count)}
+    tags = {f"part{n // 100}/v{n}": {"type": "REAL", "address": f"ns=2;s=cell/v{n}"} for n in range(count)}
     layout = place_tags("bench", tags).with_statuses()
     every_ms = max(1, round(1000 * period_s))
     options = OpcUaOptions(
@@ -86,7 +86,7 @@ class Handler:
 
 async def asyncua(mode: str, port: int, count: int, period_s: float) -> None:
     async with Client(f"opc.tcp://127.0.0.1:{port}/", timeout=20) as client:
-        nodes = [client.get_node(ua.NodeId(f"v{n}", 2)) for n in range(count)]
+        nodes = [client.get_node(ua.NodeId(f"cell/v{n}", 2)) for n in range(count)]
         handler, loop = Handler(), asyncio.get_running_loop()
         if mode == "subscribe":
             made = await client.create_subscription(1000 * period_s, handler)

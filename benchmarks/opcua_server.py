@@ -3,7 +3,8 @@
 The server is a process of its own: the endpoint, or for comparison the bare library with the same variables. The
 clients, and the writer of the frames, are in this process; the clients count values without decoding them.
 ``delivered`` is the part of all changes that came. The delay is from the source time of a message's first value until
-the client has the message. ``limit`` says which process was busy: more than 85 % of a core.
+the client has the message. ``limit`` says which process ran, or waited
+for a core, more than 85 % of the time.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 
 from asyncua import Client, Server, ua
 from asyncua.ua.ua_binary import nodeid_from_binary, struct_from_binary
-from common import CpuTime, begin, quantiles, table
+from common import CpuTime, begin, limits, quantiles, table, waited_s
 
 from shmio.config import OpcUa
 from shmio.endpoints.opcua.endpoint import Endpoint
@@ -34,7 +35,6 @@ PERIOD_S = 0.1
 CLIENTS = (1, 5, 20)
 MOST_BARE = 5
 """With more clients the bare library falls behind so far that they time out."""
-BUSY = 85.0
 EPOCH_TICKS = 116_444_736_000_000_000
 """1970 in the ticks of OPC UA, 100 ns since 1601."""
 IN_FLIGHT = 3
@@ -162,19 +162,20 @@ async def count(port: int, clients: int, pid: int, duration_s: float) -> list[st
         one.delays_ms.clear()
     pids = pid, os.getpid()
     before, begun_s = sum(one.values for one in counters), time.perf_counter()
-    used = [CpuTime.of(one) for one in pids]
+    used, ready_s = [CpuTime.of(one) for one in pids], [waited_s(one) for one in pids]
     await asyncio.sleep(duration_s)
     passed_s = time.perf_counter() - begun_s
     cpu = [CpuTime.of(one).since(then) for one, then in zip(pids, used, strict=True)]
+    waited = [100 * (waited_s(one) - then) / passed_s for one, then in zip(pids, ready_s, strict=True)]
     server, own = (100 * (one.user_s + one.system_s) / passed_s for one in cpu)
     rate = (sum(one.values for one in counters) - before) / passed_s
     delays_ms = [delay for one in counters for delay in one.delays_ms]
     for one in counters:
         await one.stop()
-    busy = [name for name, value in (("server", server), ("clients", own)) if value > BUSY]
     middle_ms, _, late_ms = quantiles(delays_ms)
     shares = rate, 100 * rate * PERIOD_S / (ITEMS * clients), server, own, middle_ms, late_ms
-    return [*(f"{value:.0f}" for value in shares), " and ".join(busy) or "none"]
+    limit = limits({"server": (server, waited[0]), "clients": (own, waited[1])})
+    return [*(f"{value:.0f}" for value in shares), limit]
 
 
 def measure(bare: bool, clients: int, duration_s: float) -> list[str]:
