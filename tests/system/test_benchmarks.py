@@ -216,3 +216,10 @@ def test_benchmark_of_serving_opc_ua() -> None:
     pytest.importorskip("asyncua")
     found = printed("opcua_server")
     assert len(re.findall(r"^1 client, (?:shmio|asyncua alone) +[1-9]\d* +[1-9]\d* .*\w$", found, re.MULTILINE)) == 2
+
+
+def test_benchmark_of_sixteen_sources() -> None:
+    pytest.importorskip("asyncua")
+    pytest.importorskip("pymodbus")
+    found = printed("sixteen_sources")
+    assert len(re.findall(r"^1 of (?:s7|opcua|modbus) +\d+\.\d +\d+\.\d+ +\d+ .* 0$", found, re.MULTILINE)) == 3, found
