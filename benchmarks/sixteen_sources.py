@@ -1,9 +1,9 @@
 """16 sources of 1,000 registers at 10 Hz: 8 of S7, 4 of OPC UA and 4 of Modbus.
 
 Each S7 and Modbus source has an emulated device in a process of its own; the OPC UA sources subscribe to one server,
-shmio's endpoint in another process. The registers of S7 and OPC UA change at 10 Hz or faster, those of Modbus do not. The CPU use of the devices is reported
-separately, because a plant has real ones. *Elsewhere* is the use of other programs: if it is large, the figures
-measure the machine and not shmio. *Due to frame* is as in ``scaling.py``.
+shmio's endpoint in another process. The registers of S7 and OPC UA change at 10 Hz or faster, those of Modbus do not.
+The CPU use of the devices is reported separately, because a plant has real ones. *Elsewhere* is the use of other
+programs: if it is large, the figures measure the machine and not shmio. *Due to frame* is as in ``scaling.py``.
 """
 
 from __future__ import annotations
