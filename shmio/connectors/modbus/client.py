@@ -2,8 +2,10 @@
 
 Each answer must have the transaction, unit and function of the request, and exactly the length that
 the request asks for. Anything else ends the connection, and so does a time-out: a late answer can
-never be taken for the next one. That is why this is not pymodbus's client, which skips answers that
-it does not expect, and repeats writes after a time-out.
+never be taken for the next one. There is one exception: a caller may stop waiting for one read. The
+client remembers its transaction, and discards its answer if it comes late. That is why this is not
+pymodbus's client, which skips all answers that it does not expect, and repeats writes after a
+time-out.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ MAX_WRITE_BITS: Final = 1968
 _HEADER: Final = 7
 _MAX_PDU: Final = 253
 _FAILED: Final = 0x80
+MAX_ABANDONED: Final = 256
+"""Largest number of abandoned requests whose late answers are still recognized."""
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE, ACKNOWLEDGE, BUSY = 1, 2, 3, 4, 5, 6
 PARITY, NO_PATH, NO_ANSWER = 8, 10, 11
@@ -43,6 +47,10 @@ class RefusedError(ConnectorError):
         self.code = code
 
 
+class SilentError(ConnectorError):
+    """The unit did not answer in the time that the caller gave it. The connection stays open."""
+
+
 class ModbusClient:
     """The connection to one device or gateway. Use it from one thread."""
 
@@ -53,12 +61,19 @@ class ModbusClient:
         self._socket: socket.socket | None = None
         self._transaction = 0  # continues after a reconnect, so that a late answer matches no new request
         self._deadline_ns = 0
+        self._received = bytearray()  # the beginning of an answer that is not complete yet
+        self._abandoned: dict[int, tuple[int, int]] = {}  # by transaction: unit and function; the oldest first
         self.sent = False
         """Whether any byte of the last request may have left this host."""
 
     def begin(self) -> None:
         """Start the time-out of the requests that follow."""
         self._deadline_ns = time.monotonic_ns() + self._timeout_ms * 1_000_000
+
+    @property
+    def left_ns(self) -> int:
+        """The time in ns until the time-out; 0 if it has passed."""
+        return max(0, self._deadline_ns - time.monotonic_ns())
 
     @property
     def connected(self) -> bool:
@@ -83,17 +98,27 @@ class ModbusClient:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+        self._received.clear()
+        self._abandoned.clear()
 
-    def read(self, unit: int, table: Table, start: int, count: int) -> bytes:
+    def read(self, unit: int, table: Table, start: int, count: int, until_ns: int | None = None) -> bytes:
         """Read entries of a table; return their bytes as the device sends them, bits packed from the lowest.
+
+        Args:
+            unit: Unit id.
+            table: The table.
+            start: First entry.
+            count: Number of entries.
+            until_ns: When to stop waiting without ending the connection, in ns of CLOCK_MONOTONIC.
 
         Raises:
             RefusedError: The device refuses the request. The connection stays open.
+            SilentError: There is no answer until ``until_ns``. The connection stays open.
             ConnectorError: The connection is lost.
 
         """
         size = -(-count // 8) if table.of_bits else 2 * count
-        answer = self.call(unit, READ[table], start.to_bytes(2, "big") + count.to_bytes(2, "big"), 1 + size)
+        answer = self.call(unit, READ[table], start.to_bytes(2, "big") + count.to_bytes(2, "big"), 1 + size, until_ns)
         if answer[0] != size:
             raise self._failed(f"it answered with {answer[0]} bytes instead of {size}")
         return answer[1:]
@@ -110,48 +135,75 @@ class ModbusClient:
         if self.call(unit, function, data, echo) != data[:echo]:
             raise self._failed("its confirmation is that of another write")
 
-    def call(self, unit: int, function: int, data: bytes, size: int) -> bytes:
+    def call(self, unit: int, function: int, data: bytes, size: int, until_ns: int | None = None) -> bytes:
         """Exchange a request; return the data of the answer, ``size`` bytes."""
         self.sent = False
         if self._socket is None:
             raise ConnectorError(f"not connected to {self.peer}")
         self._transaction = (self._transaction + 1) & 0xFFFF
+        while self._transaction in self._abandoned:
+            self._transaction = (self._transaction + 1) & 0xFFFF
         head = self._transaction.to_bytes(2, "big") + b"\0\0"
         request = head + (2 + len(data)).to_bytes(2, "big") + bytes((unit, function)) + data
         try:
-            self._socket.settimeout(self._left_s())
+            self._socket.settimeout(self._left_s(None))
             self.sent = True
             self._socket.sendall(request)
-            got = self._receive(_HEADER + 1)
-            length = int.from_bytes(got[4:6], "big") - 2
-            if got[:4] != head:
-                raise self._failed("it answered a request that is not in flight")
-            if got[6] != unit or got[7] & ~_FAILED != function or not 0 <= length < _MAX_PDU:
-                raise self._failed("its answer does not belong to the request")
-            if got[7] & _FAILED:
-                if length != 1:
+            while True:
+                self._receive(_HEADER + 1, until_ns)
+                got = bytes(self._received[: _HEADER + 1])
+                length = int.from_bytes(got[4:6], "big") - 2
+                transaction, code = int.from_bytes(got[:2], "big"), got[7] & ~_FAILED
+                late = self._abandoned.get(transaction)
+                if got[2:4] != head[2:] or (late is None and transaction != self._transaction):
+                    raise self._failed("it answered a request that is not in flight")
+                if (got[6], code) != (late or (unit, function)) or not 0 <= length < _MAX_PDU:
                     raise self._failed("its answer does not belong to the request")
-                raise RefusedError(self._receive(1)[0])
-            if length != size:
-                raise self._failed(f"it answered with {length} bytes instead of {size}")
-            return self._receive(size)
+                if got[7] & _FAILED and length != 1:
+                    raise self._failed("its answer does not belong to the request")
+                if late is None and not got[7] & _FAILED and length != size:
+                    raise self._failed(f"it answered with {length} bytes instead of {size}")
+                self._receive(_HEADER + 1 + length, until_ns)
+                found = bytes(self._received[_HEADER + 1 : _HEADER + 1 + length])
+                del self._received[: _HEADER + 1 + length]
+                if late is None:
+                    break
+                del self._abandoned[transaction]
+        except SilentError:
+            self._abandoned[self._transaction] = unit, function
+            if len(self._abandoned) > MAX_ABANDONED:
+                del self._abandoned[next(iter(self._abandoned))]
+            raise
         except OSError as error:
             self.close()
             raise self._explained(error) from None
+        if got[7] & _FAILED:
+            raise RefusedError(found[0])
+        return found
 
-    def _receive(self, size: int) -> bytes:
-        data = bytearray()
-        while len(data) < size:
+    def _receive(self, size: int, until_ns: int | None) -> None:
+        """Receive until this many bytes of an answer are there; never more, so that none is taken for the next."""
+        while len(self._received) < size:
             if self._socket is None:
                 raise ConnectionResetError
-            self._socket.settimeout(self._left_s())
-            if not (part := self._socket.recv(size - len(data))):
+            left_s = self._left_s(until_ns)
+            self._socket.settimeout(left_s)
+            try:
+                part = self._socket.recv(size - len(self._received))
+            except TimeoutError:
+                self._left_s(until_ns)  # raises SilentError if the caller's time is over
+                raise
+            if not part:
                 raise ConnectionResetError
-            data += part
-        return bytes(data)
+            self._received += part
 
-    def _left_s(self) -> float:
-        left_ns = self._deadline_ns - time.monotonic_ns()
+    def _left_s(self, until_ns: int | None) -> float:
+        now_ns = time.monotonic_ns()
+        left_ns = self._deadline_ns - now_ns
+        if until_ns is not None:
+            left_ns = min(left_ns, until_ns - now_ns)
+            if left_ns <= 0:
+                raise SilentError(f"no answer in time from a unit at {self.peer}")
         if left_ns <= 0:
             raise TimeoutError
         return left_ns / 1e9

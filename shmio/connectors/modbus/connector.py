@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Final
+from collections.abc import Collection, Iterator, Sequence
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.load import Load, Requests, counted
 from shmio.connectors.modbus import client
-from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError
+from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError, SilentError
 from shmio.connectors.modbus.plan import MAX_PROBES, Element, Limits, ReadRequest, Refusals
 from shmio.connectors.register_image import RegisterImage
 from shmio.errors import ConfigError, ConnectorError
@@ -31,7 +31,9 @@ from shmio.model.statuses import (
 )
 
 GATEWAY_RETRY_NS: Final = 1_000_000_000
-"""How long a unit that does not answer its gateway is left alone."""
+"""How long a unit that does not answer is left alone at first; the time doubles with each further attempt."""
+MAX_UNIT_RETRY_NS: Final = 10_000_000_000
+"""Longest time that a unit that does not answer is left alone."""
 _STATUS: Final = {
     client.ILLEGAL_FUNCTION: BAD_NOT_SUPPORTED,
     client.ILLEGAL_ADDRESS: BAD_OUT_OF_RANGE,
@@ -78,6 +80,18 @@ class ModbusOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_
     """Most unused words, or bits, that a request reads to save another request."""
 
 
+class _Silence(NamedTuple):
+    """A unit that does not answer."""
+
+    until_ns: int
+    """When to ask it again, in ns of CLOCK_MONOTONIC."""
+    pause_ns: int
+    """How long it is left alone this time."""
+    status: int
+    mute: bool
+    """False if the gateway said that the unit does not answer: then the connection is alive."""
+
+
 class _Register:
     """A register with its address, and its elements in the device."""
 
@@ -106,7 +120,8 @@ class ModbusConnector(Connector):
     """Reads all registers of a layout in each cycle.
 
     Addresses that the device refuses are bad by themselves: a refused request is split until they
-    are found, and they are tried again every 10 s, also after the connection was lost.
+    are found, and they are tried again every 10 s, also after the connection was lost. A unit that
+    does not answer costs its share of the time-out; then it is left alone for 1 s and up to 10 s.
     """
 
     Options = ModbusOptions
@@ -132,7 +147,8 @@ class ModbusConnector(Connector):
         except ValueError as error:
             raise ConfigError(f"layout: {error}: raise max_registers or max_bits") from None
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
-        self._silent: dict[int, tuple[int, int]] = {}  # units that do not answer: until when (ns), and the status
+        self._units = sorted({one.unit for one in self._registers})
+        self._silent: dict[int, _Silence] = {}
         self._probes = 0  # that this cycle may still send
         self._no_masks: set[int] = set()  # units that do not know function 22
 
@@ -176,10 +192,21 @@ class ModbusConnector(Connector):
         values: dict[int, list[Any]] = {}
         failed = {one.register: status for one, (_, status) in self._refusals.refused.items()}
         self._probes = MAX_PROBES
-        for request in list(self._refusals.requests):
-            self._fetch(request, now_ns, values, failed)
+        requests: dict[int, list[ReadRequest]] = {}
+        for request in self._refusals.requests:
+            requests.setdefault(request.unit, []).append(request)
+        asked = self._asked(requests, now_ns)
+        for unit in requests.keys() - asked:
+            failed.update((one.register, self._silent[unit].status) for some in requests[unit] for one in some.elements)
+        for place, unit in enumerate(asked):
+            until_ns = self._until_ns(len(asked) - place)
+            for request in requests[unit]:
+                self._fetch(request, now_ns, until_ns, values, failed)
         for request in self._refusals.due(now_ns, self._probes):
             self._try_again(request, now_ns)
+        if len(self._silent) == len(self._units) and all(one.mute for one in self._silent.values()):
+            self._client.close()
+            raise ConnectorError(f"no answer from any of {len(self._units)} units at {self._client.peer}")
         for one in self._registers:
             found = values.get(one.index, [])
             if one.index in failed:
@@ -189,15 +216,50 @@ class ModbusConnector(Connector):
                 self._image.put(one.index, value)
         return bytes(self._image)
 
-    def _fetch(self, request: ReadRequest, now_ns: int, values: dict[int, list[Any]], failed: dict[int, int]) -> None:
+    def _asked(self, units: Collection[int], now_ns: int) -> list[int]:
+        """Return the units that this cycle asks: those that answer, and then at most one that was silent."""
+        due = [unit for unit in self._silent if unit in units and self._silent[unit].until_ns <= now_ns]
+        due.sort(key=lambda unit: self._silent[unit].until_ns)
+        return [unit for unit in units if unit not in self._silent] + due[:1]
+
+    def _until_ns(self, units: int) -> int | None:
+        """Return until when the first of so many units may answer, in ns of CLOCK_MONOTONIC.
+
+        None: until the time-out. A source of one unit has no other unit to protect.
+        """
+        if len(self._units) == 1:
+            return None
+        share_ns = self._client.left_ns // units
+        return time.monotonic_ns() + min(share_ns, self._options.timeout * 1_000_000 // len(self._units))
+
+    def _fell_silent(self, unit: int, status: int, error: ConnectorError, *, mute: bool) -> None:
+        """Leave a unit alone, and longer after each further attempt."""
+        before = self._silent.get(unit)
+        if before is None:
+            log.warning("unit %d: %s; its registers are bad until it answers", unit, error)
+        pause_ns = min(2 * before.pause_ns, MAX_UNIT_RETRY_NS) if before else GATEWAY_RETRY_NS
+        self._silent[unit] = _Silence(time.monotonic_ns() + pause_ns, pause_ns, status, mute)
+
+    def _answered(self, unit: int) -> None:
+        if self._silent.pop(unit, None):
+            log.info("unit %d answers again", unit)
+
+    def _fetch(
+        self,
+        request: ReadRequest,
+        now_ns: int,
+        until_ns: int | None,
+        values: dict[int, list[Any]],
+        failed: dict[int, int],
+    ) -> None:
         """Read a request's elements; if the device refuses it, search for the addresses that it refuses.
 
         The search goes on in the next cycles if it needs more than ``MAX_PROBES`` requests, or more
         than half of the time-out.
         """
-        until_ns, status = self._silent.get(request.unit, (0, 0))
-        if until_ns > now_ns:
-            failed.update((one.register, status) for one in request.elements)
+        silence = self._silent.get(request.unit)
+        if silence is not None and silence.until_ns > now_ns:
+            failed.update((one.register, silence.status) for one in request.elements)
             return
         if (suspicion := self._refusals.suspects.get(request)) is not None:
             if not self._may_probe(now_ns):
@@ -205,24 +267,32 @@ class ModbusConnector(Connector):
                 return
             self._probes -= 1
         try:
-            data = self._client.read(request.unit, request.table, request.start, request.count)
+            data = self._client.read(request.unit, request.table, request.start, request.count, until_ns)
+        except SilentError as error:
+            self._fell_silent(request.unit, BAD_TIMEOUT, error, mute=True)
+            failed.update((one.register, BAD_TIMEOUT) for one in request.elements)
+            return
         except RefusedError as error:
             status = _STATUS.get(error.code, BAD_COMMUNICATION_ERROR)
+            if error.code in _OF_UNITS:
+                self._fell_silent(request.unit, status, error, mute=False)
+                failed.update((one.register, status) for one in request.elements)
+                return
+            self._answered(request.unit)
             if error.code in _OF_ADDRESSES:
                 parts = self._refusals.split(request, status)
                 if len(parts) > 1:
                     for part in parts:
-                        self._fetch(part, now_ns, values, failed)
+                        self._fetch(part, now_ns, until_ns, values, failed)
                     return
                 news = len(parts) == 1 and self._refusals.refuse(request, status, now_ns)
             else:
                 news = True
-                if error.code in _OF_UNITS:
-                    self._silent[request.unit] = now_ns + GATEWAY_RETRY_NS, status
             if news:
                 log.warning("%s: %s", self._named(request), error)
             failed.update((one.register, status) for one in request.elements)
             return
+        self._answered(request.unit)
         self._refusals.suspects.pop(request, None)
         for one in request.elements:
             register = self._registers[one.register]
@@ -236,11 +306,13 @@ class ModbusConnector(Connector):
 
     def _try_again(self, request: ReadRequest, now_ns: int) -> None:
         """Read a refused address alone; from the next cycle on, with the others if the device answers."""
-        if self._silent.get(request.unit, (0, 0))[0] > now_ns or not self._may_probe(now_ns):
+        if request.unit in self._silent or not self._may_probe(now_ns):
             return
         self._probes -= 1
         try:
-            self._client.read(request.unit, request.table, request.start, request.count)
+            self._client.read(request.unit, request.table, request.start, request.count, self._until_ns(1))
+        except SilentError as error:
+            self._fell_silent(request.unit, BAD_TIMEOUT, error, mute=True)
         except RefusedError as error:
             self._refusals.refuse(request, _STATUS.get(error.code, BAD_COMMUNICATION_ERROR), now_ns)
         else:
