@@ -1,9 +1,10 @@
 """16 sources of 1,000 registers at 10 Hz: 8 of S7, 4 of OPC UA and 4 of Modbus.
 
-Each S7 and Modbus source has an emulated device in a process of its own; the OPC UA sources subscribe to one server,
-shmio's endpoint in another process. The registers of S7 and OPC UA change at 10 Hz or faster, those of Modbus do not.
-The CPU use of the devices is reported separately, because a plant has real ones. *Elsewhere* is the use of other
-programs: if it is large, the figures measure the machine and not shmio. *Due to frame* is as in ``scaling.py``.
+Each S7 and Modbus source has an emulated device in a process of its own, whose values do not change: devices that
+move all of them need more of the two cores than the sources. The OPC UA sources subscribe to one server, shmio's
+endpoint in another process, where all values change at 10 Hz. The CPU use of the devices is reported separately,
+because a plant has real ones. *Elsewhere* is the use of other programs: if it is large, the figures measure the
+machine and not shmio. *Due to frame* is as in ``scaling.py``.
 """
 
 from __future__ import annotations
@@ -24,8 +25,6 @@ from shmio.testing.ports import reserved_port
 REGISTERS = 1000
 PERIOD_MS = 100
 KINDS = {"s7": 8, "opcua": 4, "modbus": 4}
-PROGRAMS = {"s7": "wave", "modbus": "idle"}
-"""What the devices do. Four Modbus devices that move 1,000 registers each take more than two cores by themselves."""
 SETTLE_S = 60.0
 _ADDRESSES = {"s7": "DB1.DBD{four}", "opcua": "ns=2;s=cell/v{number}", "modbus": "holding {two}"}
 _SOURCE = """
@@ -41,7 +40,6 @@ _EMULATOR = """
 [[emulator]]
 name = "device-{name}"
 kind = "{kind}"
-program = "{program}"
 listen = "{address}"
 """
 
@@ -72,7 +70,7 @@ def measure(kinds: dict[str, int], registers: int, duration_s: float) -> None:
                 if kind != "opcua":
                     address = stack.enter_context(reserved_port())
                     peer = f'host = "{address.host}"\nport = {address.port}'
-                    parts.append(_EMULATOR.format(name=name, kind=kind, address=address, program=PROGRAMS[kind]))
+                    parts.append(_EMULATOR.format(name=name, kind=kind, address=address))
                 parts.append(_SOURCE.format(name=name, kind=kind, layout=layout, period_ms=PERIOD_MS, peer=peer))
         running = stack.enter_context(started([], more="".join(parts)))
         sources = [name for some in names.values() for name in some]
