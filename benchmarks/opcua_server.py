@@ -211,7 +211,7 @@ def main() -> None:
     rows = []
     for clients in CLIENTS[:1] if quick else CLIENTS:
         for bare in (False, True) if clients <= MOST_BARE else (False,):
-            found = measure(bare, clients, 1.0 if quick else 6.0)
+            found = measure(bare, clients, 1.0 if quick else 10.0)
             name = "asyncua alone" if bare else "shmio"
             rows.append([f"{clients} client{'s' * (clients > 1)}, {name}", *found])
     titles = ["values/s", "% delivered", "server, % of a core", "clients, % of a core", "delay, ms", "p99", "limit"]
