@@ -89,7 +89,7 @@ def test_the_page_on_emulated_controllers_runs_as_shown(reader: Reader) -> None:
 
 @pytest.mark.parametrize("reader", ["emulate-a-tag-table.md"], indirect=True)
 def test_the_page_on_emulated_tag_tables_runs_as_shown(reader: Reader) -> None:
-    table, configuration, program = reader.all("toml")
+    table, configuration, program, _ = reader.all("toml")  # the last is examples/five-sources in short
     reader.write("press.toml", table)
     reader.write("supervisor.toml", configuration)
     for commands, shown in reader.steps():
