@@ -88,7 +88,7 @@ WRONG = {
     "[registers]\na = { type = 'INT', initial = 40000 }": "cell.toml:2:1: error: a: ",
     "[registers]\na = { type = 'INT', start = 4 }": "a: there is no 'start' here, only type, initial, comment",
     "[registers]\nb = 'INT'\na = { initial = 4 }": "cell.toml:3:1: error: a: type: this key is needed",
-    f"[registers]\na = {'9' * 5000}": "cell.toml:2:1: error: a number in it has too many digits",
+    f"[registers]\na = {'9' * 5000}": "cell.toml:2:1: error: a number has too many digits",
     f"[registers]\na = {{ type = 'INT', initial = 0x{'f' * 5000} }}": "2:1: error: a: initial: expected a number of",
     f"[registers]\n'{'/'.join('a' * 225)}' = 'INT'": "a path has at most 224 segments",
     "[registers]\nb = 'INT'\na = { type = 'ARRAY[1..3] OF INT', initial = [1, 2, 3, 4] }": "3:1: error: a: initial: "

@@ -69,7 +69,7 @@ def test_the_tree(plant: Plant, device: Peer, capsys: pytest.CaptureFixture[str]
     shown = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     assert sorted(shown) == sorted(["b", "pos", "state", "axes", "0", "pos", "on"])
     assert browse(plant, "--limit", 2) == 1
-    assert "name a part of them" in capsys.readouterr().err
+    assert "select some of them by a PATTERN" in capsys.readouterr().err
 
 
 def test_the_table_can_be_read(plant: Plant, device: Peer, tmp_path: Path) -> None:
