@@ -42,50 +42,51 @@ def offline(at_ms: int) -> dict[str, Any]:
 def test_a_node_is_born_and_dies_with_its_primary_host_and_keeps_changes(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(step=1), cycle=1)
-    with listening(broker.address, NODES) as listener, bridge(segment, broker.address, sparkplug=WAITING) as running:
-        host = Host(listener)
-        running.until(lambda: "the primary host is offline (spBv1.0/STATE/scada)" in running.bridge.problem)
-        for nothing in (
-            b"ONLINE",
-            b"[" * 5000,
-            {"online": "true", "timestamp": 1},
-            {"online": True},
-            online(2**53),
-            offline(5),
-        ):
-            say(listener, nothing)
-        say(listener, online(9), "spBv1.0/STATE/another")
-        writer.publish(image(step=2), cycle=2)
-        running.until(lambda: running.bridge.counters[4] > 0)
-        say(listener, online(10))
-        birth = host.next()
-        assert birth.kind == "NBIRTH"
-        born = host.next()
-        assert (born.kind, born.metrics["step"].int_value) == ("DBIRTH", 2)
-        while (history := host.next()).metrics["step"].int_value != 2:
-            pass
-        assert (history.kind, history.metrics["step"].is_historical) == ("DDATA", True)
-        running.until(lambda: not running.bridge.problem)
+    with listening(broker.address, NODES) as listener:
+        with bridge(segment, broker.address, sparkplug=WAITING) as running:
+            host = Host(listener)
+            running.until(lambda: "the primary host is offline (spBv1.0/STATE/scada)" in running.bridge.problem)
+            for nothing in (
+                b"ONLINE",
+                b"[" * 5000,
+                {"online": "true", "timestamp": 1},
+                {"online": True},
+                online(2**53),
+                offline(5),
+            ):
+                say(listener, nothing)
+            say(listener, online(9), "spBv1.0/STATE/another")
+            writer.publish(image(step=2), cycle=2)
+            running.until(lambda: running.bridge.counters[4] > 0)
+            say(listener, online(10))
+            birth = host.next()
+            assert birth.kind == "NBIRTH"
+            born = host.next()
+            assert (born.kind, born.metrics["step"].int_value) == ("DBIRTH", 2)
+            while (history := host.next()).metrics["step"].int_value != 2:
+                pass
+            assert (history.kind, history.metrics["step"].is_historical) == ("DDATA", True)
+            running.until(lambda: not running.bridge.problem)
 
-        say(listener, offline(9))  # the late will of an earlier session
-        writer.publish(image(step=3), cycle=3)
-        assert host.next().metrics["step"].int_value == 3
+            say(listener, offline(9))  # the late will of an earlier session
+            writer.publish(image(step=3), cycle=3)
+            assert host.next().metrics["step"].int_value == 3
 
-        say(listener, offline(10))
-        death = host.next()
-        assert (death.kind, bd_seq(death)) == ("NDEATH", bd_seq(birth))
-        running.until(lambda: "the primary host is offline" in running.bridge.problem)
-        for step in range(4, 8):
-            writer.publish(image(step=step), cycle=step)
-        running.until(lambda: "4 changes are kept" in running.bridge.problem)
-        say(listener, online(20))
-        again = host.next()
-        assert (again.kind, bd_seq(again)) == ("NBIRTH", (bd_seq(birth) + 1) % 256)
-        assert host.next().metrics["step"].int_value == 7
-        told = [host.next() for _ in range(4)]
-        assert [one.metrics["step"].int_value for one in told] == [4, 5, 6, 7]
-        assert all(one.metrics["step"].is_historical for one in told)
-    assert host.next().kind == "NDEATH"
+            say(listener, offline(10))
+            death = host.next()
+            assert (death.kind, bd_seq(death)) == ("NDEATH", bd_seq(birth))
+            running.until(lambda: "the primary host is offline" in running.bridge.problem)
+            for step in range(4, 8):
+                writer.publish(image(step=step), cycle=step)
+            running.until(lambda: "4 changes are kept" in running.bridge.problem)
+            say(listener, online(20))
+            again = host.next()
+            assert (again.kind, bd_seq(again)) == ("NBIRTH", (bd_seq(birth) + 1) % 256)
+            assert host.next().metrics["step"].int_value == 7
+            told = [host.next() for _ in range(4)]
+            assert [one.metrics["step"].int_value for one in told] == [4, 5, 6, 7]
+            assert all(one.metrics["step"].is_historical for one in told)
+        assert host.next().kind == "NDEATH"
 
 
 def test_a_host_that_returns_at_once_gets_a_new_birth(segment: Segment, broker: Mosquitto) -> None:
