@@ -16,13 +16,14 @@ from typing import Any, Final
 import msgspec
 
 from shmio.cli.run import dumps, seconds, stop_on_signals
-from shmio.cli.set import Pairs, read_value
+from shmio.cli.set import Pairs
 from shmio.config import Declaration
 from shmio.config.campaign import read_campaign
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.model import Layout
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
+from shmio.layout.values.typed import read_value
 from shmio.layout.values.write import Write, paths_of
 from shmio.logs import printable
 from shmio.model.cell import Campaign, Cell

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -14,8 +13,7 @@ from shmio.layout.glob import select
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import look_up, parse_topic
 from shmio.layout.values.codec import Value
-from shmio.layout.values.literal import parse_literal, split_array
-from shmio.layout.values.text import from_text, wire_type
+from shmio.layout.values.typed import read_value
 from shmio.local.writer import MIN_PERIODS, TIMEOUT_S
 from shmio.logs import printable
 from shmio.model.cell import Cell
@@ -25,7 +23,6 @@ MATCHES = 3
 """Number of matching registers that the error about a pattern names."""
 
 _NEGATIVE = re.compile(r"-(?:\.?[0-9]|Infinity\Z)")
-_QUOTED = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,52 +98,6 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     if options.json:
         print(dumps(_described(outcomes)))
     return 0
-
-
-def read_value(text: str, register: Register) -> Value:
-    """Convert JSON or an S7 literal to a value for a register.
-
-    The literal of an array must have all elements, because missing ones would be written as zero.
-
-    Raises:
-        ValueRangeError: The text is not a value, or does not fit the register.
-
-    """
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        return _literal(text, register)
-    if register.dims:
-        try:
-            return from_text(text, register)
-        except ValueRangeError:
-            return _literal(text, register)
-    if isinstance(value, str) and wire_type(register) != "double":
-        return value
-    if isinstance(value, (str, int, float)) and wire_type(register) != "string":
-        return from_text(value if isinstance(value, str) else text, register)
-    if isinstance(value, (dict, list)) or value is None:
-        raise ValueRangeError(f"expected one {register.type}, found {text[:60]!r}")
-    return _literal(text, register)
-
-
-def _literal(text: str, register: Register) -> Value:
-    if register.dims:
-        # The second, larger shape shows whether there are too many elements.
-        given = [
-            sum(count for _, count, _ in split_array(text, shape))
-            for shape in (register.shape, tuple(length + 1 for length in register.shape))
-        ]
-        if given != [register.count] * 2:
-            raise ValueRangeError(f"expected all of the array's {register.count} elements, found {max(given)}")
-    try:
-        return parse_literal(text, register)
-    except ValueRangeError as error:
-        if register.element.base in _QUOTED and "'" not in text and '"' not in text:
-            raise ValueRangeError(
-                f"{error}; put text in quotes, and these in quotes for the shell: '\"text\"'"
-            ) from None
-        raise
 
 
 def _target(layouts: Mapping[str, Layout], path: str) -> tuple[str, Register]:

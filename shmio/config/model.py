@@ -352,6 +352,15 @@ class Metrics(Section):
     registers: Annotated[list[Text], Meta(max_length=1000)] = []
 
 
+class Web(Metrics):
+    """``[web]``: the address of the web page, which also has what ``[metrics]`` has.
+
+    ``roles`` are those of users who show no token. Its tokens are those of ``[[grpc.token]]``.
+    """
+
+    roles: Annotated[list[Text], Meta(max_length=len(ROLES))] | None = None
+
+
 class Config(Section):
     """The whole configuration. Its paths are relative to ``folder``."""
 
@@ -363,6 +372,7 @@ class Config(Section):
     mqtt: Mqtt | None = None
     opcua: OpcUa | None = None
     metrics: Metrics | None = None
+    web: Web | None = None
     recorder: Recorder | None = None
     replay: Replay | None = None
     folder: str = "."

@@ -36,10 +36,11 @@ from shmio.config.model import (
     Tls,
     Token,
     Trigger,
+    Web,
 )
 from shmio.config.mqtt import check_mqtt, resolve_mqtt
 from shmio.config.opcua import check_opcua, resolve_opcua
-from shmio.config.web import check_metrics, resolve_metrics
+from shmio.config.web import check_web, resolve_web
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
@@ -71,6 +72,7 @@ _TABLES: dict[str, type[Section]] = {
     "opcua.account": Token,
     "opcua.client": Client,
     "metrics": Metrics,
+    "web": Web,
     "recorder": Recorder,
     "recorder.trigger": Trigger,
     "replay": Replay,
@@ -259,7 +261,7 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     with faults.catching():
         check_opcua(config)
     with faults.catching():
-        check_metrics(config)
+        check_web(config)
     if config.grpc:
         with faults.catching():
             resolve(config.grpc, config)
@@ -267,8 +269,7 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
         resolve_mqtt(config.mqtt, config)
     if config.opcua:
         resolve_opcua(config.opcua, config)
-    if config.metrics:
-        resolve_metrics(config.metrics, config)
+    resolve_web(config)
     return Examined(config, faults, broken)
 
 

@@ -1,4 +1,4 @@
-"""Rules of the section ``[metrics]``."""
+"""Rules of the sections ``[web]`` and ``[metrics]``."""
 
 from __future__ import annotations
 
@@ -6,49 +6,75 @@ import importlib.util
 from typing import Final
 
 from shmio.config.address import Address
-from shmio.config.model import Config, Metrics
+from shmio.config.model import ROLES, Config, Metrics, Web
 from shmio.errors import ConfigError
 
-EXTRA: Final = "metrics: the HTTP endpoint needs other libraries: pip install 'shmio[web]'"
+EXTRA: Final = "{}: the HTTP endpoint needs other libraries: pip install 'shmio[web]'"
+_LIBRARIES: Final = ("uvicorn", "starlette", "websockets", "prometheus_client")
 
 
-def check_metrics(config: Config) -> None:
-    """Check the address, plain-text access and patterns.
+def check_web(config: Config) -> None:
+    """Check addresses, plain-text access and roles.
 
     Raises:
         ConfigError: A rule is broken.
 
     """
-    metrics = config.metrics
-    if metrics is None:
-        return
-    if (metrics.certificate is None) != (metrics.key is None):
-        raise ConfigError("metrics.certificate: give both certificate and key, or neither")
-    try:
-        address = Address.parse(metrics.listen)
-    except ConfigError as error:
-        raise ConfigError(f"metrics.listen: {error}") from None
-    if not address.loopback and metrics.certificate is None and not metrics.insecure:
-        raise ConfigError(
-            f"metrics.listen: {metrics.listen} can be reached from other hosts in plain text; this requires "
-            "certificate "
-            "and key, or insecure = true beside it"
-        )
+    for key, section in http_sections(config):
+        if (section.certificate is None) != (section.key is None):
+            raise ConfigError(f"{key}.certificate: give both certificate and key, or neither")
+        try:
+            address = Address.parse(section.listen)
+        except ConfigError as error:
+            raise ConfigError(f"{key}.listen: {error}") from None
+        if not address.loopback and section.certificate is None and not section.insecure:
+            raise ConfigError(
+                f"{key}.listen: {section.listen} can be reached from other hosts in plain text; this requires "
+                "certificate and key, or insecure = true beside it"
+            )
+        if isinstance(section, Web):
+            _check_roles(section, address, config)
 
 
-def resolve_metrics(metrics: Metrics, config: Config) -> None:
-    """Make the paths in the section absolute."""
-    for field in ("certificate", "key"):
-        if name := getattr(metrics, field):
-            setattr(metrics, field, str(config.path(name)))
+def http_sections(config: Config) -> list[tuple[str, Metrics]]:
+    """Return the sections of the HTTP endpoint that the configuration has, each with its name."""
+    return [(key, section) for key, section in (("metrics", config.metrics), ("web", config.web)) if section]
 
 
-def check_library() -> None:
+def _check_roles(web: Web, address: Address, config: Config) -> None:
+    """Check the roles of users without a token, and fill in their default."""
+    guarded = config.grpc is not None and bool(config.grpc.token)
+    if web.roles is None:
+        if not guarded and not address.loopback:
+            raise ConfigError(
+                f"web.roles: other hosts can reach {web.listen}: give the roles of users who show no token, such as "
+                'roles = ["read"], or add a [[grpc.token]]'
+            )
+        web.roles = [] if guarded else list(ROLES)
+    for role in web.roles:
+        if role not in ROLES:
+            raise ConfigError(f"web.roles: unknown role {role!r}; there are: {', '.join(ROLES)}")
+    if not web.roles and not guarded:
+        raise ConfigError("web.roles: nobody could use the page: give a role, or add a [[grpc.token]]")
+
+
+def resolve_web(config: Config) -> None:
+    """Make the paths in the sections absolute."""
+    for _, section in http_sections(config):
+        for field in ("certificate", "key"):
+            if name := getattr(section, field):
+                setattr(section, field, str(config.path(name)))
+
+
+def check_library(section: str = "metrics") -> None:
     """Check that the libraries of the HTTP endpoint are installed.
+
+    Args:
+        section: Name of the section that needs them, for the message.
 
     Raises:
         ConfigError: One of them is not.
 
     """
-    if any(importlib.util.find_spec(name) is None for name in ("uvicorn", "starlette", "prometheus_client")):
-        raise ConfigError(EXTRA)
+    if any(importlib.util.find_spec(name) is None for name in _LIBRARIES):
+        raise ConfigError(EXTRA.format(section))

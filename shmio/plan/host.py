@@ -19,6 +19,7 @@ from shmio.config.model import ROLES, MqttTls
 from shmio.config.opcua import check_library as check_opcua_library
 from shmio.config.tls import client_context, read_tls, server_context
 from shmio.config.web import check_library as check_web_library
+from shmio.config.web import http_sections
 from shmio.endpoints.mqtt.broker.program import choose_broker, find_mosquitto
 from shmio.errors import ConfigError
 
@@ -59,9 +60,9 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
     if config.opcua:
         with catching():
             warnings += _check_opcua(config.opcua)
-    if config.metrics:
+    for key, section in http_sections(config):
         with catching():
-            _check_metrics(config.metrics)
+            _check_http(key, section)
     return warnings
 
 
@@ -99,11 +100,11 @@ def _check_opcua(opcua: OpcUa) -> Iterator[str]:
         )
 
 
-def _check_metrics(metrics: Metrics) -> None:
+def _check_http(key: str, section: Metrics) -> None:
     """Check the libraries and the files of the HTTP endpoint."""
-    check_web_library()
-    if metrics.certificate and metrics.key:
-        server_context(MqttTls(certificate=metrics.certificate, key=metrics.key), "metrics.")
+    check_web_library(key)
+    if section.certificate and section.key:
+        server_context(MqttTls(certificate=section.certificate, key=section.key), f"{key}.")
 
 
 def _check_group(name: str | None) -> None:

@@ -15,6 +15,7 @@ from shmio.config import Address, Config, Emulator, Mqtt, Source
 from shmio.config.credentials import read_accounts
 from shmio.config.faults import Faults, meant
 from shmio.config.read import examine
+from shmio.config.web import http_sections
 from shmio.emulators.areas import TableMemory, is_table, place_name
 from shmio.emulators.device import Served
 from shmio.emulators.kinds import KINDS, S7, create
@@ -404,9 +405,9 @@ def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:
         if config.mqtt.sparkplug is not None:
             for pattern in config.mqtt.sparkplug.patterns:
                 yield "mqtt.sparkplug.match", pattern, False
-    if config.metrics is not None:
-        for index, pattern in enumerate(config.metrics.registers):
-            yield f"metrics.registers[{index}]", pattern, False
+    for key, section in http_sections(config):
+        for index, pattern in enumerate(section.registers):
+            yield f"{key}.registers[{index}]", pattern, False
 
 
 def _near(pattern: str, layout: Layout) -> str:

@@ -213,6 +213,10 @@ def make_plan(
         sections.append(("opcua", "opcua", msgspec.to_builtins(config.opcua)))
     if config.metrics and mode != "log":
         sections.append(("metrics", "web", msgspec.to_builtins(config.metrics) | {"folders": _folders(config)}))
+    if config.web and mode != "log":
+        tokens = msgspec.to_builtins(config.grpc.token) if config.grpc else []
+        more = {"folders": _folders(config), "token": tokens, "config_file": str(config_file.resolve())}
+        sections.append(("web", "web", msgspec.to_builtins(config.web) | more))
     if config.recorder:
         paths = {"directory": config.path(config.recorder.directory), "config_file": config_file.resolve()}
         recorder = msgspec.to_builtins(config.recorder) | {key: str(path) for key, path in paths.items()}
@@ -241,6 +245,7 @@ def process_names(config: Config) -> list[str]:
     names += [name for name, _, _ in _mqtt(config.mqtt)] if config.mqtt else []
     names += ["opcua"] if config.opcua else []
     names += ["metrics"] if config.metrics else []
+    names += ["web"] if config.web else []
     return [*names, "recorder"] if config.recorder else names
 
 

@@ -1,32 +1,35 @@
-"""The process of the HTTP endpoint."""
+"""The process of the HTTP endpoint: the web page, or figures for Prometheus alone."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
 from shmio import worker
 from shmio.config import Address
-from shmio.config.model import Metrics
+from shmio.config.credentials import read_tokens
+from shmio.config.model import Metrics, Token, Web
 from shmio.config.web import check_library
+from shmio.local.attach import attach
 from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
-LOGGERS: Final = ("shmio.web", "uvicorn", "asyncio")
+LOGGERS: Final = ("shmio.web", "uvicorn", "asyncio", "websockets")
 """Loggers of lines that clients can cause. The rate of these lines is limited."""
 FOLDERS: Final = "folders"
 
 
 def run(worker: Worker) -> None:
     """Serve clients until the worker is stopped."""
-    check_library()
+    check_library(worker.name)
     limits = {name: LogRateLimit(one_kind=name != "shmio.web") for name in LOGGERS}
     for name, limit in limits.items():
         logging.getLogger(name).addFilter(limit)
-    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+    for name in ("uvicorn", "websockets"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     try:
         asyncio.run(_serve(worker))
     finally:
@@ -35,27 +38,42 @@ def run(worker: Worker) -> None:
 
 
 async def _serve(worker: Worker) -> None:
-    from shmio.endpoints.web.app import metrics_app  # noqa: PLC0415  it needs the extra
+    from shmio.endpoints.web.app import PageApp, metrics_app  # noqa: PLC0415  it needs the extra
     from shmio.endpoints.web.measurements import Measurements  # noqa: PLC0415
+    from shmio.endpoints.web.served import Served  # noqa: PLC0415
     from shmio.endpoints.web.server import HttpServer  # noqa: PLC0415
+    from shmio.endpoints.web.sessions import Sessions  # noqa: PLC0415
+    from shmio.endpoints.web.tabs import TABS  # noqa: PLC0415
 
     folders: dict[str, str] = worker.config.pop(FOLDERS)
-    config = msgspec.convert(worker.config, Metrics)
+    given: list[dict[str, Any]] = worker.config.pop("token", [])
+    file: str = worker.config.pop("config_file", "")
+    config = msgspec.convert(worker.config, Web if worker.name == "web" else Metrics)
     loop = asyncio.get_running_loop()
     stopping = asyncio.Event()
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     measurements = Measurements(worker.segment)
-    app = metrics_app(worker.segment, measurements, folders, config.registers)
+    page = cell = None
+    if isinstance(config, Web):
+        cell = attach(worker.segment.instance, writable=True)
+        sessions = Sessions(read_tokens(msgspec.convert(given, list[Token])), config.roles or ())
+        served = Served(worker.segment, cell, measurements, folders, file)
+        page = PageApp(served, sessions, TABS, secure=config.certificate is not None)
+        app = page.app(measurements, config.registers)
+    else:
+        app = metrics_app(worker.segment, measurements, folders, config.registers)
     server = HttpServer(
         app,
         Address.parse(config.listen),
         hosts=tuple(config.hosts),
+        sockets=page is not None,
         certificate=config.certificate,
         key=config.key,
     )
     await server.start()
     measurements.start()
-    worker.log.info("serving %s://%s/metrics", "https" if config.certificate else "http", server.address)
+    scheme = "https" if config.certificate else "http"
+    worker.log.info("serving %s://%s/%s", scheme, server.address, "" if page else "metrics")
     worker.running()
     while not stopping.is_set():
         counters = server.counters
@@ -66,6 +84,8 @@ async def _serve(worker: Worker) -> None:
             continue
     await server.stop()
     await asyncio.to_thread(measurements.stop)
+    if cell is not None:
+        cell.close()
 
 
 if __name__ == "__main__":

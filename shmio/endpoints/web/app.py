@@ -3,19 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Final
 
+import msgspec
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
-from starlette.routing import Route
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket
 
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.metrics import Exposition, InstanceCollector
+from shmio.endpoints.web.page import Page, Tab
+from shmio.endpoints.web.served import Served
+from shmio.endpoints.web.sessions import COOKIE, MAX_AGE_S, Sessions, User
 from shmio.segment import Segment
 
+STATIC: Final = Path(__file__).parent / "static"
+MAX_PAGES: Final = 64
+"""Maximum number of open pages."""
+MAX_LOGIN_BYTES: Final = 4096
+_TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+_POLICY: Final = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "cache-control": "no-cache",
+}
 _HINT: Final = "shmio: /metrics has the figures of the instance, for Prometheus\n"
 
 
@@ -31,12 +49,126 @@ def metrics_app(
         registers: Patterns of the registers whose values are reported.
 
     """
+
+    async def hint(_request: Request) -> Response:
+        return PlainTextResponse(_HINT)
+
+    return Starlette(routes=[_metrics(segment, measurements, folders, registers), Route("/", hint)])
+
+
+def _metrics(
+    segment: Segment, measurements: Measurements, folders: Mapping[str, str], registers: Sequence[str]
+) -> Route:
     exposition = Exposition(InstanceCollector(segment, measurements, folders, registers))
 
     async def metrics(_request: Request) -> Response:
         return Response(await run_in_threadpool(exposition.answer), media_type=CONTENT_TYPE_LATEST)
 
-    async def hint(_request: Request) -> Response:
-        return PlainTextResponse(_HINT)
+    return Route("/metrics", metrics)
 
-    return Starlette(routes=[Route("/metrics", metrics), Route("/", hint)])
+
+class _Login(msgspec.Struct, forbid_unknown_fields=True):
+    token: str
+
+
+class PageApp:
+    """The application of ``[web]``: the page, its session and its WebSocket, and ``/metrics``."""
+
+    def __init__(self, served: Served, sessions: Sessions, tabs: Sequence[type[Tab]], *, secure: bool) -> None:
+        """Create the application.
+
+        Args:
+            served: What the pages show.
+            sessions: The users.
+            tabs: The tabs of a page.
+            secure: Whether the server uses TLS. Then browsers send the session's cookie over TLS only.
+
+        """
+        self._served, self._sessions, self._tabs, self._secure = served, sessions, tabs, secure
+        self.open_pages = 0
+        """Number of open pages."""
+        self._files = {
+            f"/{file.relative_to(STATIC)}": (file.read_bytes(), _TYPES[file.suffix])
+            for file in STATIC.rglob("*")
+            if file.suffix in _TYPES
+        }
+        self._files["/"] = self._files["/index.html"]
+
+    def app(self, measurements: Measurements, registers: Sequence[str]) -> Starlette:
+        """Return the routes of the application.
+
+        Args:
+            measurements: The histograms for ``/metrics``.
+            registers: Patterns of the registers that ``/metrics`` reports.
+
+        """
+        routes: list[BaseRoute] = [
+            _metrics(self._served.segment, measurements, self._served.folders, registers),
+            Route("/session", self._session, methods=["GET", "POST", "DELETE"]),
+            WebSocketRoute("/socket", self._socket),
+            Route("/{path:path}", self._file),
+        ]
+        return Starlette(routes=routes)
+
+    async def _file(self, request: Request) -> Response:
+        found = self._files.get(request.url.path)
+        if found is None:
+            return PlainTextResponse("there is no such page\n", 404)
+        return Response(found[0], media_type=found[1], headers=_POLICY)
+
+    def _user(self, request: HTTPConnection) -> User:
+        return self._sessions.user(request.cookies.get(COOKIE), _host(request))
+
+    async def _session(self, request: Request) -> Response:
+        """Tell who the user is; with POST, open a session for a token; with DELETE, close it."""
+        host = _host(request)
+        if request.method == "GET":
+            return JSONResponse(self._describe(self._user(request)))
+        if request.method == "DELETE":
+            self._sessions.close(request.cookies.get(COOKIE, ""))
+            answer = JSONResponse(self._describe(self._sessions.user(None, host)))
+            answer.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=self._secure)
+            return answer
+        if self._sessions.blocked(host):
+            return JSONResponse({"error": "too many wrong tokens: try again in a minute"}, 429)
+        body = b""
+        async for part in request.stream():
+            body += part
+            if len(body) > MAX_LOGIN_BYTES:
+                return JSONResponse({"error": "this is no token"}, 413)
+        try:
+            token = msgspec.json.decode(body, type=_Login).token
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            return JSONResponse({"error": "expected a JSON object with the key token"}, 400)
+        opened = self._sessions.open(token, host)
+        if opened is None:
+            return JSONResponse({"error": "this is no token of [[grpc.token]]"}, 403)
+        cookie, user = opened
+        answer = JSONResponse(self._describe(user))
+        answer.set_cookie(
+            COOKIE, cookie, max_age=MAX_AGE_S, httponly=True, samesite="strict", secure=self._secure, path="/"
+        )
+        return answer
+
+    def _describe(self, user: User) -> dict[str, object]:
+        return {
+            "instance": self._served.segment.instance,
+            "name": user.name,
+            "roles": user.listed_roles,
+            "takes_tokens": self._sessions.takes_tokens,
+        }
+
+    async def _socket(self, socket: WebSocket) -> None:
+        user = self._user(socket)
+        if "read" not in user.roles or self.open_pages >= MAX_PAGES:
+            await socket.close(1008)  # before it is accepted: an answer 403
+            return
+        self.open_pages += 1
+        try:
+            await Page(self._served, socket, user, self._tabs).run()
+        finally:
+            self.open_pages -= 1
+
+
+def _host(request: HTTPConnection) -> str:
+    return request.client.host if request.client else ""

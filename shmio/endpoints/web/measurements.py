@@ -8,11 +8,12 @@ from __future__ import annotations
 import threading
 import time
 from bisect import bisect_left
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterator
 from itertools import accumulate
 from typing import Final
 
+from shmio.model.values import Quality
 from shmio.segment import Block, Segment
 from shmio.segment.events import ENDS, EventKind
 
@@ -23,6 +24,8 @@ BOUNDS_S: Final = (
     0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0,
 )  # fmt: skip
 """Upper bounds of the buckets of all histograms."""
+MAX_CHANGES: Final = 4096
+"""Maximum number of a source's changes of quality that are kept."""
 MAX_COMMANDS: Final = 4096
 """Maximum number of a source's commands without outcome. If there are more, the oldest are forgotten."""
 
@@ -70,6 +73,9 @@ class SourceTiming:
         """Times from the publication of a frame until this process ran, which waited for the frame."""
         self.command = Histogram()
         """Times from the acceptance of a command by the source until its outcome was known."""
+        self.connections: deque[tuple[float, bool]] = deque(maxlen=MAX_CHANGES)
+        """Newest changes between bad and other quality: the time by CLOCK_MONOTONIC in s, and True if it became bad."""
+        self._bad = False
         self._started_ns = started_ns
         self._frames = block.cursor()
         self._events = block.events.cursor()
@@ -91,6 +97,9 @@ class SourceTiming:
             if before is not None and (before[0], before[1] + 1) == place[:2]:
                 self.period.add(frame.publish_ns - before[2])
         while (event := self._events.poll()) is not None:
+            if event.kind == EventKind.QUALITY and self._bad != (event.quality is Quality.BAD):
+                self._bad = not self._bad
+                self.connections.append((event.publish_ns / 1e9, self._bad))
             command = (event.writer, event.command)
             if event.kind == EventKind.ACCEPTED:
                 self._accepted.setdefault(command, event.publish_ns)

@@ -20,6 +20,12 @@ from shmio.config import Address
 from shmio.errors import EndpointError
 
 MAX_CONNECTIONS: Final = 128
+MAX_MESSAGE_BYTES: Final = 64 << 10
+"""Maximum size of a message that a page sends over its WebSocket."""
+SEND_BUFFER_BYTES: Final = 64 << 10
+"""Size of the kernel's buffer for each client. A larger one would hold old data for a client that does not read."""
+PING_S: Final = 20.0
+"""Interval of pings to a page, and the time in which it must answer each."""
 REQUEST_S: Final = 10.0
 """Time limit in s for a client's first request, and for each later request from its first byte on."""
 IDLE_S: Final = 75
@@ -63,6 +69,11 @@ class _Protocol(H11Protocol):
             transport.abort()
             return
         self._set_deadline()
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        """Leave the connection to a page's WebSocket."""
+        self._clear_deadline()
+        super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the connection."""
@@ -109,10 +120,19 @@ class _Guarded:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] != "http":
+        if scope["type"] not in ("http", "websocket"):
             return
         self._counters.requests += 1
         hosts = [value for name, value in scope["headers"] if name == b"host"]
+        origins = [value for name, value in scope["headers"] if name == b"origin"]
+        known = len(hosts) == 1 and self.knows(hosts[0].decode("latin-1"))
+        if scope["type"] == "websocket":
+            if known and _same_origin(origins, hosts[0], secure=scope["scheme"] == "wss"):
+                await self._app(scope, receive, send)
+            else:
+                self._counters.refused += 1
+                await send({"type": "websocket.close", "code": 1008})  # before it is accepted: an answer 403
+            return
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -122,15 +142,21 @@ class _Guarded:
                 ]  # fmt: skip
             await send(message)
 
-        if len(hosts) != 1 or not self.knows(hosts[0].decode("latin-1")):
+        async def refuse(status: int, text: bytes) -> None:
             self._counters.refused += 1
-            text = b"this server has another name: use the address of [metrics] listen, or add the name to its hosts\n"
-            await with_headers(
-                {"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]}
-            )
+            start = {"type": "http.response.start", "status": status, "headers": [(b"content-type", b"text/plain")]}
+            await with_headers(start)
             await with_headers({"type": "http.response.body", "body": text})
-            return
-        await self._app(scope, receive, with_headers)
+
+        if not known:
+            text = b"this server has another name: use its address in listen, or add the name to hosts beside it\n"
+            await refuse(421, text)
+        elif scope["method"] not in ("GET", "HEAD") and not _same_origin(
+            origins, hosts[0], secure=scope["scheme"] == "https"
+        ):
+            await refuse(403, b"this request comes from a page of another server\n")
+        else:
+            await self._app(scope, receive, with_headers)
 
     def knows(self, host: str) -> bool:
         """Return whether a Host header names this server: an IP address, ``localhost``, or a configured name."""
@@ -141,6 +167,14 @@ class _Guarded:
         except ValueError:
             return name in self._names
         return True
+
+
+def _same_origin(origins: list[bytes], host: bytes, *, secure: bool) -> bool:
+    """Return whether a request comes from a page of this server, or from a program that is no browser.
+
+    Browsers name the page that sends a request in the Origin header (RFC 6454, section 7).
+    """
+    return not origins or origins == [(b"https://" if secure else b"http://") + host.lower()]
 
 
 class _Server(Uvicorn):
@@ -171,6 +205,7 @@ class HttpServer:
         address: Address,
         *,
         hosts: tuple[str, ...] = (),
+        sockets: bool = False,
         certificate: str | None = None,
         key: str | None = None,
     ) -> None:
@@ -181,6 +216,7 @@ class HttpServer:
             address: Where to listen.
             hosts: Names by which clients may address the server, besides IP addresses, ``localhost`` and the name in
                 ``address``.
+            sockets: Whether the application has WebSockets.
             certificate: PEM file of the certificate for TLS.
             key: PEM file of the certificate's key.
 
@@ -192,7 +228,11 @@ class HttpServer:
         config = Config(
             _Guarded(app, names, self.counters),
             http=protocol,
-            ws="none",
+            ws="websockets-sansio" if sockets else "none",
+            ws_max_size=MAX_MESSAGE_BYTES,
+            ws_ping_interval=PING_S,
+            ws_ping_timeout=PING_S,
+            ws_per_message_deflate=False,
             loop="none",
             lifespan="off",
             log_config=None,
@@ -215,6 +255,7 @@ class HttpServer:
         family = socket.AF_INET6 if ":" in self.address.host else socket.AF_INET
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)  # connections inherit it
         try:
             listening.bind((self.address.host, self.address.port))
             listening.listen(BACKLOG)
@@ -223,7 +264,13 @@ class HttpServer:
             raise EndpointError(f"cannot listen on {self.address}: {error.strerror}") from None
         self.port: int = listening.getsockname()[1]
         self._serving = asyncio.get_running_loop().create_task(self._server.serve([listening]))
-        await self._server.ready.wait()
+        ready = asyncio.get_running_loop().create_task(self._server.ready.wait())
+        await asyncio.wait({ready, self._serving}, return_when=asyncio.FIRST_COMPLETED)
+        if self._serving.done():  # uvicorn could not begin
+            ready.cancel()
+            listening.close()
+            await self._serving  # raises the reason
+            raise EndpointError(f"cannot serve HTTP on {self.address}: the server ended while it started")
 
     async def stop(self) -> None:
         """Stop listening, and end all connections."""

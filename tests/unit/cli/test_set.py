@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 
 import shmio
-from shmio.cli.set import read_value
 from shmio.cli.user import main
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.output import Output
 from shmio.errors import ConnectorError, ValueRangeError
 from shmio.layout.model import Layout, Register
+from shmio.layout.values.typed import read_value
 from shmio.segment import Attributes, BlockSpec, BlockWriter, Segment
 
 LAYOUT = Layout(

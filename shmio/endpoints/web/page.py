@@ -1,0 +1,214 @@
+"""One open page: its WebSocket, the calls that it makes, and the data that it follows.
+
+A page sends calls as JSON text, ``{"id": 7, "call": "registers.rows", "with": {…}}``. The answer is
+``{"id": 7, "result": …}`` or ``{"id": 7, "error": "…"}``. Data that a page follows comes unasked, as
+``{"topic": "overview", "data": …}``, or as binary messages for plots. docs/reference/web-page.md
+describes all of them.
+
+Nothing waits for a page. Of data that is not sent yet, newer data replaces older data.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
+from contextlib import suppress
+from typing import Any, ClassVar, Final, NamedTuple, TypeVar
+
+import msgspec
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from shmio.endpoints.web.served import Served
+from shmio.endpoints.web.sessions import User
+from shmio.errors import ShmioError
+
+MAX_CALLS: Final = 16
+"""Maximum number of a page's calls that may be in progress. The page's next call waits."""
+MAX_BATCHES: Final = 32
+"""Maximum number of binary messages that may wait for a page. The oldest ones are dropped."""
+FIRST_CALL_S: Final = 10.0
+"""Time in s in which a page must make its first call."""
+
+_log = logging.getLogger("shmio.web")
+
+
+class Nothing(msgspec.Struct, forbid_unknown_fields=True):
+    """The arguments of a call that takes none."""
+
+
+class _Message(msgspec.Struct, forbid_unknown_fields=True):
+    """A call as a page sends it."""
+
+    id: int
+    call: str
+    arguments: msgspec.Raw = msgspec.field(name="with", default=msgspec.Raw(b"{}"))
+
+
+class Call(NamedTuple):
+    """A call that pages can make: the role that it needs, the type of its arguments, and its function."""
+
+    role: str
+    arguments: type[msgspec.Struct]
+    function: Callable[[Any, Any], Awaitable[Any]]
+
+
+_Arguments = TypeVar("_Arguments", bound=msgspec.Struct)
+_Tab = TypeVar("_Tab", bound="Tab")
+
+
+def call(
+    role: str, arguments: type[_Arguments]
+) -> Callable[[Callable[[_Tab, _Arguments], Awaitable[Any]]], Callable[[_Tab, _Arguments], Awaitable[Any]]]:
+    """Make a method of a tab a call. Its name is the tab's name, a point, and the method's name.
+
+    Args:
+        role: The role that a user needs.
+        arguments: The type of the arguments.
+
+    """
+
+    def mark(
+        method: Callable[[_Tab, _Arguments], Awaitable[Any]],
+    ) -> Callable[[_Tab, _Arguments], Awaitable[Any]]:
+        method.page_call = (role, arguments)  # type: ignore[attr-defined]
+        return method
+
+    return mark
+
+
+class Tab:
+    """One tab of a page: the state that it has on the server, and its calls."""
+
+    name: ClassVar[str]
+    calls: ClassVar[Mapping[str, Call]]
+
+    def __init_subclass__(cls) -> None:
+        """Collect the calls."""
+        cls.calls = {
+            f"{cls.name}.{name}": Call(method.page_call[0], method.page_call[1], method)
+            for name, method in vars(cls).items()
+            if hasattr(method, "page_call")
+        }
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+
+    def close(self) -> None:
+        """Release what the tab holds, because the page has been closed."""
+
+
+class Page:
+    """One open page. Use it in the event loop's thread only."""
+
+    def __init__(self, served: Served, socket: WebSocket, user: User, tabs: Iterable[type[Tab]]) -> None:
+        self.served = served
+        self.user = user
+        self._socket = socket
+        self._tabs = {tab.name: tab(self) for tab in tabs}
+        self._calls = {name: (call, tab) for tab in self._tabs.values() for name, call in tab.calls.items()}
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._room = asyncio.Semaphore(MAX_CALLS)
+        self._answers: deque[bytes] = deque()  # bounded, because a call in progress keeps its place until it is sent
+        self._newest: dict[str, bytes] = {}
+        self._batches: deque[bytes] = deque(maxlen=MAX_BATCHES)
+        self._waiting = asyncio.Event()
+
+    async def run(self) -> None:
+        """Serve the page until it is closed."""
+        await self._socket.accept()
+        sender = self.start(self._send())
+        try:
+            async with asyncio.timeout(FIRST_CALL_S):
+                message = await self._receive()
+            while message is not None:
+                await self._room.acquire()
+                self.start(self._answer(message))
+                message = await self._receive()
+        except TimeoutError:
+            await self._socket.close(1008, "the page made no call in time")
+        except (WebSocketDisconnect, RuntimeError):  # starlette raises RuntimeError for a connection that is closed
+            pass
+        finally:
+            for tab in self._tabs.values():
+                tab.close()
+            tasks = [sender, *self._tasks]
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Run work in the background. It is cancelled when the page is closed."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+        return task
+
+    def push(self, topic: str, data: object) -> None:
+        """Send data of a topic. Data of this topic that is not sent yet is replaced."""
+        self._newest[topic] = msgspec.json.encode({"topic": topic, "data": data})
+        self._waiting.set()
+
+    def push_batch(self, batch: bytes) -> None:
+        """Send a binary message."""
+        self._batches.append(batch)
+        self._waiting.set()
+
+    def _done(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is not None and not isinstance(error, (WebSocketDisconnect, RuntimeError)):
+            _log.error("a page's work failed", exc_info=error)
+
+    async def _receive(self) -> str | None:
+        """Return the next message; None if the page is closed or sends something else than text."""
+        message = await self._socket.receive()
+        text: str | None = message.get("text") if message["type"] == "websocket.receive" else None
+        return text
+
+    async def _answer(self, text: str) -> None:
+        """Make the call of a message, and send its result."""
+        number = 0
+        answer: dict[str, object]
+        try:
+            try:
+                message = msgspec.json.decode(text, type=_Message)
+                number = message.id
+                made, tab = self._calls.get(message.call, (None, None))
+                if made is None:
+                    raise ShmioError(f"there is no call {message.call[:80]!r}")
+                if made.role not in self.user.roles:
+                    raise ShmioError(self._denial(made.role))
+                arguments = msgspec.json.decode(message.arguments, type=made.arguments)
+            except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+                raise ShmioError(f"the call is malformed: {error}") from None
+            answer = {"id": number, "result": await made.function(tab, arguments)}
+        except ShmioError as error:
+            answer = {"id": number, "error": str(error)}
+        except asyncio.CancelledError:
+            raise
+        except Exception:  # noqa: BLE001  the page gets an answer to each call
+            _log.exception("a call of a page failed")
+            answer = {"id": number, "error": "the server failed to do this; its log has the reason"}
+        self._answers.append(msgspec.json.encode(answer))
+        self._waiting.set()
+
+    def _denial(self, role: str) -> str:
+        who = f"the token {self.user.name!r}" if self.user.name else "without a token, this address"
+        has = ", ".join(self.user.listed_roles) or "none"
+        return f"this needs the role {role}; {who} has the roles: {has}"
+
+    async def _send(self) -> None:
+        """Send what waits: answers first, then the newest data."""
+        with suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                await self._waiting.wait()
+                self._waiting.clear()
+                while self._answers:
+                    await self._socket.send_text(self._answers.popleft().decode())
+                    self._room.release()
+                while self._newest:
+                    await self._socket.send_text(self._newest.pop(next(iter(self._newest))).decode())
+                while self._batches and not self._answers:
+                    await self._socket.send_bytes(self._batches.popleft())

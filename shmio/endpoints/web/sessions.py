@@ -1,0 +1,114 @@
+"""Sessions: who uses the page, and what each user may do.
+
+A user who shows a token gets a session. Its cookie is HttpOnly, so that scripts cannot read it, and
+SameSite, so that browsers do not send it with requests of other sites' pages. A session belongs to
+the host that opened it: a stolen cookie is worth nothing elsewhere.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from shmio.config.credentials import Secret, digest
+from shmio.config.model import ROLES
+
+COOKIE: Final = "shmio_session"
+MAX_SESSIONS: Final = 256
+MAX_AGE_S: Final = 12 * 3600
+"""Time in s after which a user must show the token again."""
+ATTEMPTS: Final = 10
+ATTEMPTS_S: Final = 60.0
+"""Each host may show at most ``ATTEMPTS`` wrong tokens in this time in s."""
+_MAX_HOSTS: Final = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class User:
+    """A user of the page: the name of the token, or an empty name, and the roles."""
+
+    name: str
+    roles: frozenset[str]
+    host: str = ""
+
+    @property
+    def listed_roles(self) -> list[str]:
+        """The roles in their usual order."""
+        return [role for role in ROLES if role in self.roles]
+
+
+class Sessions:
+    """The sessions of all users."""
+
+    def __init__(
+        self, tokens: Sequence[Secret], anonymous: Iterable[str], now: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Create an empty set of sessions.
+
+        Args:
+            tokens: The tokens that users may show.
+            anonymous: Roles of users who show none.
+            now: Clock in s.
+
+        """
+        self._tokens = tokens
+        self._anonymous = frozenset(anonymous)
+        self._now = now
+        self._users: OrderedDict[bytes, tuple[User, float]] = OrderedDict()
+        self._failures: OrderedDict[str, list[float]] = OrderedDict()
+
+    @property
+    def takes_tokens(self) -> bool:
+        """True if there are tokens that a user can show."""
+        return bool(self._tokens)
+
+    def user(self, cookie: str | None, host: str) -> User:
+        """Return the user who sent a cookie, or who sent none, from a host."""
+        if cookie is not None:
+            found = self._users.get(digest(cookie.encode()))
+            if found is not None and found[0].host == host and self._now() - found[1] < MAX_AGE_S:
+                return found[0]
+        return User("", self._anonymous, host)
+
+    def open(self, token: str, host: str) -> tuple[str, User] | None:
+        """Open a session for the owner of a token.
+
+        Returns:
+            The cookie and the user; None if there is no such token.
+
+        """
+        shown, owner = digest(token.strip().encode()), None
+        for secret in self._tokens:
+            if hmac.compare_digest(secret.digest, shown):
+                owner = secret
+        if owner is None:
+            self._failed(host)
+            return None
+        cookie = secrets.token_urlsafe(32)
+        user = User(owner.name, owner.roles | self._anonymous, host)
+        self._users[digest(cookie.encode())] = (user, self._now())
+        if len(self._users) > MAX_SESSIONS:
+            self._users.popitem(last=False)
+        return cookie, user
+
+    def close(self, cookie: str) -> None:
+        """Close the session of a cookie."""
+        self._users.pop(digest(cookie.encode()), None)
+
+    def blocked(self, host: str) -> bool:
+        """Return whether a host has shown too many wrong tokens lately."""
+        failures = self._failures.get(host, [])
+        return len(failures) >= ATTEMPTS and self._now() - failures[-ATTEMPTS] < ATTEMPTS_S
+
+    def _failed(self, host: str) -> None:
+        failures = self._failures.setdefault(host, [])
+        self._failures.move_to_end(host)
+        failures.append(self._now())
+        del failures[:-ATTEMPTS]
+        if len(self._failures) > _MAX_HOSTS:
+            self._failures.popitem(last=False)

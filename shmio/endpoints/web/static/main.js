@@ -1,0 +1,120 @@
+// The page: head line, tabs, theme and session.
+
+import { Connection } from "./connection.js";
+import { byId, element, replace, setText } from "./dom.js";
+import { OverviewTab } from "./overview.js";
+import { RegistersTab } from "./registers.js";
+import { session, signIn, signOut } from "./session.js";
+
+/**
+ * @typedef {{ root: HTMLElement, close: () => void, resume?: () => void }} Tab A tab that is shown. `resume` requests again
+ *   what the tab follows, after the connection was lost.
+ * @typedef {{ connection: Connection, overview: any, may: (role: string) => boolean, show: (name: string) => void }} Context
+ */
+
+/** @type {Record<string, { title: string, make: (context: Context) => Tab }>} */
+const TABS = {
+  overview: { title: "Overview", make: (context) => new OverviewTab(context) },
+  registers: { title: "Registers", make: (context) => new RegistersTab(context) },
+};
+
+const connection = new Connection();
+/** @type {import("./session.js").Session} */
+let user = { instance: "", name: "", roles: [], takes_tokens: false };
+/** @type {Tab | null} */
+let shown = null;
+/** @type {Context} */
+const context = { connection, overview: null, may: (role) => user.roles.includes(role), show: (name) => (location.hash = name) };
+
+function showTab() {
+  const wanted = location.hash.slice(1).split("/")[0];
+  const name = wanted in TABS ? wanted : "overview";
+  shown?.close();
+  shown = TABS[name].make(context);
+  replace(byId("main"), shown.root);
+  if (connection.open) shown.resume?.();
+  for (const button of byId("tabs").children) {
+    const selected = button.id === `tab-${name}`;
+    button.setAttribute("aria-selected", String(selected));
+    button.setAttribute("tabindex", selected ? "0" : "-1");
+  }
+}
+
+function makeTabs() {
+  const buttons = Object.entries(TABS).map(([name, { title }]) =>
+    element("button", { type: "button", role: "tab", id: `tab-${name}`, click: () => context.show(name) }, title),
+  );
+  byId("tabs").replaceChildren(...buttons);
+  byId("tabs").addEventListener("keydown", (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    const at = buttons.findIndex((button) => button === document.activeElement);
+    if (step === undefined || at < 0) return;
+    const next = buttons[(at + step + buttons.length) % buttons.length];
+    next.focus();
+    next.click();
+  });
+}
+
+/** @param {any} overview */
+function showHead(overview) {
+  context.overview = overview;
+  setText(byId("instance"), overview.instance);
+  document.title = `${overview.instance} – shmio`;
+  const state = byId("state");
+  setText(state, overview.state);
+  state.className = `badge ${overview.state}`;
+  const { clock } = overview;
+  const step = clock.mode === "virtual" ? `, step ${clock.step}${clock.playing ? `, ${clock.rate} times real time` : ""}` : "";
+  setText(byId("clock"), `mode ${overview.mode}, ${clock.mode} time ${clock.time_s.toFixed(1)} s${step}`);
+  setText(byId("note"), overview.note);
+}
+
+/** @param {import("./session.js").Session} found */
+function showUser(found) {
+  user = found;
+  setText(byId("instance"), user.instance);
+  const roles = user.roles.join(", ") || "no role";
+  const act = user.name
+    ? element("button", { type: "button", click: async () => enter(await signOut()) }, "Sign out")
+    : element("button", { type: "button", click: askToken }, "Sign in");
+  replace(byId("user"), `${user.name || "no token"} (${roles}) `, user.takes_tokens || user.name ? act : null);
+}
+
+async function askToken() {
+  const found = await signIn();
+  if (found !== null) enter(found);
+}
+
+/** @param {import("./session.js").Session} found */
+function enter(found) {
+  showUser(found);
+  connection.close();
+  if (context.may("read")) connection.connect();
+  else replace(byId("main"), element("p", {}, "Sign in to see this cell."));
+}
+
+function makeTheme() {
+  const root = document.documentElement;
+  root.dataset.theme = localStorage.getItem("theme") ?? "";
+  byId("theme").addEventListener("click", () => {
+    const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+    root.dataset.theme = dark ? "light" : "dark";
+    localStorage.setItem("theme", root.dataset.theme);
+  });
+}
+
+connection.follow("overview", showHead);
+connection.addEventListener("open", () => {
+  byId("offline").hidden = true;
+  connection.call("overview.follow").catch(() => {});
+  if (shown === null) showTab();
+  else shown.resume?.();
+});
+connection.addEventListener("lost", async () => {
+  byId("offline").hidden = false;
+});
+window.addEventListener("hashchange", showTab);
+makeTheme();
+makeTabs();
+enter(await session());
+if (!context.may("read") && user.takes_tokens) askToken();

@@ -1,0 +1,234 @@
+// The registers tab: a virtual table of the tree of all registers. The server sends only the visible rows.
+
+import { element, notify, replace, setText } from "./dom.js";
+
+/** @typedef {import("./main.js").Context} Context */
+/**
+ * @typedef {{ path: string, name: string, depth: number, expandable: boolean, type?: string, unit?: string, comment?: string,
+ *   writable?: boolean, overridden?: boolean }} Row
+ */
+/** @typedef {[string | null, string, string, string, number | null]} Value Text, quality, reason, provenance, source time. */
+
+const ROW_PX = 26;
+const SPARE_ROWS = 10;
+const MAX_ROWS = 200;
+// Browsers cannot make elements of any height. Beyond this, each pixel of the scroll bar stands for several rows.
+const MAX_HEIGHT_PX = 8_000_000;
+const FILTER_DELAY_MS = 200;
+
+export class RegistersTab {
+  /** @param {Context} context */
+  constructor(context) {
+    this.context = context;
+    /** @type {Set<string>} */
+    this.expanded = new Set(JSON.parse(sessionStorage.getItem("expanded") ?? "[]"));
+    this.untouched = this.expanded.size === 0; // then all sources are expanded
+    this.first = 0;
+    this.total = 0;
+    /** @type {Row[]} */
+    this.rows = [];
+    /** @type {Record<string, Value>} */
+    this.values = {};
+    this.asked = 0;
+    this.answered = 0;
+    this.selected = "";
+
+    this.filter = element("input", {
+      type: "search",
+      placeholder: "Search path or comment",
+      "aria-label": "Search",
+      maxlength: 200,
+      input: () => {
+        clearTimeout(this.typing);
+        this.typing = setTimeout(() => this.restart(), FILTER_DELAY_MS);
+      },
+    });
+    /** @type {ReturnType<typeof setTimeout> | undefined} */
+    this.typing = undefined;
+    this.count = element("span", { class: "dim" });
+    this.body = element("div", { class: "tree-rows", role: "rowgroup" });
+    this.space = element("div", { class: "tree-space" }, this.body);
+    this.view = element("div", { class: "tree", role: "treegrid", tabindex: 0, "aria-label": "Registers", scroll: () => this.request() }, this.space);
+    this.view.addEventListener("keydown", (event) => this.key(event));
+    this.detail = element("form", { class: "detail", "aria-label": "Register" });
+    this.detail.addEventListener("submit", (event) => event.preventDefault());
+    const heads = ["Register", "Value", "Quality", "Origin", "Type", "Comment"].map((text) => element("span", { role: "columnheader" }, text));
+    this.root = element(
+      "div",
+      { class: "registers" },
+      element("p", {}, this.filter, " ", this.count),
+      element("div", { class: "tree-row tree-head", role: "row" }, ...heads),
+      this.view,
+      this.detail,
+    );
+    this.stop = context.connection.follow("registers", (values) => this.show(values));
+    this.resize = new ResizeObserver(() => this.request());
+    this.resize.observe(this.view);
+  }
+
+  close() {
+    this.stop();
+    this.resize.disconnect();
+    this.context.connection.call("registers.rows", { first: 0, count: 0 }).catch(() => {});
+  }
+
+  /** Request the rows again: the connection is new. Overrides of this page ended with the old one. */
+  resume() {
+    this.request();
+  }
+
+  restart() {
+    this.view.scrollTop = 0;
+    this.request();
+  }
+
+  /** Request the rows that are visible now. */
+  async request() {
+    const fit = Math.ceil(this.view.clientHeight / ROW_PX);
+    const first = Math.max(0, this.row() - SPARE_ROWS);
+    const given = {
+      first,
+      count: Math.min(MAX_ROWS, fit + 2 * SPARE_ROWS),
+      expanded: this.untouched ? null : [...this.expanded],
+      filter: this.filter.value,
+    };
+    const number = (this.asked += 1);
+    try {
+      const found = await this.context.connection.call("registers.rows", given);
+      if (number < this.answered) return; // a later request was answered before
+      this.answered = number;
+      this.first = found.first;
+      this.total = found.total;
+      this.rows = found.rows;
+      if (this.untouched) for (const row of this.rows) if (row.depth === 0) this.expanded.add(row.path);
+      this.draw();
+    } catch (error) {
+      if (this.context.connection.open) notify(String(/** @type {Error} */ (error).message), "problem");
+    }
+  }
+
+  /** Return the number of the topmost visible row. */
+  row() {
+    const height = Math.min(this.total * ROW_PX, MAX_HEIGHT_PX);
+    return height === 0 ? 0 : Math.floor((this.view.scrollTop / height) * this.total);
+  }
+
+  draw() {
+    const height = Math.min(this.total * ROW_PX, MAX_HEIGHT_PX);
+    this.space.style.height = `${height}px`;
+    const top = height < MAX_HEIGHT_PX ? this.first * ROW_PX : this.view.scrollTop - (this.row() - this.first) * ROW_PX;
+    this.body.style.transform = `translateY(${top}px)`;
+    setText(this.count, `${this.total} rows`);
+    replace(this.body, ...this.rows.map((row) => this.makeRow(row)));
+    this.fill();
+  }
+
+  /** @param {Row} row */
+  makeRow(row) {
+    const open = this.expanded.has(row.path);
+    const mark = row.expandable ? (open ? "▾ " : "▸ ") : "";
+    const name = element("span", { role: "gridcell", class: "name", title: row.path }, mark + row.name);
+    name.style.paddingLeft = `${row.depth * 1.2}rem`;
+    const cells = ["value", "quality", "origin"].map((kind) => element("span", { role: "gridcell", class: kind }));
+    const made = element(
+      "div",
+      { class: "tree-row", role: "row", "data-path": row.path, click: () => this.choose(row), "aria-level": row.depth + 1 },
+      name,
+      ...cells,
+      element("span", { role: "gridcell", class: "dim" }, row.type),
+      element("span", { role: "gridcell", class: "dim", title: row.comment }, row.comment),
+    );
+    if (row.expandable) made.setAttribute("aria-expanded", String(open));
+    made.setAttribute("aria-selected", String(row.path === this.selected));
+    return made;
+  }
+
+  /** @param {Record<string, Value>} values */
+  show(values) {
+    this.values = values;
+    this.fill();
+  }
+
+  /** Write the values into the rows. */
+  fill() {
+    this.rows.forEach((row, index) => {
+      const value = this.values[row.path];
+      const cells = this.body.children[index]?.children;
+      if (value === undefined || cells === undefined) return;
+      const [text, quality, reason, origin] = value;
+      setText(cells[1], text === null ? "no value" : `${text}${row.unit ? ` ${row.unit}` : ""}`);
+      setText(cells[2], reason ? `${quality}: ${reason}` : quality);
+      cells[2].className = `quality ${quality}`;
+      cells[2].setAttribute("title", reason);
+      setText(cells[3], origin);
+      cells[3].className = `origin ${origin}`;
+      if (row.path === this.selected && this.present) setText(this.present, `${text ?? "no value"} (${quality}, ${origin})`);
+    });
+  }
+
+  /** @param {Row} row */
+  choose(row) {
+    this.selected = row.path;
+    if (row.expandable) {
+      this.untouched = false;
+      if (!this.expanded.delete(row.path)) this.expanded.add(row.path);
+      sessionStorage.setItem("expanded", JSON.stringify([...this.expanded].slice(-500)));
+      this.request();
+    } else this.draw();
+    if (row.type !== undefined) this.edit(row);
+  }
+
+  /** @param {Row} row Show the form that writes a register. */
+  edit(row) {
+    const { context } = this;
+    const value = element("input", { type: "text", "aria-label": "New value", placeholder: "5, 1.5, true, 16#FF, T#1s" });
+    this.present = element("span", { class: "dim" });
+    const result = element("output", {});
+    const act = async (/** @type {string} */ name, /** @type {object} */ given) => {
+      setText(result, "…");
+      try {
+        const done = await context.connection.call(`registers.${name}`, given);
+        setText(result, done === null ? "lifted" : [done.outcome, done.reason].filter(Boolean).join(": "));
+        this.request();
+      } catch (error) {
+        setText(result, String(/** @type {Error} */ (error).message));
+      }
+    };
+    const writable = row.writable && context.may("write");
+    const injects = context.may("inject");
+    const reason = row.writable ? "your roles do not allow to write" : "the configuration's writable does not name this register";
+    const write = element("button", { type: "submit", disabled: !writable, title: writable ? "Write to the device" : reason }, "Write");
+    this.detail.onsubmit = () => writable && act("set", { path: row.path, value: value.value });
+    replace(
+      this.detail,
+      element("strong", {}, row.path),
+      this.present,
+      value,
+      write,
+      element(
+        "button",
+        { type: "button", disabled: !injects, title: "Show this value to all consumers until it is lifted", click: () => act("override", { path: row.path, value: value.value }) },
+        "Override",
+      ),
+      element("button", { type: "button", disabled: !injects, click: () => act("lift", { path: row.path }) }, "Lift"),
+      result,
+    );
+    this.fill();
+  }
+
+  /** @param {KeyboardEvent} event */
+  key(event) {
+    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    const at = this.rows.findIndex((row) => row.path === this.selected);
+    const row = this.rows[at];
+    if (step !== undefined) {
+      const next = this.rows[Math.max(0, Math.min(this.rows.length - 1, at + step))];
+      this.selected = next?.path ?? "";
+      this.draw();
+      this.body.querySelector("[aria-selected=true]")?.scrollIntoView({ block: "nearest" });
+    } else if (row && (event.key === "Enter" || (row.expandable && (event.key === "ArrowRight") !== this.expanded.has(row.path) && event.key.startsWith("Arrow")))) {
+      this.choose(row);
+    } else return;
+    event.preventDefault();
+  }
+}

@@ -1,0 +1,10 @@
+"""The tabs of a page: for each the calls that it makes and the data that it follows."""
+
+from typing import Final
+
+from shmio.endpoints.web.page import Tab
+from shmio.endpoints.web.tabs.overview import Overview
+from shmio.endpoints.web.tabs.registers import Registers
+
+TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers)
+"""All tabs, in the order in which a page shows them."""

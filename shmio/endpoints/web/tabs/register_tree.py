@@ -1,0 +1,95 @@
+"""The tree of all registers, of which a page shows a few rows."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from itertools import islice
+from typing import NamedTuple
+
+from shmio.layout.model import Layout, Register
+
+
+class Row(NamedTuple):
+    """One visible row: a source, a structure, a register, or an array's element."""
+
+    path: str
+    name: str
+    depth: int
+    register: Register | None
+    """None for a source or a structure."""
+    expandable: bool
+
+
+class Node:
+    """A source, a structure or a register, and what is below it in the order of the layout."""
+
+    __slots__ = ("children", "name", "path", "register")
+
+    def __init__(self, name: str, path: str, register: Register | None = None) -> None:
+        self.name, self.path, self.register = name, path, register
+        self.children: dict[str, Node] = {}
+
+
+def tree(source: str, layout: Layout) -> Node:
+    """Return the tree of a layout, whose root is the source."""
+    root = Node(source, source)
+    for register in layout.registers:
+        node = root
+        for name in register.path.split("/"):
+            child = node.children.get(name)
+            if child is None:
+                child = node.children[name] = Node(name, f"{node.path}/{name}")
+            node = child
+        node.register = register
+    return root
+
+
+def rows(root: Node, layout: Layout, expanded: Collection[str]) -> Iterator[Row]:
+    """Yield the visible rows of a source, of which nodes with an expanded path show what is below them."""
+    pending = [(root, 0)]
+    while pending:
+        node, depth = pending.pop()
+        array = node.register is not None and bool(node.register.dims)
+        yield Row(node.path, node.name, depth, node.register, array or bool(node.children))
+        if node.path not in expanded:
+            continue
+        if array and node.register is not None:
+            yield from _elements(node, depth + 1, layout, node.register)
+        pending += [(child, depth + 1) for child in reversed(node.children.values())]
+
+
+def matching(root: Node, layout: Layout, text: str) -> Iterator[Row]:
+    """Yield a row for each register whose path or comment contains a text, in any case."""
+    wanted = text.lower()
+    for register in layout.registers:
+        if wanted in register.path.lower() or wanted in register.comment.lower() or wanted in root.name.lower():
+            yield Row(f"{root.path}/{register.path}", register.path, 0, register, expandable=False)
+
+
+def _elements(node: Node, depth: int, layout: Layout, array: Register) -> Iterator[Row]:
+    for index in _indices(array.dims):
+        register = layout.element(array, index)
+        yield Row(
+            f"{root_of(node.path)}/{register.path}", ", ".join(map(str, index)), depth, register, expandable=False
+        )
+
+
+def root_of(path: str) -> str:
+    """Return the source of a path."""
+    return path.partition("/")[0]
+
+
+def _indices(dims: tuple[tuple[int, int], ...]) -> Iterator[tuple[int, ...]]:
+    if not dims:
+        yield ()
+        return
+    for index in range(dims[0][0], dims[0][1] + 1):
+        for rest in _indices(dims[1:]):
+            yield (index, *rest)
+
+
+def window(visible: Iterator[Row], first: int, count: int, most: int) -> tuple[list[Row], int]:
+    """Return ``count`` rows from ``first`` on, and the number of all rows, counted up to ``most``."""
+    skipped = sum(1 for _ in islice(visible, first))
+    chosen = list(islice(visible, count))
+    return chosen, skipped + len(chosen) + sum(1 for _ in islice(visible, max(0, most - skipped - len(chosen))))

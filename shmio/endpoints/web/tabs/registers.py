@@ -1,0 +1,219 @@
+"""The registers tab: a tree of all registers with their values, writes and overrides."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from itertools import chain
+from typing import Annotated, Any, ClassVar, Final
+
+import msgspec
+from msgspec import Meta
+from starlette.concurrency import run_in_threadpool
+
+from shmio.endpoints.web.page import Page, Tab, call
+from shmio.endpoints.web.tabs.register_tree import Node, Row, matching, rows, tree, window
+from shmio.errors import CommandError, PathError, ShmioError
+from shmio.layout.model import MAX_PATH, Register
+from shmio.layout.values.typed import read_value
+from shmio.layout.values.write import bits_of, cover
+from shmio.local.attach import Attachment
+from shmio.local.injection import Shadow
+from shmio.local.reading import reading
+from shmio.model.values import Reading
+from shmio.segment import Block
+
+INTERVAL_S: Final = 0.2
+"""Interval at which changed values of visible rows are sent, in s."""
+MAX_ROWS: Final = 200
+MAX_COUNTED: Final = 2_000_000
+"""Number of visible rows above which they are no longer counted."""
+MAX_EXPANDED: Final = 1000
+MAX_OVERRIDES: Final = 64
+"""Maximum number of registers that one page may override at a time."""
+MAX_TEXT: Final = 200
+"""Number of characters of a value that are shown."""
+_TEXTS: Final = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
+
+_Path = Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
+
+
+class Shown(msgspec.Struct, forbid_unknown_fields=True):
+    """Which rows the page shows."""
+
+    first: Annotated[int, Meta(ge=0, le=MAX_COUNTED)]
+    count: Annotated[int, Meta(ge=0, le=MAX_ROWS)]
+    expanded: Annotated[list[_Path], Meta(max_length=MAX_EXPANDED)] | None = None
+    """Paths of the nodes that show what is below them; None: all sources."""
+    filter: Annotated[str, Meta(max_length=200)] = ""
+
+
+class Given(msgspec.Struct, forbid_unknown_fields=True):
+    """A value that the user has typed, and its register."""
+
+    path: _Path
+    value: Annotated[str, Meta(max_length=32_768)]
+
+
+class Named(msgspec.Struct, forbid_unknown_fields=True):
+    """A register."""
+
+    path: _Path
+
+
+class Registers(Tab):
+    """Shows registers, and writes and overrides them."""
+
+    name: ClassVar[str] = "registers"
+
+    def __init__(self, page: Page) -> None:
+        super().__init__(page)
+        self._cell: Attachment = page.served.cell
+        self._trees: dict[int, Node] = {}
+        self._allowed: dict[int, bytes] = {}
+        self._visible: list[tuple[str, Register]] = []
+        self._sent: dict[str, list[Any]] = {}
+        self._sending: asyncio.Task[None] | None = None
+        self._overrides: dict[str, Shadow] = {}
+
+    def close(self) -> None:
+        """Lift the overrides of this page."""
+        overrides, self._overrides = list(self._overrides.values()), {}
+        if overrides:
+            asyncio.get_running_loop().run_in_executor(None, _lift, overrides)
+
+    @call("read", Shown)
+    async def rows(self, given: Shown) -> dict[str, Any]:
+        """Return rows, and send the values of these rows from now on, whenever they change."""
+        found, total = await run_in_threadpool(self._rows, given)
+        self._visible = [(row.path, row.register) for row in found if row.register is not None]
+        self._sent = {}
+        if self._sending is None:
+            self._sending = self.page.start(self._send())
+        self._send_values()
+        return {"first": given.first, "total": total, "rows": [self._describe(row) for row in found]}
+
+    @call("write", Given)
+    async def set(self, given: Given) -> dict[str, str]:
+        """Write a value; return its outcome."""
+        path, value = self._typed(given)
+        outcome = (await run_in_threadpool(self._cell.set, {path: value}))[0]
+        return {"path": path, "outcome": str(outcome.kind), "reason": outcome.text}
+
+    @call("inject", Given)
+    async def override(self, given: Given) -> dict[str, str]:
+        """Show consumers this value in place of the source's, until it is lifted or the page is closed."""
+        path, value = self._typed(given)
+        shadow = self._overrides.get(path)
+        if shadow is None:
+            if len(self._overrides) >= MAX_OVERRIDES:
+                raise CommandError(f"a page may override at most {MAX_OVERRIDES} registers at a time: lift one first")
+            name = f"page {self.page.user.name}".strip()
+            shadow = await run_in_threadpool(lambda: self._cell.inject(path, name=name))
+            self._overrides[path] = shadow
+        outcome = (await run_in_threadpool(shadow.set, {path: value}))[0]
+        return {"path": path, "outcome": str(outcome.kind), "reason": outcome.text}
+
+    @call("inject", Named)
+    async def lift(self, given: Named) -> None:
+        """End an override of this page."""
+        shadow = self._overrides.pop(given.path, None)
+        if shadow is None:
+            raise PathError(f"{given.path}: this page does not override it; the tab Injections lifts others")
+        await run_in_threadpool(shadow.close)
+
+    def _typed(self, given: Given) -> tuple[str, Any]:
+        block, register = self._cell.resolve(given.path)
+        text = given.value
+        if not register.dims and register.element.base in _TEXTS:
+            text = msgspec.json.encode(text).decode()
+        return f"{block.source}/{register.path}", read_value(text, register)
+
+    def _rows(self, given: Shown) -> tuple[list[Row], int]:
+        blocks = self.page.served.segment.blocks
+        expanded = frozenset(blocks if given.expanded is None else given.expanded)
+        visible: Iterator[Row] = chain.from_iterable(
+            matching(self._tree(block), block.layout, given.filter)
+            if given.filter
+            else rows(self._tree(block), block.layout, expanded)
+            for block in blocks.values()
+        )
+        return window(visible, given.first, given.count, MAX_COUNTED)
+
+    def _tree(self, block: Block) -> Node:
+        node = self._trees.get(block.section)
+        if node is None:
+            node = self._trees[block.section] = tree(block.source, block.layout)
+        return node
+
+    def _describe(self, row: Row) -> dict[str, Any]:
+        described: dict[str, Any] = {
+            "path": row.path,
+            "name": row.name,
+            "depth": row.depth,
+            "expandable": row.expandable,
+        }
+        if row.register is not None:
+            register = row.register
+            bounds = "".join(f"[{low}..{high}]" for low, high in register.dims)
+            described |= {
+                "type": f"{register.type}{bounds}",
+                "unit": register.unit,
+                "comment": register.comment,
+                "writable": self._writable(row.path, register),
+                "overridden": row.path in self._overrides,
+            }
+        return described
+
+    def _writable(self, path: str, register: Register) -> bool:
+        """Return whether the configuration allows to write all of a register."""
+        block = self.page.served.segment.blocks.get(path.partition("/")[0])
+        if block is None:
+            return False
+        allowed = self._allowed.get(block.section)
+        if allowed is None:
+            allowed = self._allowed[block.section] = cover(block.layout, block.attributes.writable)
+        share = allowed[register.offset : register.offset + register.size]
+        return not any(bits & ~covered for bits, covered in zip(bits_of(register), share, strict=True))
+
+    async def _send(self) -> None:
+        while True:
+            await asyncio.sleep(INTERVAL_S)
+            self._send_values()
+
+    def _send_values(self) -> None:
+        """Send the values of all visible rows, if one has changed.
+
+        All of them, because a message that the page has not taken is replaced by the next.
+        """
+        blocks = self.page.served.segment.blocks
+        frames = {source: block.latest() for source, block in blocks.items()}
+        values: dict[str, list[Any]] = {}
+        for path, register in self._visible:
+            source = path.partition("/")[0]
+            if source in blocks:
+                values[path] = _value(reading(blocks[source], register, frames[source]))
+        if values != self._sent:
+            self._sent = values
+            self.page.push("registers", values)
+
+
+def _value(found: Reading) -> list[Any]:
+    """Return what a row shows: value as text, quality, reason, provenance, source time."""
+    text = None if found.value is None else _text(found.value)
+    return [text, str(found.quality), found.reason, found.provenance, found.source_time]
+
+
+def _text(value: Any) -> str:
+    """Return a value as text: JavaScript has no exact numbers above 2**53, and JSON no infinity."""
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…"
+
+
+def _lift(overrides: list[Shadow]) -> None:
+    for shadow in overrides:
+        try:
+            shadow.close()
+        except ShmioError:
+            continue

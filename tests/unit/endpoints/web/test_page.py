@@ -1,0 +1,190 @@
+"""The web page over real sockets, used as a browser uses it."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.sync.connection import Connection
+
+from shmio.config import Address
+from shmio.config.credentials import Secret, digest
+from shmio.endpoints.web import app, page
+from shmio.endpoints.web.app import PageApp
+from shmio.endpoints.web.measurements import Measurements
+from shmio.endpoints.web.served import Served
+from shmio.endpoints.web.server import MAX_MESSAGE_BYTES, HttpServer
+from shmio.endpoints.web.sessions import COOKIE, Sessions
+from shmio.endpoints.web.tabs import TABS
+from shmio.local.attach import Attachment
+from shmio.segment import Segment
+from tests.unit.endpoints.web.harness import TIMEOUT_S
+
+TOKEN = "a-token-of-thirty-two-characters"
+SECRETS = (Secret("ann", frozenset({"read"}), digest(TOKEN.encode())),)
+
+
+class Pages:
+    """A server of the page, and a browser's requests to it."""
+
+    def __init__(self, server: HttpServer) -> None:
+        self.port = server.port
+
+    def request(
+        self, method: str, path: str, body: str | None = None, **headers: str
+    ) -> tuple[int, http.client.HTTPMessage, str]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_S)
+        try:
+            connection.request(method, path, body, headers)
+            answer = connection.getresponse()
+            return answer.status, answer.headers, answer.read().decode()
+        finally:
+            connection.close()
+
+    def open(self, cookie: str | None = None, **more: Any) -> ClientConnection:
+        headers = {} if cookie is None else {"Cookie": f"{COOKIE}={cookie}"}
+        return connect(f"ws://127.0.0.1:{self.port}/socket", additional_headers=headers, open_timeout=TIMEOUT_S, **more)
+
+
+@contextmanager
+def pages(segment: Segment, secrets: Sequence[Secret] = (), roles: Sequence[str] = ("read",)) -> Iterator[Pages]:
+    """Serve the page of a segment on a free port."""
+    measurements = Measurements(segment)
+    with Segment.open(segment.instance, writable=True) as mapped:
+        shown = Served(segment, Attachment(mapped), measurements, {})
+        served = PageApp(shown, Sessions(secrets, roles), TABS, secure=False)
+        server = HttpServer(served.app(measurements, ()), Address("127.0.0.1", 0), sockets=True)
+        loop = asyncio.new_event_loop()
+        thread = threading.Thread(target=loop.run_forever)
+        thread.start()
+        try:
+            asyncio.run_coroutine_threadsafe(server.start(), loop).result(TIMEOUT_S)
+            yield Pages(server)
+        finally:
+            asyncio.run_coroutine_threadsafe(server.stop(), loop).result(TIMEOUT_S)
+            loop.call_soon_threadsafe(loop.stop)
+            thread.join()
+            loop.close()
+
+
+def said(browser: Connection, call: str, **given: Any) -> dict[str, Any]:
+    """Make a call, and return its answer."""
+    browser.send(json.dumps({"id": 7, "call": call, "with": given}))
+    while (message := json.loads(browser.recv(TIMEOUT_S))).get("id") != 7:
+        pass
+    return dict(message)
+
+
+def test_page_and_its_files_come_from_this_server_alone(segment: Segment) -> None:
+    with pages(segment) as server:
+        for path, kind in (("/", "text/html"), ("/main.js", "text/javascript"), ("/style.css", "text/css")):
+            status, headers, text = server.request("GET", path)
+            assert (status, headers["content-type"]) == (200, f"{kind}; charset=utf-8")
+            assert "script-src 'self'" in headers["content-security-policy"]
+            assert "http:" not in text
+        assert server.request("GET", "/../app.py")[0] == 404
+        assert server.request("GET", "/metrics")[0] == 200
+
+
+def test_overview_comes_unasked(segment: Segment) -> None:
+    with pages(segment) as server, server.open() as browser:
+        assert said(browser, "overview.follow") == {"id": 7, "result": None}
+        for _ in range(2):
+            message = json.loads(browser.recv(TIMEOUT_S))
+            assert (message["topic"], message["data"]["instance"]) == ("overview", segment.instance)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:{port}"])
+def test_pages_of_other_servers_get_nothing(segment: Segment, origin: str) -> None:
+    with pages(segment, SECRETS) as server:
+        origin = origin.format(port=server.port)
+        with pytest.raises(InvalidStatus) as refused:
+            server.open(origin=origin)
+        assert refused.value.response.status_code == 403
+        body = json.dumps({"token": TOKEN})
+        assert server.request("POST", "/session", body, Origin=origin)[0] == 403
+        assert server.request("DELETE", "/session", Origin=origin)[0] == 403
+        own = f"http://127.0.0.1:{server.port}"
+        assert server.request("POST", "/session", body, Origin=own)[0] == 200
+
+
+def test_name_of_another_host_gets_nothing(segment: Segment) -> None:
+    with pages(segment) as server:
+        assert server.request("GET", "/", Host="evil.example")[0] == 421
+        with pytest.raises(InvalidStatus):
+            connect("ws://evil.example/socket", sock=socket.create_connection(("127.0.0.1", server.port)))
+
+
+def test_token_opens_the_page_until_the_user_signs_out(segment: Segment) -> None:
+    with pages(segment, SECRETS, roles=()) as server:
+        with pytest.raises(InvalidStatus):
+            server.open()
+        assert server.request("POST", "/session", json.dumps({"token": "wrong"}))[0] == 403
+        status, headers, text = server.request("POST", "/session", json.dumps({"token": TOKEN}))
+        assert (status, json.loads(text)["name"], json.loads(text)["roles"]) == (200, "ann", ["read"])
+        cookie = headers["set-cookie"]
+        assert "HttpOnly" in cookie
+        assert "SameSite=strict" in cookie
+        value = cookie.partition(";")[0].partition("=")[2]
+        with server.open(value) as browser:
+            assert said(browser, "overview.follow")["result"] is None
+        assert server.request("DELETE", "/session", Cookie=f"{COOKIE}={value}")[0] == 200
+        with pytest.raises(InvalidStatus):
+            server.open(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("{", "malformed"),
+        ('{"id": 7, "call": "nothing"}', "there is no call 'nothing'"),
+        ('{"id": 7, "call": "overview.follow", "with": {"x": 1}}', "malformed"),
+        (f'{{"id": 7, "call": {"[" * 5000}', "malformed"),
+    ],
+)
+def test_wrong_call_is_answered(segment: Segment, text: str, error: str) -> None:
+    with pages(segment) as server, server.open() as browser:
+        browser.send(text)
+        assert error in json.loads(browser.recv(TIMEOUT_S))["error"]
+        assert said(browser, "overview.follow")["result"] is None
+
+
+def test_role_is_needed(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    call = page.Call("control", page.Nothing, TABS[0].calls["overview.follow"].function)
+    monkeypatch.setattr(TABS[0], "calls", {"overview.follow": call})
+    with pages(segment) as server, server.open() as browser:
+        assert "needs the role control" in said(browser, "overview.follow")["error"]
+
+
+def test_large_message_ends_only_its_own_page(segment: Segment) -> None:
+    with pages(segment) as server, server.open() as other:
+        with server.open() as browser:
+            browser.send("x" * (MAX_MESSAGE_BYTES + 1))
+            with pytest.raises(ConnectionClosed):
+                browser.recv(TIMEOUT_S)
+        assert said(other, "overview.follow")["result"] is None
+
+
+def test_number_of_pages_is_bounded_and_silent_ones_are_closed(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "MAX_PAGES", 1)
+    monkeypatch.setattr(page, "FIRST_CALL_S", 0.2)
+    with pages(segment) as server, server.open() as silent:
+        with pytest.raises(InvalidStatus):
+            server.open()
+        with pytest.raises(ConnectionClosed) as closed:
+            silent.recv(TIMEOUT_S)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1008
+        with server.open() as browser:
+            assert said(browser, "overview.follow")["result"] is None

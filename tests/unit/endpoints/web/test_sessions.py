@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from shmio.config.credentials import Secret, digest
+from shmio.endpoints.web import sessions
+from shmio.endpoints.web.sessions import Sessions
+
+TOKEN = "a-token-of-thirty-two-characters"
+SECRETS = (Secret("ann", frozenset({"read", "write"}), digest(TOKEN.encode())),)
+
+
+class Clock:
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_token_opens_a_session_that_ends() -> None:
+    clock = Clock()
+    users = Sessions(SECRETS, ["read"], clock)
+    opened = users.open(f"{TOKEN}\n", "10.0.0.1")
+    assert opened is not None
+    cookie, user = opened
+    assert (user.name, user.listed_roles) == ("ann", ["read", "write"])
+    assert users.user(cookie, "10.0.0.1") == user
+    clock.now_s = sessions.MAX_AGE_S - 1
+    assert users.user(cookie, "10.0.0.1") == user
+    clock.now_s += 1
+    assert users.user(cookie, "10.0.0.1").name == ""
+    assert users.user(None, "10.0.0.1").listed_roles == ["read"]
+
+
+def test_stolen_cookie_is_worth_nothing_elsewhere() -> None:
+    users = Sessions(SECRETS, [])
+    opened = users.open(TOKEN, "10.0.0.1")
+    assert opened is not None
+    assert users.user(opened[0], "10.0.0.2").roles == frozenset()
+    users.close(opened[0])
+    assert users.user(opened[0], "10.0.0.1").roles == frozenset()
+
+
+def test_wrong_tokens_are_limited_for_each_host() -> None:
+    clock = Clock()
+    users = Sessions(SECRETS, [], clock)
+    for _ in range(sessions.ATTEMPTS):
+        assert not users.blocked("10.0.0.1")
+        assert users.open("wrong", "10.0.0.1") is None
+    assert users.blocked("10.0.0.1")
+    assert not users.blocked("10.0.0.2")
+    clock.now_s = sessions.ATTEMPTS_S
+    assert not users.blocked("10.0.0.1")
+
+
+def test_number_of_sessions_is_bounded() -> None:
+    users = Sessions(SECRETS, [])
+    opened = [users.open(TOKEN, "10.0.0.1") for _ in range(sessions.MAX_SESSIONS + 1)]
+    names = [users.user(one[0], "10.0.0.1").name for one in opened if one is not None]
+    assert names == ["", *["ann"] * sessions.MAX_SESSIONS]
