@@ -2,8 +2,8 @@
 
 A page sends calls as JSON text, ``{"id": 7, "call": "registers.rows", "with": {…}}``. The answer is
 ``{"id": 7, "result": …}`` or ``{"id": 7, "error": "…"}``. Data that a page follows comes unasked, as
-``{"topic": "overview", "data": …}``, or as binary messages for plots. docs/reference/web-page.md
-describes all of them.
+``{"topic": "overview", "data": …}``, or as binary messages for plots (``signals.py``). The classes in
+``tabs/`` have the calls.
 
 Nothing waits for a page. Of data that is not sent yet, newer data replaces older data.
 """

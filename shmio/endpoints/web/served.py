@@ -13,6 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from shmio.endpoints.web.measurements import Measurements
+from shmio.endpoints.web.signals import Feeds
 from shmio.local.attach import Attachment
 from shmio.local.status import SourceStatus, status_of
 from shmio.segment import Segment
@@ -57,6 +58,8 @@ class Served:
         """
         self.segment, self.cell, self.measurements, self.folders = segment, cell, measurements, folders
         self.config_file = config_file
+        self.feeds = Feeds()
+        """What pages plot."""
         self._overview: dict[str, Any] = {}
         self._overview_s = -OVERVIEW_S
         self._usages: dict[int, _Usage] = {}

@@ -3,6 +3,7 @@
 import { Connection } from "./connection.js";
 import { byId, element, replace, setText } from "./dom.js";
 import { OverviewTab } from "./overview.js";
+import { PlotsTab, plot } from "./plots.js";
 import { RegistersTab } from "./registers.js";
 import { session, signIn, signOut } from "./session.js";
 
@@ -16,6 +17,7 @@ import { session, signIn, signOut } from "./session.js";
 const TABS = {
   overview: { title: "Overview", make: (context) => new OverviewTab(context) },
   registers: { title: "Registers", make: (context) => new RegistersTab(context) },
+  plots: { title: "Plots", make: (context) => new PlotsTab(context) },
 };
 
 const connection = new Connection();
@@ -45,6 +47,12 @@ function makeTabs() {
     element("button", { type: "button", role: "tab", id: `tab-${name}`, click: () => context.show(name) }, title),
   );
   byId("tabs").replaceChildren(...buttons);
+  byId("tab-plots").addEventListener("dragover", (event) => event.preventDefault());
+  byId("tab-plots").addEventListener("drop", (event) => {
+    event.preventDefault();
+    const path = event.dataTransfer?.getData("text/plain");
+    if (path) plot(path);
+  });
   byId("tabs").addEventListener("keydown", (event) => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     const at = buttons.findIndex((button) => button === document.activeElement);

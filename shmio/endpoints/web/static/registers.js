@@ -1,6 +1,7 @@
 // The registers tab: a virtual table of the tree of all registers. The server sends only the visible rows.
 
 import { element, notify, replace, setText } from "./dom.js";
+import { plot } from "./plots.js";
 
 /** @typedef {import("./main.js").Context} Context */
 /**
@@ -139,6 +140,10 @@ export class RegistersTab {
       element("span", { role: "gridcell", class: "dim", title: row.comment }, row.comment),
     );
     if (row.expandable) made.setAttribute("aria-expanded", String(open));
+    if (row.type !== undefined) {
+      made.draggable = true;
+      made.addEventListener("dragstart", (event) => event.dataTransfer?.setData("text/plain", row.path));
+    }
     made.setAttribute("aria-selected", String(row.path === this.selected));
     return made;
   }
@@ -211,6 +216,7 @@ export class RegistersTab {
         "Override",
       ),
       element("button", { type: "button", disabled: !injects, click: () => act("lift", { path: row.path }) }, "Lift"),
+      element("button", { type: "button", click: () => plot(row.path) }, "Plot"),
       result,
     );
     this.fill();

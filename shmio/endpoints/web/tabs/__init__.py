@@ -4,7 +4,8 @@ from typing import Final
 
 from shmio.endpoints.web.page import Tab
 from shmio.endpoints.web.tabs.overview import Overview
+from shmio.endpoints.web.tabs.plots import Plots
 from shmio.endpoints.web.tabs.registers import Registers
 
-TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers)
+TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers, Plots)
 """All tabs, in the order in which a page shows them."""

@@ -1,0 +1,294 @@
+"""The course of registers over time, for plots. What several pages plot is packed once.
+
+A batch is a binary message with the frames of one feed, little-endian: the feed's number (uint32),
+the number of frames (uint32), and the time of the frame before them (float64), NaN after a gap.
+Then follow as float64 the times of the frames, and for each register its values, NaN where the
+quality is bad; then for each register a byte for each frame, its provenance. Times are in s, UTC.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import struct
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, islice
+from typing import Any, Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from starlette.concurrency import run_in_threadpool
+
+from shmio.errors import PathError
+from shmio.layout.model import Layout, Register
+from shmio.layout.values.frame_codec import FrameCodec
+from shmio.local.reading import status_of
+from shmio.model.values import Provenance, Quality
+from shmio.segment import Block
+from shmio.segment.block import Frame
+
+INTERVAL_S: Final = 0.04
+"""Interval at which new frames are packed and sent, in s. A page redraws as often."""
+HISTORY_S: Final = 8.0
+"""Time in s before a feed's start, from which the feed sends the frames that the ring still has."""
+MAX_HISTORY: Final = 2_000
+"""Maximum number of these frames. If there are more, they are taken at equal distances."""
+MAX_BEHIND: Final = 500
+"""Maximum number of unread frames. If there are more, this process was too slow: the older ones become a gap."""
+MAX_BATCH_BYTES: Final = 256 << 10
+"""Maximum size of the values and marks of a batch."""
+MAX_IMAGE_BYTES: Final = 32 << 20
+"""Maximum size of the images from which a batch is made."""
+LEAST_GAP_NS: Final = 100_000_000
+"""Time without frames that is a gap, unless the source's period or its stale time is longer."""
+_HEAD: Final = struct.Struct("<IId")
+_MILLISECOND: Final = np.timedelta64(1, "ms")
+
+_log = logging.getLogger("shmio.web")
+
+
+class Follower(Protocol):
+    """Who follows a feed."""
+
+    def take(self, batch: bytes) -> None:
+        """Take a batch. It may be dropped."""
+
+    def end(self, number: int) -> None:
+        """Learn that a feed has ended, because a reload has replaced its source."""
+
+
+class Feed:
+    """Some registers of one source, frame by frame. Use it in the event loop's thread only."""
+
+    def __init__(self, number: int, block: Block, registers: Sequence[Register], utc_ns: int) -> None:
+        """Start with the next frame.
+
+        Args:
+            number: The feed's number, which its batches carry.
+            block: The source's block.
+            registers: The registers; :func:`check_plottable` accepts each of them.
+            utc_ns: UTC minus the time of CLOCK_MONOTONIC, in ns.
+
+        """
+        self.number, self.block, self.registers = number, block, tuple(registers)
+        self.followers: set[Follower] = set()
+        layout = block.layout
+        self._codec = FrameCodec(Layout("", None, layout.size, False, self.registers, layout.byte_order))
+        self._cursor = block.cursor()
+        self._live = _Packer(self, block.read(self.last) if self.last else None)
+        self._utc_ns = utc_ns
+
+    def history(self, last: int) -> tuple[list[bytes], Frame | None]:
+        """Return the batches of the frames before the feed's start, and the last of these frames.
+
+        It may run in another thread.
+
+        Args:
+            last: Number of the last frame before the start.
+
+        """
+        block = self.block
+        count = min(block.ring.slot_count - 1, last, math.ceil(HISTORY_S * 1e9 / block.period_ns))
+        step = max(1, math.ceil(count / MAX_HISTORY))
+        packer = _Packer(self, None, step)
+        numbers = range(last - (count - 1) // step * step, last + 1, step)
+        return list(packer.batches(filter(None, map(block.read, numbers)))), packer.before
+
+    def between(self, before: Frame | None, first: int, last: int) -> list[bytes]:
+        """Return the batches of the frames with the numbers from ``first`` to ``last``."""
+        return list(_Packer(self, before).batches(filter(None, map(self.block.read, range(first, last + 1)))))
+
+    @property
+    def last(self) -> int:
+        """Number of the last frame that was sent to all followers."""
+        return self._cursor.last
+
+    def send(self) -> None:
+        """Send new frames to all followers."""
+        batches = self.read()
+        for follower in tuple(self.followers):
+            for batch in batches:
+                follower.take(batch)
+
+    def read(self) -> list[bytes]:
+        """Return batches of the frames that are new since the last call."""
+        cursor = self._cursor
+        if cursor.behind > MAX_BEHIND:
+            cursor.resume(after=cursor.last + cursor.behind - MAX_BEHIND)
+        return list(self._live.batches(islice(iter(cursor.poll, None), MAX_BEHIND)))
+
+    def pack(self, before: Frame | None, frames: Sequence[Frame]) -> bytes:
+        """Return a batch.
+
+        Args:
+            before: The frame before these; None after a gap.
+            frames: The frames.
+
+        """
+        rows = len(frames)
+        decoded = self._codec.decode(b"".join(frame.image for frame in frames))
+        raw = decoded
+        if any(frame.effective is not None for frame in frames):
+            raw = self._codec.decode(b"".join(frame.raw for frame in frames))
+            standing = [one for one in self.block.standing.read() if one.direction == "out"]
+        columns = np.empty((1 + len(self.registers), rows), "<f8")
+        columns[0] = [self._utc_s(frame) for frame in frames]
+        marks = np.empty((len(self.registers), rows), np.uint8)
+        marks[:] = [frame.provenance for frame in frames]
+        bad = np.array([frame.quality is Quality.BAD or not frame.source_ns for frame in frames])
+        for index, register in enumerate(self.registers):
+            values = decoded[register.path]
+            columns[1 + index] = _numbers(values)
+            columns[1 + index][bad | self._bad(register, frames)] = math.nan
+            if raw is not decoded:
+                original = raw[register.path]
+                altered = (values != original) & ((values == values) | (original == original))  # noqa: PLR0124  not both NaN
+                if any(one.covers(register) for one in standing):
+                    altered |= np.array([frame.effective is not None for frame in frames])
+                marks[index][altered] = Provenance.INJECTED
+        head = _HEAD.pack(self.number, rows, math.nan if before is None else self._utc_s(before))
+        return head + columns.tobytes() + marks.tobytes()
+
+    def _utc_s(self, frame: Frame) -> float:
+        return (frame.publish_ns + self._utc_ns) / 1e9
+
+    def _bad(self, register: Register, frames: Sequence[Frame]) -> npt.NDArray[np.bool_] | bool:
+        """Return in which frames the source calls a register bad."""
+        if self.block.statuses is None:
+            return False
+        statuses = (status_of(self.block, register, frame) for frame in frames)
+        return np.array([status is not None and status.quality is Quality.BAD for status in statuses])
+
+
+class _Packer:
+    """Splits a feed's frames into batches: at gaps, and where a batch has become large."""
+
+    def __init__(self, feed: Feed, before: Frame | None = None, step: int = 1) -> None:
+        """Start.
+
+        Args:
+            feed: The feed.
+            before: The frame before the first; None after a gap.
+            step: Distance between the numbers of two frames.
+
+        """
+        self.before = before
+        """The last frame that was packed; None at the start and after a gap."""
+        self._feed, self._step = feed, step
+        block = feed.block
+        self._gap_ns = max(block.stale_ns, 3 * step * block.period_ns, LEAST_GAP_NS)
+        self._most = max(
+            1, min(MAX_BATCH_BYTES // (9 * len(feed.registers)), MAX_IMAGE_BYTES // max(1, block.layout.size))
+        )
+
+    def batches(self, frames: Iterable[Frame]) -> Iterator[bytes]:
+        """Yield the batches of frames."""
+        start = self.before
+        waiting: list[Frame] = []
+        for frame in frames:
+            gap = self.before is not None and (
+                frame.number != self.before.number + self._step
+                or frame.publish_ns - self.before.publish_ns > self._gap_ns
+            )
+            if waiting and (gap or len(waiting) == self._most):
+                yield self._feed.pack(start, waiting)
+                start, waiting = self.before, []
+            if gap:
+                start = None
+            waiting.append(frame)
+            self.before = frame
+        if waiting:
+            yield self._feed.pack(start, waiting)
+
+
+class Feeds:
+    """All feeds that pages follow. Use it in the event loop's thread only."""
+
+    def __init__(self) -> None:
+        self._feeds: dict[tuple[int, tuple[str, ...]], Feed] = {}
+        self._number = 0
+        self._utc_ns = time.time_ns() - time.monotonic_ns()  # one for all feeds: a frame has the same time in each
+        self._task: asyncio.Task[None] | None = None
+
+    async def follow(self, block: Block, registers: Sequence[Register], follower: Follower) -> Feed:
+        """Send a follower the frames of the last seconds, and from then on all new frames.
+
+        Args:
+            block: The source's block.
+            registers: The registers.
+            follower: Who follows.
+
+        """
+        key = (block.section, tuple(register.path for register in registers))
+        feed = self._feeds.get(key)
+        if feed is None:
+            self._number += 1
+            feed = self._feeds[key] = Feed(self._number, block, registers, self._utc_ns)
+        last = feed.last
+        batches, before = await run_in_threadpool(feed.history, last)
+        self._feeds[key] = feed  # it may have been removed, because nobody followed it yet
+        feed.send()
+        for batch in chain(batches, feed.between(before, last + 1, feed.last)):
+            follower.take(batch)
+        feed.followers.add(follower)
+        if self._task is None:
+            self._task = asyncio.get_running_loop().create_task(self._send())
+        return feed
+
+    def leave(self, feed: Feed, follower: Follower) -> None:
+        """End that a follower follows a feed."""
+        feed.followers.discard(follower)
+        if self._task is not None and not any(feed.followers for feed in self._feeds.values()):
+            self._task.cancel()
+            self._task = None
+            self._feeds.clear()
+
+    async def _send(self) -> None:
+        """Send new frames at intervals, while pages follow any."""
+        while True:
+            await asyncio.sleep(INTERVAL_S)
+            for key, feed in list(self._feeds.items()):
+                if not feed.followers:
+                    del self._feeds[key]
+                elif not _sent(feed):
+                    del self._feeds[key]
+                    for follower in tuple(feed.followers):
+                        follower.end(feed.number)
+                        self.leave(feed, follower)
+
+
+def _sent(feed: Feed) -> bool:
+    """Send a feed's new frames; return False if the feed has ended."""
+    try:
+        retired = feed.block.retired  # before the frames are read: nothing is published after the end
+        feed.send()
+    except Exception:  # noqa: BLE001  the feeds of other sources go on
+        _log.exception("a plot of %s ends", feed.block.source)
+        return False
+    return not retired
+
+
+def check_plottable(register: Register) -> None:
+    """Raise PathError unless a register is one number, BOOL or duration."""
+    kind = np.dtype(_kind(register)).kind
+    if register.dims:
+        raise PathError(f"{register.path}: this is an array; plot one element, such as {_first(register)}")
+    if kind not in "?biufm":
+        raise PathError(f"{register.path}: {register.type} is no number, so it cannot be plotted")
+
+
+def _kind(register: Register) -> Any:
+    codec = FrameCodec(Layout("", None, register.offset + register.size, False, (register,), "big"))
+    return codec.dtype[0].base
+
+
+def _first(register: Register) -> str:
+    return f"{register.path}[{','.join(str(low) for low, _ in register.dims)}]"
+
+
+def _numbers(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Return values as numbers; durations in ms."""
+    found: npt.NDArray[np.float64] = values / _MILLISECOND if values.dtype.kind == "m" else values.astype(np.float64)
+    return found

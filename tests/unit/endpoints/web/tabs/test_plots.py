@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from websockets.sync.connection import Connection
+
+from shmio.endpoints.web import signals
+from shmio.endpoints.web.tabs import plots
+from shmio.segment import BlockWriter, Provenance, Quality, Segment
+from tests.unit.endpoints.harness import LAYOUT
+from tests.unit.endpoints.web.harness import TIMEOUT_S
+from tests.unit.endpoints.web.test_page import Pages, pages, said
+
+POSITION = "cell/axis/position"
+
+
+@dataclass
+class Batch:
+    number: int
+    before: float
+    times: list[float]
+    values: list[list[float]]
+    marks: list[list[int]]
+
+
+def decoded(message: bytes, registers: int) -> Batch:
+    number, rows, before = struct.unpack_from("<IId", message)
+    columns = struct.unpack_from(f"<{(1 + registers) * rows}d", message, 16)
+    marks = message[16 + 8 * len(columns) :]
+    assert len(marks) == registers * rows
+    cut = [list(columns[rows * index : rows * (index + 1)]) for index in range(1 + registers)]
+    return Batch(number, before, cut[0], cut[1:], [list(marks[rows * i : rows * (i + 1)]) for i in range(registers)])
+
+
+def batches(browser: Connection, registers: int = 1) -> Iterator[Batch]:
+    """Yield the batches that a page receives."""
+    while True:
+        message = browser.recv(TIMEOUT_S)
+        if isinstance(message, bytes):
+            yield decoded(message, registers)
+
+
+def course(browser: Connection, count: int, registers: int = 1) -> tuple[list[float], list[list[float]], list[int]]:
+    """Return a number of samples: their times, values and the marks of the first register; a gap is a NaN."""
+    times: list[float] = []
+    values: list[list[float]] = [[] for _ in range(registers)]
+    marks: list[int] = []
+    for batch in batches(browser, registers):
+        if times and batch.before != times[-1]:
+            times.append(math.nan)
+        times += batch.times
+        marks += batch.marks[0]
+        for column, new in zip(values, batch.values, strict=True):
+            column.extend(new)
+        if len(marks) >= count:
+            return times, values, marks
+    raise AssertionError
+
+
+def image(position: float) -> bytes:
+    return struct.pack(">f", position) + bytes(LAYOUT.size - 4)
+
+
+def publish(writer: BlockWriter, positions: Sequence[float], first: int = 1, **more: Any) -> None:
+    for cycle, position in enumerate(positions, first):
+        writer.publish(image(position), cycle=cycle, **({"quality": Quality.GOOD} | more))
+
+
+def follow(server: Pages, browser: Connection, *paths: str) -> dict[str, Any]:
+    return dict(said(browser, "plots.follow", source="cell", paths=paths)["result"])
+
+
+def test_course_has_the_past_and_each_new_frame(segment: Segment) -> None:
+    writer = segment.writer("cell")
+    publish(writer, [1, 2, 3])
+    with pages(segment) as server, server.open() as browser:
+        found = follow(server, browser, POSITION, "cell/step")
+        assert [signal["path"] for signal in found["signals"]] == [POSITION, "cell/step"]
+        publish(writer, range(4, 401), 4)
+        times, values, marks = course(browser, 400, 2)
+        assert not any(map(math.isnan, times))  # no gap
+        assert values[0] == list(range(1, 401))
+        assert values[1] == [0] * 400
+        assert times == sorted(times)
+        assert set(marks) == {Provenance.LIVE}
+
+
+def test_second_page_gets_the_past_and_then_the_same(segment: Segment) -> None:
+    writer = segment.writer("cell")
+    with pages(segment) as server, server.open() as one, server.open() as two:
+        number = follow(server, one, POSITION)["number"]
+        publish(writer, [1, 2])
+        assert course(one, 2)[1] == [[1, 2]]
+        assert follow(server, two, POSITION)["number"] == number
+        publish(writer, [3], 3)
+        assert course(one, 1)[1] == [[3]]
+        assert course(two, 3)[1] == [[1, 2, 3]]
+
+
+def test_bad_quality_is_a_gap_and_provenance_a_mark(segment: Segment) -> None:
+    writer = segment.writer("cell")
+    publish(writer, [1])
+    publish(writer, [1], 2, quality=Quality.BAD, reason="a test")
+    publish(writer, [2], 3, provenance=Provenance.SIMULATED)
+    with pages(segment) as server, server.open() as browser:
+        follow(server, browser, POSITION)
+        _, values, marks = course(browser, 3)
+        assert [values[0][0], values[0][2]] == [1, 2]
+        assert math.isnan(values[0][1])
+        assert marks == [Provenance.LIVE, Provenance.LIVE, Provenance.SIMULATED]
+
+
+def test_altered_values_are_marked_and_others_are_not(segment: Segment) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(1), cycle=1, effective=image(5), quality=Quality.GOOD)
+    with pages(segment) as server, server.open() as browser:
+        follow(server, browser, POSITION, "cell/step")
+        batch = next(batches(browser, 2))
+        assert batch.values == [[5], [0]]
+        assert batch.marks == [[Provenance.INJECTED], [Provenance.LIVE]]
+
+
+def test_frames_that_are_skipped_are_a_gap(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signals, "MAX_BEHIND", 5)
+    block = segment.blocks["cell"]
+    feed = signals.Feed(7, block, [block.layout.registers[0]], 0)
+    writer = segment.writer("cell")
+    publish(writer, [1])
+    (first,) = feed.read()
+    publish(writer, range(2, 40), 2)
+    (second,) = feed.read()
+    publish(writer, [40], 40)
+    (third,) = feed.read()
+    assert decoded(first, 1).values == [[1]]
+    assert decoded(second, 1).values == [[35, 36, 37, 38, 39]]
+    assert math.isnan(decoded(second, 1).before)
+    assert decoded(third, 1).before == decoded(second, 1).times[-1]
+
+
+def test_long_past_comes_at_equal_distances(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signals, "MAX_HISTORY", 10)
+    writer = segment.writer("cell")
+    publish(writer, range(1, 301))
+    with pages(segment) as server, server.open() as browser:
+        follow(server, browser, POSITION)
+        found = course(browser, 7)[1][0]
+        assert found[-1] == 300
+        assert len(found) <= 10
+        assert len({later - earlier for earlier, later in pairwise(found)}) == 1
+
+
+def test_empty_list_ends_the_course(segment: Segment) -> None:
+    writer = segment.writer("cell")
+    with pages(segment) as server, server.open() as browser:
+        follow(server, browser, POSITION)
+        assert said(browser, "plots.follow", source="cell", paths=[])["result"] is None
+        publish(writer, [1])
+        follow(server, browser, "cell/step")
+        assert next(batches(browser)).values == [[0]]
+
+
+def test_reload_of_the_source_tells_the_page(segment: Segment) -> None:
+    publish(segment.writer("cell"), [1])
+    with pages(segment) as server, server.open() as browser:
+        follow(server, browser, POSITION)
+        segment.change(retire=["cell"])
+        while True:
+            message = browser.recv(TIMEOUT_S)
+            if isinstance(message, str) and json.loads(message).get("topic") == "plots":
+                assert json.loads(message)["data"] == []
+                return
+
+
+@pytest.mark.parametrize(
+    ("paths", "error"),
+    [
+        (["cell/nothing"], "nothing"),
+        (["cell/long"], "array"),
+        (["other/x"], "other"),
+        (["x"] * 201, "malformed"),
+    ],
+)
+def test_wrong_request_is_answered(segment: Segment, paths: list[str], error: str) -> None:
+    with pages(segment) as server, server.open() as browser:
+        assert error in said(browser, "plots.follow", source="cell", paths=paths)["error"]
+
+
+def test_number_of_registers_is_bounded(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plots, "MAX_SIGNALS", 1)
+    with pages(segment) as server, server.open() as browser:
+        assert "at most 1" in said(browser, "plots.follow", source="cell", paths=[POSITION, "cell/step"])["error"]
