@@ -148,7 +148,7 @@ def exposure(config: Config) -> str | None:
 
     None if nothing.
     """
-    ways = [*_open_grpc(config), *_open_mqtt(config), *_open_opcua(config)]
+    ways = [*_open_grpc(config), *_open_mqtt(config), *_open_opcua(config), *_open_web(config)]
     users = other_users() if ways else []
     if not users:
         return None
@@ -209,6 +209,13 @@ def _open_opcua(config: Config) -> Iterator[str]:
     given = opcua.anonymous if opcua.anonymous is not None else [] if guarded else ROLES
     if roles := [role for role in given if role != "read"]:
         yield f"{_joined(roles)} by OPC UA at {opcua.listen}"
+
+
+def _open_web(config: Config) -> Iterator[str]:
+    """Yield texts that say what users without a token may do on the web page."""
+    web = config.web
+    if web is not None and (roles := [role for role in web.roles or () if role != "read"]):
+        yield f"{_joined(roles)} on the page at {web.listen}"
 
 
 def _joined(words: Iterable[str]) -> str:

@@ -136,6 +136,9 @@ def _describe(job: Job, prepared: Prepared) -> str:
         return f"to {config['directory']}"
     if job.kind == "mqtt":
         return f"{config['broker']} on {config['listen']}" if job.name == BROKER else f"under {config['prefix']}/"
+    if job.kind == "web":
+        scheme = "https" if config["certificate"] else "http"
+        return f"{scheme}://{config['listen']}/{'' if job.name == 'web' else 'metrics'}"
     return f"on {', '.join(job.listening)}"
 
 

@@ -27,6 +27,7 @@ writable = {writable}
 TOKEN = f'[[grpc.token]]\nname = "a"\nroles = ["read", "write"]\nsha256 = "{"0" * 64}"\n'
 GRPC = '[grpc]\nlisten = ["127.0.0.1:8089", "[::1]:8090"]\n'
 MQTT = '[mqtt]\nbroker = "embedded"\nlisten = "127.0.0.1:1883"\nprefix = "x"\n'
+WEB = '[web]\nlisten = "127.0.0.1:8080"\n'
 FREE = '[[mqtt.account]]\nroles = ["read", "write"]\n'
 
 
@@ -57,6 +58,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             '["**"]',
             "ada) may write by gRPC at 127.0.0.1:8089; and write by MQTT at 127.0.0.1:1883 without logging in",
         ),
+        (WEB, "[]", "ada) may write, inject and control on the page at 127.0.0.1:8080 without logging in"),
+        (WEB + 'roles = ["read"]\n', "[]", None),
+        (WEB + GRPC + TOKEN, "[]", None),
         (MQTT + FREE, "[]", None),
         (MQTT, '["**"]', None),
         (MQTT + 'password_file = "accounts"\n', '["**"]', None),

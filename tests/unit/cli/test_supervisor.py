@@ -64,8 +64,9 @@ def example(capsys: pytest.CaptureFixture[str]) -> Edit:
 def test_init_writes_the_example_of_the_repository(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init"]) == 0
     assert capsys.readouterr().out.splitlines()[:2] == ["wrote supervisor.toml", "wrote db201.db"]
-    for name in ("supervisor.toml", "db201.db"):
-        assert Path(name).read_bytes() == (ROOT / name).read_bytes()
+    assert Path("db201.db").read_bytes() == (ROOT / "db201.db").read_bytes()
+    without_page, page = Path("supervisor.toml").read_text().split("# [web]")  # its libraries may be missing
+    assert f"{without_page}[web]{page}".replace("\n# listen", "\nlisten") == (ROOT / "supervisor.toml").read_text()
 
 
 def test_init_names_tag_tables(capsys: pytest.CaptureFixture[str]) -> None:
