@@ -1,0 +1,139 @@
+"""The web page of a running cell, used by a person with a browser: real Chromium."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.testing.cell import CONFIG, Cell, until
+from shmio.testing.ports import reserved_port
+
+pytest.importorskip("uvicorn")
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = shutil.which("chromium")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+expect: Any = playwright.expect
+PATIENCE_MS = 30_000
+AXIS = "cell/Robot_800/Axs1_Pos"
+
+
+@pytest.fixture
+def address() -> Iterator[str]:
+    """The page's address."""
+    with reserved_port() as address:
+        yield str(address)
+
+
+@pytest.fixture
+def cell(make_cell: Callable[..., Cell], address: str) -> Cell:
+    """A running cell with a page."""
+    config = CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]')
+    cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n')
+    cell.up()
+    return cell
+
+
+@pytest.fixture
+def page(cell: Cell, address: str) -> Iterator[Any]:
+    """The cell's page in a browser. The browser must report no error."""
+    expect.set_options(timeout=PATIENCE_MS)
+    errors: list[str] = []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(f"http://{address}/")
+        yield page
+        browser.close()
+    assert not errors
+
+
+def keep(page: Any, name: str) -> None:
+    """Keep a screenshot in the folder that SHMIO_SCREENSHOTS names, if it does."""
+    if folder := os.environ.get("SHMIO_SCREENSHOTS"):
+        page.screenshot(path=Path(folder) / f"{name}.png")
+
+
+def open_tab(page: Any, name: str) -> None:
+    page.get_by_role("tab", name=name).click()
+
+
+def reading(cell: Cell, path: str) -> tuple[Any, str]:
+    found = json.loads(cell.output("shmio", "get", "--json", path))[path]
+    return found["value"], found["provenance"]
+
+
+def test_user_writes_a_register_and_overrides_it(cell: Cell, page: Any) -> None:
+    open_tab(page, "Registers")
+    page.get_by_label("Search").fill("Outputs")
+    page.locator('.tree-row[data-path="cell/Outputs"]').click()
+    expect(page.get_by_role("button", name="Write")).to_be_enabled()
+    size = len(reading(cell, "cell/Outputs")[0])
+    page.get_by_label("New value").fill(json.dumps([7] * size))
+    page.get_by_role("button", name="Write").click()
+    expect(page.locator(".detail output")).to_have_text("written")
+    until(lambda: reading(cell, "cell/Outputs/500") == (7, "live"), "the value in the PLC's memory")
+
+    page.get_by_label("Search").fill("Axs1_Pos")
+    row = page.locator(f'.tree-row[data-path="{AXIS}"]')
+    row.click()
+    expect(page.get_by_role("button", name="Write")).to_be_disabled()
+    page.get_by_label("New value").fill("12.5")
+    page.get_by_role("button", name="Override").click()
+    expect(row.locator(".origin")).to_have_text("injected")
+    keep(page, "registers")
+    until(lambda: reading(cell, AXIS) == (12.5, "injected"), "the override")
+    page.get_by_role("button", name="Lift").click()
+    expect(row.locator(".origin")).to_have_text("live")
+
+
+def test_plot_moves_and_survives_restarts(cell: Cell, page: Any) -> None:
+    open_tab(page, "Plots")
+    search = page.get_by_label("Add a register")
+    for path in (AXIS, "cell/Robot_800/Axs3_Pos"):
+        search.fill(path)
+        search.press("Enter")
+    expect(page.locator(".lane")).to_have_count(2)
+    value = page.locator(f'.legend li[data-path="{AXIS}"] output')
+
+    def moves() -> None:
+        expect(value).not_to_have_text("no value")
+        expect(value).not_to_have_text(value.inner_text())
+
+    moves()
+    page.locator(f'.legend li[data-path="{AXIS}"]').drag_to(page.locator(".lane").last)
+    expect(page.locator(".lane")).to_have_count(1)
+    keep(page, "plots")
+    cell.output("shmio-supervisor", "restart", "web")
+    moves()
+    os.kill(cell.processes()["cell"]["pid"], signal.SIGKILL)
+    moves()
+    page.get_by_role("button", name="Pause").click()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save CSV").click()
+    head, *rows = download.value.path().read_text().splitlines()
+    assert head == f"time,cell/Robot_800/Axs3_Pos,{AXIS}"
+    assert len(rows) > 20
+    assert any(row.count(",") == 2 and float(row.split(",")[2]) for row in rows if not row.endswith(","))
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save PNG").click()
+    assert download.value.path().read_bytes().startswith(b"\x89PNG")
+
+
+def test_page_says_that_the_instance_has_stopped(cell: Cell, page: Any) -> None:
+    expect(page.locator("#state")).to_have_text("running")
+    expect(page.get_by_role("cell", name="cell", exact=True).first).to_be_visible()
+    keep(page, "overview")
+    cell.down()
+    expect(page.get_by_role("alert")).to_be_visible()
+    cell.up()
+    expect(page.get_by_role("alert")).to_be_hidden()
+    expect(page.locator("#state")).to_have_text("running")
