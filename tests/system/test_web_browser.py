@@ -128,6 +128,27 @@ def test_plot_moves_and_survives_restarts(cell: Cell, page: Any) -> None:
     assert download.value.path().read_bytes().startswith(b"\x89PNG")
 
 
+def test_user_runs_a_campaign_and_lifts_everything(cell: Cell, page: Any) -> None:
+    open_tab(page, "Injections")
+    campaign = f'[[injection]]\nname = "drift"\ntarget = "{AXIS}"\noperation = "set"\nvalue = 42.0\n'
+    text = page.get_by_role("textbox", name="Campaign")
+    text.fill(campaign.replace('"set"', '"sett"'))
+    page.get_by_role("button", name="Check").click()
+    expect(page.locator(".preview")).to_contain_text("injection[0].operation")
+    text.fill(campaign)
+    page.get_by_role("button", name="Check").click()
+    expect(page.locator(".preview")).to_contain_text(f"drift: set, over {AXIS}")
+    page.get_by_role("button", name="Start").click()
+    present = page.get_by_role("table", name="injections").get_by_role("row").filter(has_text="drift")
+    expect(present).to_contain_text("active")
+    until(lambda: reading(cell, AXIS) == (42.0, "injected"), "the campaign")
+    expect(page.get_by_role("table", name="events").get_by_role("row").filter(has_text="drift").first).to_be_visible()
+    keep(page, "injections")
+    page.get_by_role("button", name="Lift all injections").click()
+    expect(present).to_have_count(0)
+    until(lambda: reading(cell, AXIS)[1] == "live", "the end of the campaign")
+
+
 def test_page_says_that_the_instance_has_stopped(cell: Cell, page: Any) -> None:
     expect(page.locator("#state")).to_have_text("running")
     expect(page.get_by_role("cell", name="cell", exact=True).first).to_be_visible()

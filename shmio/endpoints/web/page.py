@@ -23,6 +23,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.sessions import User
 from shmio.errors import ShmioError
+from shmio.model.cell import Held
 
 MAX_CALLS: Final = 16
 """Maximum number of a page's calls that may be in progress. The page's next call waits."""
@@ -76,6 +77,13 @@ def call(
         return method
 
     return mark
+
+
+def release(held: Iterable[Held]) -> None:
+    """Close what a page held. What another program has ended, or a source that has ended, is skipped."""
+    for one in held:
+        with suppress(ShmioError):
+            one.close()
 
 
 class Tab:

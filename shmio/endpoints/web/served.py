@@ -14,6 +14,7 @@ import msgspec
 
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.signals import Feeds
+from shmio.endpoints.web.timeline import Timeline
 from shmio.local.attach import Attachment
 from shmio.local.status import SourceStatus, status_of
 from shmio.segment import Segment
@@ -60,6 +61,8 @@ class Served:
         self.config_file = config_file
         self.feeds = Feeds()
         """What pages plot."""
+        self.timeline = Timeline(segment)
+        """The newest events."""
         self._overview: dict[str, Any] = {}
         self._overview_s = -OVERVIEW_S
         self._usages: dict[int, _Usage] = {}

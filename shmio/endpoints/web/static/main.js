@@ -2,6 +2,7 @@
 
 import { Connection } from "./connection.js";
 import { byId, element, replace, setText } from "./dom.js";
+import { InjectionsTab } from "./injections.js";
 import { OverviewTab } from "./overview.js";
 import { PlotsTab, plot } from "./plots.js";
 import { RegistersTab } from "./registers.js";
@@ -18,6 +19,7 @@ const TABS = {
   overview: { title: "Overview", make: (context) => new OverviewTab(context) },
   registers: { title: "Registers", make: (context) => new RegistersTab(context) },
   plots: { title: "Plots", make: (context) => new PlotsTab(context) },
+  injections: { title: "Injections", make: (context) => new InjectionsTab(context) },
 };
 
 const connection = new Connection();

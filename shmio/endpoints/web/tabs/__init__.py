@@ -3,9 +3,10 @@
 from typing import Final
 
 from shmio.endpoints.web.page import Tab
+from shmio.endpoints.web.tabs.injections import Injections
 from shmio.endpoints.web.tabs.overview import Overview
 from shmio.endpoints.web.tabs.plots import Plots
 from shmio.endpoints.web.tabs.registers import Registers
 
-TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers, Plots)
+TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers, Plots, Injections)
 """All tabs, in the order in which a page shows them."""

@@ -12,9 +12,9 @@ import msgspec
 from msgspec import Meta
 from starlette.concurrency import run_in_threadpool
 
-from shmio.endpoints.web.page import Page, Tab, call
+from shmio.endpoints.web.page import Page, Tab, call, release
 from shmio.endpoints.web.tabs.register_tree import Node, Row, matching, rows, tree, window
-from shmio.errors import CommandError, PathError, ShmioError
+from shmio.errors import CommandError, PathError
 from shmio.layout.model import MAX_PATH, Register
 from shmio.layout.values.typed import read_value
 from shmio.layout.values.write import bits_of, cover
@@ -81,7 +81,7 @@ class Registers(Tab):
         """Lift the overrides of this page."""
         overrides, self._overrides = list(self._overrides.values()), {}
         if overrides:
-            asyncio.get_running_loop().run_in_executor(None, _lift, overrides)
+            asyncio.get_running_loop().run_in_executor(None, release, overrides)
 
     @call("read", Shown)
     async def rows(self, given: Shown) -> dict[str, Any]:
@@ -209,11 +209,3 @@ def _text(value: Any) -> str:
     """Return a value as text: JavaScript has no exact numbers above 2**53, and JSON no infinity."""
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…"
-
-
-def _lift(overrides: list[Shadow]) -> None:
-    for shadow in overrides:
-        try:
-            shadow.close()
-        except ShmioError:
-            continue

@@ -1,0 +1,196 @@
+"""The injections tab: what is injected, campaigns, and the events of all sources."""
+
+from __future__ import annotations
+
+import asyncio
+import tomllib
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from typing import Annotated, Any, ClassVar, Final
+
+import msgspec
+from msgspec import Meta
+from starlette.concurrency import run_in_threadpool
+
+from shmio.config import Declaration
+from shmio.config.campaign import parse_campaign
+from shmio.endpoints.web.page import Nothing, Page, Tab, call, release
+from shmio.errors import CommandError, ConfigError
+from shmio.layout.values.write import Write, bits_of, paths_of
+from shmio.local.injection import Campaign, compile_declarations
+from shmio.segment import Block
+
+INTERVAL_S: Final = 0.5
+"""Interval at which injections and events are sent if they have changed, in s."""
+MAX_INJECTIONS: Final = 500
+"""Maximum number of injections that are shown."""
+MAX_PATHS: Final = 20
+"""Maximum number of paths that are shown for an injection or an event."""
+MAX_COUNTED: Final = 4_096
+"""Number of registers above which they are no longer counted."""
+MAX_CAMPAIGNS: Final = 16
+"""Maximum number of campaigns that one page may run at a time."""
+MAX_CAMPAIGN: Final = 60_000
+"""Maximum number of characters of a campaign."""
+
+
+class Given(msgspec.Struct, forbid_unknown_fields=True):
+    """A campaign as TOML text."""
+
+    text: Annotated[str, Meta(max_length=MAX_CAMPAIGN)]
+    keep: bool = False
+    """Whether its injections continue when the page is closed."""
+
+
+class Chosen(msgspec.Struct, forbid_unknown_fields=True):
+    """An injection."""
+
+    source: Annotated[str, Meta(max_length=200)]
+    number: Annotated[str, Meta(pattern="^[0-9]{1,20}$")]
+    """Its number as text: JavaScript has no exact numbers above 2**53."""
+
+
+class Injections(Tab):
+    """Shows, starts and lifts injections, and shows the events of all sources."""
+
+    name: ClassVar[str] = "injections"
+
+    def __init__(self, page: Page) -> None:
+        super().__init__(page)
+        self._campaigns: list[Campaign] = []
+        self._following: asyncio.Task[None] | None = None
+
+    def close(self) -> None:
+        """Lift the campaigns of this page that are not to be kept."""
+        campaigns, self._campaigns = self._campaigns, []
+        if campaigns:
+            asyncio.get_running_loop().run_in_executor(None, release, campaigns)
+
+    @call("read", Nothing)
+    async def follow(self, _: Nothing) -> None:
+        """Send injections and events now, and then whenever they change, until ``leave``."""
+        await self.leave(_)
+        self._following = self.page.start(self._follow())
+
+    @call("read", Nothing)
+    async def leave(self, _: Nothing) -> None:
+        """End what ``follow`` began."""
+        if self._following is not None:
+            self._following.cancel()
+            self._following = None
+
+    @call("inject", Chosen)
+    async def lift(self, given: Chosen) -> None:
+        """Lift an injection, whoever created it."""
+        await run_in_threadpool(self.page.served.cell.lift, given.source, int(given.number))
+
+    @call("inject", Nothing)
+    async def lift_all(self, _: Nothing) -> int:
+        """Lift all injections of all sources; return their number."""
+        return len(await run_in_threadpool(self.page.served.cell.lift_all))
+
+    @call("read", Given)
+    async def check(self, given: Given) -> list[dict[str, Any]]:
+        """Check a campaign, and return what it would inject. Nothing is started."""
+        return await run_in_threadpool(self._preview, given.text)
+
+    @call("inject", Given)
+    async def start(self, given: Given) -> list[dict[str, Any]]:
+        """Start a campaign: all of its injections or none."""
+        self._campaigns = [one for one in self._campaigns if self._runs(one)]
+        if len(self._campaigns) >= MAX_CAMPAIGNS:
+            raise CommandError(f"a page may run at most {MAX_CAMPAIGNS} campaigns at a time: lift one first")
+        declarations = _parse(given.text)
+        cell = self.page.served.cell
+        campaign = await run_in_threadpool(lambda: cell.declare(declarations, keep=given.keep))
+        self._campaigns.append(campaign)
+        return [
+            {"source": one.source, "number": str(one.number), "name": one.name, "seed": str(one.seed)}
+            for one in campaign.declared
+        ]
+
+    def _runs(self, campaign: Campaign) -> bool:
+        present = {one.number for one in self.page.served.cell.injections()}
+        return any(one.number in present for one in campaign.declared)
+
+    def _preview(self, text: str) -> list[dict[str, Any]]:
+        blocks = self.page.served.segment.blocks
+        return [
+            _described_declaration(program.declaration)
+            | _first_paths(f"{program.source}/{path}" for path in _covered(blocks[program.source], program.cover))
+            for program in compile_declarations(_parse(text), blocks)
+        ]
+
+    async def _follow(self) -> None:
+        present: dict[str, tuple[Any, ...]] | None = None
+        events: list[dict[str, Any]] | None = None
+        while True:
+            blocks = self.page.served.segment.blocks
+            before, present = present, {source: block.standing.read() for source, block in blocks.items()}
+            if present != before:
+                names = {one["pid"]: one["name"] for one in self.page.served.overview()["processes"]}
+                self.page.push("injections", await run_in_threadpool(self._describe, present, names))
+            earlier, events = events, self.page.served.timeline.events()
+            if events != earlier:
+                self.page.push("events", events)
+            await asyncio.sleep(INTERVAL_S)
+
+    def _describe(self, present: dict[str, tuple[Any, ...]], names: dict[int, str]) -> list[dict[str, Any]]:
+        """Describe injections, with the names of the instance's processes by pid."""
+        blocks = self.page.served.segment.blocks
+        found: list[dict[str, Any]] = []
+        for source, injections in present.items():
+            layout = blocks[source].layout
+            for one in injections[: MAX_INJECTIONS - len(found)]:
+                bits = (Write(offset, mask, bytes(size)) for offset, size, mask in one.ranges)
+                paths = (f"{source}/{path}" for path in paths_of(layout, bits, MAX_COUNTED))
+                running = one.running
+                found.append(
+                    {
+                        "source": source,
+                        "number": str(one.number),  # JavaScript has no exact numbers above 2**53
+                        "name": one.name,
+                        "direction": one.direction,
+                        "priority": one.priority,
+                        "keep": one.keep,
+                        "by": "configuration" if one.configured else names.get(one.pid) or f"process {one.pid}",
+                        "state": "active" if running is None else running.state,
+                        "since_s": running.time_ns / 1e9 if running is not None and running.time_ns else None,
+                        "seed": None if running is None else str(running.seed),
+                    }
+                    | ({} if running is None else _described_declaration(running.declaration))
+                    | _first_paths(paths)
+                )
+        return found
+
+
+def _parse(text: str) -> list[Declaration]:
+    """Return the declarations in a campaign.
+
+    Raises:
+        ConfigError: The text is no TOML, or a declaration is wrong.
+
+    """
+    try:
+        tables = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"this is no TOML: {error}") from None
+    return parse_campaign(tables)
+
+
+def _described_declaration(declaration: Declaration) -> dict[str, Any]:
+    return {"name": declaration.name, "operation": declaration.operation, "when": declaration.when}
+
+
+def _covered(block: Block, cover: Any) -> Iterator[str]:
+    """Yield the paths of the registers of which a declared injection covers a bit."""
+    mask = bytes(cover)
+    for register in block.layout.own:
+        share = mask[register.offset : register.offset + register.size]
+        if any(bits & covered for bits, covered in zip(bits_of(register), share, strict=True)):
+            yield register.path
+
+
+def _first_paths(paths: Iterable[str]) -> dict[str, Any]:
+    found = list(islice(paths, MAX_COUNTED))
+    return {"registers": found[:MAX_PATHS], "count": len(found)}
