@@ -93,11 +93,10 @@ export class InjectionsTab {
 
   /** @param {Injection[]} injections */
   fill(injections) {
-    const now = this.context.overview?.clock.time_s;
     const rows = injections.map((one) => {
       const more = one.count > one.registers.length ? ` and ${one.count - one.registers.length} more` : "";
       const what = one.operation ? `${one.operation}${one.when ? ` when ${one.when}` : ""}` : "values of a program";
-      const since = one.state === "active" && one.since_s !== null && now ? ` for ${duration(Math.max(0, now - one.since_s))}` : "";
+      const since = one.state === "active" && one.since_s !== null ? ` since ${duration(one.since_s)}` : "";
       const lift = element(
         "button",
         { type: "button", disabled: !this.context.may("inject"), click: () => this.act("lift", { source: one.source, number: one.number }) },
